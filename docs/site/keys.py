@@ -23,9 +23,9 @@ from estimator.centroiding.centroid import CENTROIDERS
 from estimator.detection.detect import DETECTORS
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers.dome_tracker import IDENTIFIERS as DOME_IDENTIFIERS
-from skysim.apps.gui.page.forms import file_value, si_unit, yaml_line
+from skysim.apps.gui.page.forms import file_value, yaml_line
 from skysim.core.paths import CATALOGS, ROOT
-from skysim.core.units import ConfigModel
+from skysim.core.units import ConfigModel, si_unit
 from skysim.experiments.study.plan import Study
 from skysim.scene.camera import CURVE_FOLDER
 from skysim.scene.loader import PRESETS

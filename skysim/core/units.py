@@ -25,6 +25,18 @@ SI_SUFFIX = re.compile(
     r"(?<!_deg)(?<!_rad)(?<!_e)(?<!^e)(?<!_cm2)(?<!_um)_(m|s|n|kg|kg_m|kg_m2|cd|w_sr|nm|nm_rad|nms|nms2)$"
 )
 
+# The SI unit of each suffix, as the loader accepts it.
+SI_UNITS = {
+    **{"m": "m", "s": "s", "n": "N", "kg": "kg", "kg_m": "kg m", "kg_m2": "kg m2", "cd": "cd", "w_sr": "W/sr"},
+    **{"nm": "N m", "nm_rad": "N m/rad", "nms": "N m s", "nms2": "N m s2"},
+}
+
+
+def si_unit(name: str) -> str:
+    """The SI unit of a model field, from the suffix of its name; empty for a bare number."""
+    match = SI_SUFFIX.search(name)
+    return SI_UNITS.get(match[1], "") if match else ""
+
 
 def in_utc(moment: datetime.datetime) -> datetime.datetime:
     """The moment in UTC, without a zone; a naive datetime is in UTC already."""

@@ -143,11 +143,14 @@ def write_page(
     annotated: NDArray[np.uint8],
     flight: bytes,
     scene_3d: Sequence[Path],
+    plan: Sequence[tuple[str, Sequence[str]]] = (),
+    findings: Sequence[str] = (),
 ) -> None:
-    """Write one HTML file with its images embedded: statistics, plots, an annotated frame, the table, the command.
+    """Write one HTML file with its images embedded: the scene and its warnings, statistics, plots, an annotated frame.
 
     angles : names of the three angles of a row;  stages_ms : median time by stage
     flight : telemetry plot, PNG, or empty;  scene_3d : image files of the laboratory
+    plan, findings : names and lines of the scene's table, and the check's warnings, see `simulation.checks`
 
     A single frame has no plot against time.
     """
@@ -163,6 +166,8 @@ def write_page(
         flight=embed(flight) if flight else "",
         scene_3d=[embed(path.read_bytes(), path.suffix[1:]) for path in scene_3d],
         figure=embed(error_figure(rows)) if len(rows) > 1 else "",
+        plan=plan,
+        findings=findings,
     )
     write_text(path, text)
 

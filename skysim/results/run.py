@@ -25,6 +25,7 @@ from skysim.results.files.frames import remove_results, write_frame
 from skysim.scene.scene import Scene
 from skysim.simulation import exposure
 from skysim.simulation import run as simulation
+from skysim.simulation.checks import Check, check
 from skysim.simulation.testbed import Testbed, build_tracker
 from skysim.simulation.user_parts import build_testbed_with
 from skysim.tracking.factory import NO_PROGRAMS
@@ -146,11 +147,13 @@ class Recorder:
 
     Files of an earlier run in the folder are removed first.
 
+    plan    : the check of the plan, for the report; computed if left out
     seconds : of all frames, by stage;  shown : the last solved frame, or the first if none was solved
     """
 
     folder: Path
     testbed: Testbed
+    plan: Check | None = None
     rows: list[FrameRow] = field(default_factory=list)
     seconds: dict[str, list[float]] = field(default_factory=dict)
     shown: ScoredFrame | None = None
@@ -192,13 +195,28 @@ class Recorder:
         write_image(self.folder / "annotated.png", annotated)
         stages_ms = {stage: 1e3 * float(np.median(seconds)) for stage, seconds in self.seconds.items()}
         flight = telemetry_report.figure(log) if len(self.rows) > 1 or log.t_s[-1] > SHORT_S else b""
-        report.write_page(page, scene.title, command, names, self.rows, stages_ms, annotated, flight, pictures)
+        plan = self.plan or check(self.testbed)
+        facts = [(name, [text]) for name, text in scene.summary] + [(fact.name, fact.lines) for fact in plan.facts]
+        report.write_page(
+            page,
+            scene.title,
+            command,
+            names,
+            self.rows,
+            stages_ms,
+            annotated,
+            flight,
+            pictures,
+            facts,
+            plan.findings,
+        )
         return report.summary(self.rows) | {
             "stages_ms": stages_ms,
             "report": str(page),
             "flight": telemetry_report.summary(log),
             "pictures": [str(path) for path in pictures],
             "exposures_ms": [1e3 * row.exposure_s for row in self.rows],
+            "findings": plan.findings,
         }
 
 

@@ -2,16 +2,18 @@
 
 The raw YAML tree is built in layers, the later ones over the earlier: the `base` scene (recursively), the scene's own
 keys, then the overrides of `--set`. Next, the camera section is merged over its preset, and a calibration file's
-values over both (`with_preset`). Only then does pydantic validate the tree. Every error becomes an InputError of
-one line with key, file and line.
+values over both (`with_preset`). Only then does pydantic validate the tree. Last, an option that has no effect is
+refused (`keys.unused`). Every error becomes an InputError of one line with key, file and line.
 """
 
 from __future__ import annotations
 
+import copy
+import functools
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
@@ -21,6 +23,7 @@ from skysim.core.paths import DATA, SCENES
 from skysim.core.units import ConfigModel, quantity
 from skysim.core.yaml_reader import Files, check_version, explain, is_file, location_of, read_yaml, set_key
 from skysim.scene.camera import CameraConfig, focus_distance
+from skysim.scene.keys import unused
 from skysim.scene.opencv_calibration import read as read_calibration
 from skysim.scene.scene import NAME_ALIAS, Scene
 
@@ -116,20 +119,30 @@ def find(name: str) -> Path:
     return yaml_reader.find_file(name, SCENES, "scene")
 
 
-def load(name: str | Path, overrides: Mapping[str, str] | None = None) -> Scene:
+def load(name: str | Path, overrides: Mapping[str, str] | None = None, refuses_unused: bool = True) -> Scene:
     """Read, override (`path.to.key` -> YAML value) and validate a scene.
 
+    refuses_unused : whether an option that has no effect is an error (scene/keys/unused.py)
     Raises InputError with one line: the key, what is wrong with it, what is allowed, the file and line.
     """
-    path = find(str(name))
-    tree, files = read(path)
-    for key, value in (overrides or {}).items():
+    path, overrides = find(str(name)), overrides or {}
+    layers = read_layers(path)
+    scene = validate(layers, overrides)
+    if refuses_unused:
+        unused.check(scene, layers[0].tree, overrides, locations(layers), lambda: validate(layers, {}))
+    return scene
+
+
+def validate(layers: list[Layer], overrides: Mapping[str, str]) -> Scene:
+    """The scene of some layers and overrides. Raises InputError with one line."""
+    tree, files = merged(layers), locations(layers)
+    for key, value in overrides.items():
         set_key(tree, key, value)
     try:
-        raw = apply_preset(tree, files, overrides or {})
-        return Scene.model_validate(raw | {NAME_ALIAS: path.stem})
+        raw = apply_preset(tree, files, overrides)
+        return Scene.model_validate(raw | {NAME_ALIAS: layers[0].path.stem})
     except ValidationError as error:
-        raise InputError(explain(error, Scene, tree, files, overrides or {})) from None
+        raise InputError(explain(error, Scene, tree, files, overrides)) from None
 
 
 def load_scene(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
@@ -160,8 +173,16 @@ def with_location(message: str, name: str, overrides: Mapping[str, str]) -> str:
     return f"{message} {location_of(key.split('.'), read(find(name))[1], overrides)}"
 
 
-def read(path: Path, derived: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Files]:
-    """A scene's keys merged over those of its `base` scene, and the files read, this one first. Raises InputError.
+class Layer(NamedTuple):
+    """One file of a scene: its path, its text and its keys, without `base`."""
+
+    path: Path
+    text: str
+    tree: dict[str, Any]
+
+
+def read_layers(path: Path, derived: tuple[Path, ...] = ()) -> list[Layer]:
+    """A scene's file, its `base` scene, the base of that, and so on. Raises InputError.
 
     derived : scenes that have this one as their base, to detect a cycle
     """
@@ -170,7 +191,7 @@ def read(path: Path, derived: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Fi
         check_version(tree, path, text)
     tree = resolve_files(path, tree)
     if "base" not in tree:
-        return tree, [(path, text)]
+        return [Layer(path, text, tree)]
     base = tree.pop("base")
     location = location_of(["base"], [(path, text)], {})
     try:
@@ -179,8 +200,24 @@ def read(path: Path, derived: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Fi
         raise InputError(f"base: {error} {location}") from None
     if base_path.resolve() in (*derived, path.resolve()):
         raise InputError(f"base: {base} leads back to this scene {location}")
-    base_tree, files = read(base_path, (*derived, path.resolve()))
-    return merge(base_tree, tree), [(path, text), *files]
+    return [Layer(path, text, tree), *read_layers(base_path, (*derived, path.resolve()))]
+
+
+def merged(layers: list[Layer]) -> dict[str, Any]:
+    """The keys of a scene merged over those of its base scenes; a copy, which `set_key` may change."""
+    tree = functools.reduce(merge, (layer.tree for layer in reversed(layers)))
+    return copy.deepcopy(tree)
+
+
+def locations(layers: list[Layer]) -> Files:
+    """Paths and texts of the layers, for the locations in messages."""
+    return [(layer.path, layer.text) for layer in layers]
+
+
+def read(path: Path) -> tuple[dict[str, Any], Files]:
+    """A scene's keys merged over those of its `base` scene, and the files read, this one first. Raises InputError."""
+    layers = read_layers(path)
+    return merged(layers), locations(layers)
 
 
 def apply_preset(tree: dict[str, Any], files: Files, overrides: Mapping[str, str]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import datetime
 import html
+import math
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -161,24 +162,32 @@ class Scene(ConfigModel):
             )
         return self
 
-    def _repr_html_(self) -> str:
-        """For notebooks: what the scene has, one row a section."""
-        camera, exposure = self.camera, self.exposure
-        rows = [
+    @property
+    def summary(self) -> list[tuple[str, str]]:
+        """What the scene has, one line a section, for tables."""
+        camera, exposure, control, tracker = self.camera, self.exposure, self.motion.control, self.tracker
+        dome = self.light if isinstance(self.light, DomeConfig) else None
+        stages = [getattr(tracker, stage) for stage in ("detector", "centroider", "identifier", "solver")]
+        focus = "infinity" if math.isinf(camera.focus_m) else f"{camera.focus_m:.4g} m"
+        return [
             ("name", self.name),
-            ("light", self.light.kind),
-            ("vehicle", self.vehicle.mount),
+            ("light", f"dome: {dome.surface.kind}, {dome.layout.kind}" if dome else self.light.kind),
+            ("vehicle", f"{self.vehicle.mount}, {control.law if control else 'no'} control"),
             (
                 "camera",
-                f"{camera.width_px} × {camera.height_px} px, f = {1e3 * camera.focal_length_m:g} mm",
+                f"{camera.width_px} × {camera.height_px} px of {1e6 * camera.pixel_m:g} µm,"
+                f" f = {1e3 * camera.focal_length_m:g} mm, f/{camera.f_number:g}, focus {focus}",
             ),
             (
                 "exposure",
                 f"{exposure.frames} of {1e3 * exposure.time_s:g} ms at {exposure.rate_hz:g} Hz",
             ),
-            ("tracker", self.tracker.name),
+            ("tracker", ", ".join([tracker.name, *(stage for stage in stages if stage)])),
         ]
-        cells = "".join(f"<tr><th>{key}</th><td>{html.escape(str(value))}</td></tr>" for key, value in rows)
+
+    def _repr_html_(self) -> str:
+        """For notebooks: what the scene has, one row a section."""
+        cells = "".join(f"<tr><th>{key}</th><td>{html.escape(text)}</td></tr>" for key, text in self.summary)
         return f"<h4>{html.escape(self.title)}</h4><table>{cells}</table>"
 
     @property

@@ -34,7 +34,7 @@ BARE_CAMERA = {
 
 
 def loaded(name: str = "afit_simsat", **changes: str) -> Scene:
-    return loader.load(name, {key.replace("__", "."): value for key, value in changes.items()})
+    return loader.load(name, {key.replace("__", "."): value for key, value in changes.items()}, refuses_unused=False)
 
 
 def believing(**changes: str) -> tuple[DomeTracker, Testbed]:

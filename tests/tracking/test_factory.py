@@ -17,7 +17,8 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats, Frame, Telemetry
 from skysim.dynamics import imu, multibody
 from skysim.scene import loader
-from skysim.simulation import checks, run
+from skysim.simulation import run
+from skysim.simulation.checks import check, dome
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking import exposure_control
 from skysim.tracking.exposure_control import ExposureController
@@ -263,8 +264,7 @@ def test_a_dome_that_no_tracker_can_work_under_is_told_in_one_line(changes: dict
 
 
 def doubted_of(name: str, changes: dict[str, str]) -> list[str]:
-    testbed = build_testbed(loader.load(name, changes))
-    return checks.warnings(testbed.scene, testbed.sources, testbed.mount)
+    return check(build_testbed(loader.load(name, changes))).findings
 
 
 @pytest.mark.parametrize(
@@ -312,9 +312,11 @@ def test_under_the_stars_there_is_no_surface_to_doubt() -> None:
 )
 def test_what_no_tracker_copes_with_is_doubted(changes: dict[str, str], told: str) -> None:
     """By hand: 8 mm at 33 in, 36.5 mm before pixels of 4 um, is 87 px; focused at 20 in 4.4 mm of pupil blur by 32."""
-    lines = doubted_of("afit_simsat", changes)
+    testbed = build_testbed(loader.load("afit_simsat", changes))
+    lines = dome.warnings(testbed.scene, testbed.sources, testbed.mount)
     assert len(lines) == 1
     assert lines[0].startswith(told)
+    assert lines[0] in check(testbed).findings
 
 
 def test_a_doubt_is_one_line_before_the_run_which_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

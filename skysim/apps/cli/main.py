@@ -17,14 +17,15 @@ from skysim.apps.cli.commands.run import compare, render, run, trackers
 from skysim.apps.cli.commands.solve import solve, survey
 from skysim.apps.cli.commands.stream import stream
 from skysim.apps.cli.commands.study import app as studies
-from skysim.apps.cli.commands.validate import validate
+from skysim.apps.cli.commands.validate import check, validate
 from skysim.apps.cli.options import with_location
 from skysim.apps.cli.terminal import print_error
 from skysim.core import errors
 from skysim.core.errors import InputError
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
-for command in (run, render, stream, compare, trackers, solve, survey, camera, reproduce, gui, validate, export):
+COMMANDS = (run, check, render, stream, compare, trackers, solve, survey, camera, reproduce, gui, validate, export)
+for command in COMMANDS:
     app.command()(command)
 app.add_typer(scenes_app, name="scenes")
 app.add_typer(catalog_app, name="catalog")

@@ -64,9 +64,16 @@ Programs = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 
-def load(name: str, frames: int | None, seed: int | None, overrides: list[str] | None) -> Scene:
-    """Load the scene with the command line's overrides. Raises InputError."""
+def load(
+    name: str, frames: int | None, seed: int | None, overrides: list[str] | None, trackers: list[str] | None = None
+) -> Scene:
+    """Load the scene with the command line's overrides. Raises InputError.
+
+    trackers : names of all trackers that will solve its frames, the scene's own first; an override must have an effect
+        for one of them
+    """
     from skysim.core.yaml_reader import parse_overrides
+    from skysim.scene.keys import unused
     from skysim.scene.loader import load as load_scene
 
     values = parse_overrides(overrides)
@@ -74,8 +81,14 @@ def load(name: str, frames: int | None, seed: int | None, overrides: list[str] |
         values["exposure.frames"] = str(frames)
     if seed is not None:
         values["seed"] = str(seed)
+    if trackers:
+        values["tracker.name"] = trackers[0]
     LOADED.append((name, values))
-    return load_scene(name, values)
+    scene = load_scene(name, values, refuses_unused=not trackers)
+    if trackers:
+        each = [scene.tracker.model_copy(update={"name": tracker}) for tracker in trackers]
+        unused.check_overrides([scene.model_copy(update={"tracker": tracker}) for tracker in each], values)
+    return scene
 
 
 def output_folder(out: Path | None, name: str) -> Path:

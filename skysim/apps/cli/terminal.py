@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from skysim.core.types import FrameRow
     from skysim.experiments.study.execution.runner import Progress
     from skysim.experiments.tracker_comparison import TrackerScore
+    from skysim.simulation.checks.facts import Fact
     from skysim.simulation.testbed import Testbed
 
 T = TypeVar("T")
@@ -174,6 +175,24 @@ def print_summary(run: dict[str, Any]) -> None:
     print(f"median ms per frame: {stages}")
     print_motion(run["flight"])
     print(f"report: {run['report']}")
+
+
+FACT_COLUMN = 21  # of the text of a fact
+MAX_WIDTH = 80  # of the lines of a check
+
+
+def print_check(facts: Sequence[Fact], findings: Sequence[str]) -> None:
+    """Print the facts of a plan, names at the left, and its warnings; lines of at most 80 columns."""
+    import textwrap
+
+    for fact in facts:
+        lines = [part for line in fact.lines for part in textwrap.wrap(line, MAX_WIDTH - FACT_COLUMN)]
+        for name, line in zip([fact.name, *[""] * (len(lines) - 1)], lines, strict=True):
+            print(f"{name:{FACT_COLUMN}}{line}")
+    for finding in findings:
+        print(textwrap.fill(f"warning: {printable(finding)}", MAX_WIDTH, subsequent_indent="  "))
+    if not findings:
+        print("no warnings")
 
 
 def print_scores(lines: list[TrackerScore], folder: Path) -> None:

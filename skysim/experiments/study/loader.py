@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -11,6 +12,7 @@ from pydantic import ValidationError
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.yaml_reader import check_version, explain, line_of, read_yaml, set_key
 from skysim.dynamics.controllers.interface import CONTROLLERS
+from skysim.experiments.study import unused_options
 from skysim.experiments.study.designs import make_point
 from skysim.experiments.study.factors import Distribution, Factor, Levels, Settings, Value
 from skysim.experiments.study.plan import (
@@ -92,17 +94,16 @@ def check(plan: Plan, to_run: bool) -> None:
         if name in COLUMNS or name in study.responses:
             raise InputError(f"factors.{name}: the name is that of a column of the trials; allowed: another name")
     check_hardware(study)
-    scenes: list[Scene] = []
-    kinds: set[str] = set()
-    for name, level, settings in each_level(study.factors):
+    points = []
+    for name, level, own, settings in each_level(study.factors):
         try:
             scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(settings, 0))
             check_trial(plan, scene, trial, to_run)
         except InputError as error:
             raise InputError(at_factor(study, name, level, error)) from None
-        scenes.append(scene)
-        kinds.add(trial.kind)
-    check_measured(study, kinds, scenes)
+        points.append(unused_options.CheckedPoint(name, level, own, settings, scene, trial))
+    check_measured(study, {point.trial.kind for point in points}, [point.scene for point in points])
+    unused_options.check(plan, points, partial(resolve_point, plan.spec))
 
 
 def check_figures(plan: Plan) -> None:
@@ -224,10 +225,10 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
         )
 
 
-def each_level(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings]]:
-    """Every level of every factor with the other factors at their middle: factor, level, all settings."""
+def each_level(factors: Mapping[str, Factor]) -> Iterator[tuple[str, Value, Settings, Settings]]:
+    """Every level of every factor with the other factors at their middle: factor, level, its settings, all settings."""
     middle = {name: factor.value_at(0.5) for name, factor in factors.items()}
     for name, factor in factors.items():
         others = make_point({other: chosen for other, chosen in middle.items() if other != name}).settings
         for level, settings in factor.options() or [middle[name]]:
-            yield name, level, others | settings
+            yield name, level, settings, others | settings

@@ -392,7 +392,8 @@ def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
         raise InputError(message.removesuffix(f" ({Path()})")) from None
     local = Path(spec.folder) / name
     path = local if local.suffix in {".yaml", ".yml"} and is_file(local) else find_scene(name)
-    return load_scene(path, {key: text for key, text in texts.items() if not key.startswith(TRIAL)}), trial
+    overrides = {key: text for key, text in texts.items() if not key.startswith(TRIAL)}
+    return load_scene(path, overrides, refuses_unused=False), trial  # `unused_options` refuses, for the whole study
 
 
 class TrialSection(ConfigModel):

@@ -16,7 +16,9 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from skysim.apps.cli import main
+from skysim.apps.cli.options import load
 from skysim.core import images
+from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.scene import loader
 
@@ -525,3 +527,86 @@ def test_a_camera_file_with_a_slip_is_one_line(skysim: Skysim, rendered: Path, t
     said = skysim("solve", rendered / "frame_0000.fits", "--camera", camera).one_line()
     assert "camera.focal_length: 25 has no unit" in said
     assert f"({camera}, line " in said
+
+
+# Check a plan, show a scene
+
+
+def test_check_prints_facts_and_warnings_in_eighty_columns(skysim: Skysim) -> None:
+    ran = skysim("check", "afit_simsat", "--set", "light.led.intensity=60 mcd")
+    assert (ran.code, ran.err) == (0, "")
+    assert max(map(len, ran.out.splitlines())) <= 80
+    for name in (
+        "field of view",
+        "lights in the field",
+        "peak",
+        "smear",
+        "LED cap",
+        "depth of focus",
+        "expected error",
+    ):
+        assert f"\n{name} " in f"\n{ran.out}"
+    words = " ".join(ran.out.split())
+    assert "warning: light.led.intensity: " in words
+    assert words.endswith("mcd (--set)")
+    assert "no warnings" in skysim("check", "shefex2").out
+
+
+def test_check_as_json_has_numbers_and_findings(skysim: Skysim) -> None:
+    told = json.loads(skysim("check", "afit_simsat", "--json", "--set", "light.layout.cap_deg=15").out)
+    assert told["facts"]["field_of_view"]["arcsec_px"] == pytest.approx(22.6, abs=0.1)
+    assert told["facts"]["expected_error"]["frames"]["cross_arcsec"] == pytest.approx(120, abs=5)
+    assert any(line.startswith("light.layout.cap_deg: ") for line in told["findings"])
+
+
+def test_a_run_carries_the_findings_before_its_frames_and_in_its_report(skysim: Skysim, tmp_path: Path) -> None:
+    words = ("--frames", 1, "--set", "light.led.intensity=60 mcd", "--out", tmp_path)
+    ran = skysim("run", "afit_simsat", *words, "--json")
+    assert ran.code == 0
+    assert ran.err.startswith("skysim: light.led.intensity: ")
+    assert "of the lights are saturated" in ran.err
+    (finding,) = json.loads(ran.out)["findings"]
+    assert finding in ran.err
+    page = (tmp_path / "report.html").read_text()
+    assert page.index("of the lights are saturated") < page.index("The run") < page.index("Frames</h2>")
+    for name in ("lights in the field", "expected error", "camera", "1600 × 1200 px"):
+        assert name in page[: page.index("The run")]
+
+
+def test_validate_carries_the_findings(skysim: Skysim, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("schema: 1\nbase: afit_simsat\nlight:\n  led: {intensity: 60 mcd}\n")
+    out = skysim("validate", path).out
+    assert "light.led.intensity: " in out
+    assert f"({path}, line 4)" in out
+
+
+def test_scenes_show_prints_keys_with_their_origin(skysim: Skysim) -> None:
+    ran = skysim("scenes", "show", "afit_simsat_ideal", "--set", "seed=9")
+    assert (ran.code, ran.err) == (0, "")
+    assert "  focal_length: 35 mm " in ran.out
+    assert "# base afit_simsat.yaml, line " in ran.out
+    (seed,) = [line for line in ran.out.splitlines() if line.startswith("seed:")]
+    assert seed.split() == ["seed:", "9", "#", "--set"]
+    entries = json.loads(skysim("scenes", "show", "shefex2", "--json").out)
+    (catalog,) = [entry for entry in entries if entry["key"] == "tracker.catalog"]
+    assert (catalog["value"], catalog["what"]) == ("hipparcos_hp6.5", "this file")
+    assert catalog["line"] > 1
+    assert "nothing: no such scene" in skysim("scenes", "show", "nothing").one_line()
+
+
+def test_an_option_without_effect_is_one_line(skysim: Skysim) -> None:
+    for words in (("check", "afit_simsat"), ("run", "afit_simsat"), ("scenes", "show", "afit_simsat")):
+        line = skysim(*words, "--set", "tracker.limit_mag=4").one_line()
+        assert "tracker.limit_mag: has no effect: under a dome the tracker's map is of LEDs; allowed: " in line
+
+
+def test_compare_takes_options_of_any_of_its_trackers() -> None:
+    """Each is refused for the other tracker alone; one that serves none is refused."""
+    words, both = ["tracker.solver=quest", "tracker.options={a: 1}"], ["own", "mine"]
+    assert load("shefex2", 1, None, words, both).tracker.name == "own"
+    for trackers in (["own"], ["mine"]):
+        with pytest.raises(InputError, match="has no effect"):
+            load("shefex2", 1, None, words, trackers)
+    with pytest.raises(InputError, match=r"tracker.assumed_camera_body: has no effect.*\(--set\)"):
+        load("shefex2", 1, None, ["tracker.assumed_camera_body=[1 m, 0 m, 0 m]"], both)

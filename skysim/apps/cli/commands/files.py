@@ -10,7 +10,9 @@ import typer
 from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load
 from skysim.apps.cli.terminal import print_catalog, print_json, print_titles, progress
 
-scenes_app = typer.Typer(invoke_without_command=True, help="List the shipped scenes, or export one for MuJoCo.")
+scenes_app = typer.Typer(
+    invoke_without_command=True, help="List the shipped scenes; show every key of a scene, or export it for MuJoCo."
+)
 catalog_app = typer.Typer(no_args_is_help=True, help="Build and inspect star catalogs.")
 
 
@@ -22,6 +24,19 @@ def scenes(context: typer.Context, json: Json = False) -> None:
     from skysim.core.paths import SCENES
 
     print_titles(SCENES, json)
+
+
+@scenes_app.command("show")
+def scenes_show(scene: SceneArg, set_: Overrides = None, json: Json = False) -> None:
+    """Print the effective scene: every key with its value and where it comes from (file and line, preset, default)."""
+    from skysim.core.yaml_reader import parse_overrides
+    from skysim.scene.keys import provenance
+
+    entries = provenance.effective(scene, parse_overrides(set_))
+    if json:
+        print_json(provenance.as_dicts(entries))
+    else:
+        print(provenance.text(entries), end="")
 
 
 @scenes_app.command("export")

@@ -27,6 +27,7 @@ from skysim.apps.cli.options import (
     load,
     output_folder,
     selected_stages,
+    with_location,
 )
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ def run(
     """Simulate a scene: motion, frames, attitude solutions and their scores."""
     from skysim.results import scoring
     from skysim.results.run import Recorder, score_frames
-    from skysim.simulation import checks
+    from skysim.simulation.checks import check
     from skysim.simulation.compilation import on_two_processes
     from skysim.simulation.run import simulate_motion
     from skysim.simulation.testbed import build_testbed
@@ -64,13 +65,14 @@ def run(
         stages["name"] = tracker
     loaded = load(scene, frames, seed, [*(set_ or []), *(f"tracker.{key}={name}" for key, name in stages.items())])
     testbed = build_testbed(loaded, process.program_commands(program))
-    for warning in checks.warnings(loaded, testbed.sources, testbed.mount):
-        terminal.print_error(warning)
+    plan = check(testbed)
+    for finding in plan.findings:
+        terminal.print_error(with_location(finding))
     with on_two_processes(*LOADED[-1]):
         with terminal.progress_callback("simulating the motion") as update:
             testbed = simulate_motion(testbed, update)
         scored = terminal.eager_first(score_frames(testbed))
-    recorder = Recorder(output_folder(out, loaded.name), testbed)
+    recorder = Recorder(output_folder(out, loaded.name), testbed, plan)
     for frame in terminal.progress(scored, loaded.exposure.frames, loaded.title):
         recorder.add(frame)
     views = terminal.write_3d_views(testbed, recorder.folder) if scene_3d else []
@@ -95,13 +97,13 @@ def render(
 ) -> None:
     """Simulate a scene and write its frames with their truth, without solving them."""
     from skysim.results.run import Recorder
-    from skysim.simulation import checks
     from skysim.simulation import run as simulation
+    from skysim.simulation.checks import dome
     from skysim.simulation.testbed import build_testbed
 
     loaded = load(scene, frames, seed, set_)
     testbed = build_testbed(loaded)
-    if warning := checks.camera_outside_warning(loaded, testbed.mount):
+    if warning := dome.camera_outside_warning(loaded, testbed.mount):
         terminal.print_error(warning)
     with terminal.progress_callback("simulating the motion") as update:
         testbed = simulation.simulate_motion(testbed, update)
@@ -134,7 +136,7 @@ def compare(
     from skysim.simulation.testbed import build_testbed
     from skysim.tracking.external import process
 
-    loaded = load(scene, frames, seed, [*(set_ or []), f"tracker.name={tracker[0]}"])
+    loaded = load(scene, frames, seed, set_, tracker)
     testbed = build_testbed(loaded, process.program_commands(program))
     entrants = tracker_comparison.build_trackers(testbed, tracker)
     with terminal.progress_callback("simulating the motion", quiet=json) as update:

@@ -1,4 +1,8 @@
-"""Command `skysim validate`: check input files without simulating, or print their JSON Schema for an editor."""
+"""Commands `skysim validate` and `check`.
+
+`validate` checks input files without simulating, or prints their JSON Schema for an editor; `check` says what a scene
+will show and how accurate its tracker will be.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +11,8 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from skysim.apps.cli.options import Json
-from skysim.apps.cli.terminal import print_error, print_json
+from skysim.apps.cli.options import Json, Overrides, SceneArg, load, with_location
+from skysim.apps.cli.terminal import print_check, print_error, print_json
 from skysim.core.errors import InputError
 
 KINDS = ("scene", "study")
@@ -56,6 +60,22 @@ def validate(
             print(f"{verdict.file}: {verdict.what}", *verdict.doubts, sep="\n  ")
     if any(verdict.fault for verdict in verdicts):
         raise typer.Exit(2)
+
+
+def check(scene: SceneArg, set_: Overrides = None, json: Json = False) -> None:
+    """Check a plan before its run: field, lights in it, image size, saturation, smear, focus, expected error, warnings.
+
+    Nothing is simulated or rendered; everything is computed at sampled attitudes.
+    """
+    from skysim.simulation.checks import check as check_plan
+    from skysim.simulation.testbed import build_testbed
+
+    result = check_plan(build_testbed(load(scene, None, None, set_)))
+    findings = [with_location(finding) for finding in result.findings]
+    if json:
+        print_json(result._replace(findings=findings).as_dict())
+    else:
+        print_check(result.facts, findings)
 
 
 def check_file(path: Path) -> Verdict:
@@ -114,19 +134,20 @@ def find_shipped(path: Path) -> Path:
 
 def check_scene(path: Path) -> tuple[str, tuple[str, ...]]:
     """Set up a scene without simulating its motion: vehicle, lights, tracker. Returns a description and warnings."""
-    from skysim.scene.loader import load, with_location
-    from skysim.simulation import checks
+    from skysim.scene import loader
+    from skysim.simulation.checks import check as check_plan
     from skysim.simulation.testbed import build_testbed, build_tracker
 
-    scene = load(path)
+    scene = loader.load(path)
     try:
         testbed = build_testbed(scene)
         build_tracker(testbed)
+        findings = check_plan(testbed).findings
     except InputError as error:
-        raise InputError(with_location(str(error), str(path), {})) from None
+        raise InputError(loader.with_location(str(error), str(path), {})) from None
     count, frames = len(testbed.sources.id), scene.exposure.frames
     return f"a scene of {count} lights and {frames} frames", tuple(
-        checks.warnings(scene, testbed.sources, testbed.mount)
+        loader.with_location(finding, str(path), {}) for finding in findings
     )
 
 

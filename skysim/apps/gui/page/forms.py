@@ -13,17 +13,13 @@ from pydantic import BaseModel
 
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.units import SI_SUFFIX
+from skysim.core.units import SI_SUFFIX, si_unit
 from skysim.core.yaml_reader import read_yaml, set_key
 from skysim.scene.loader import file_names, find, load, read
 from skysim.scene.motion import expand_control
 from skysim.scene.scene import NAME_ALIAS, Scene
 
-# SI units by suffix of a model's field, as the loader accepts them, and units of bare numbers by suffix of a key.
-SI_UNITS = {
-    **{"m": "m", "s": "s", "n": "N", "kg": "kg", "kg_m": "kg m", "kg_m2": "kg m2", "cd": "cd", "w_sr": "W/sr"},
-    **{"nm": "N m", "nm_rad": "N m/rad", "nms": "N m s", "nms2": "N m s2"},
-}
+# Units of bare numbers by suffix of a key.
 DISPLAY_UNITS = {
     **{"deg": "deg", "arcsec": "arcsec", "px": "px", "hz": "Hz", "e": "e-", "e_s": "e-/s", "dn": "DN"},
     **{"mag": "mag", "deg_s": "deg/s", "deg_s2": "deg/s²", "rpm": "rpm", "c": "°C", "e_dn": "e-/DN"},
@@ -84,12 +80,6 @@ def section_fields(model: BaseModel, tree: Any, prefix: str) -> Iterator[Field]:
 def short_path(value: Any) -> Any:
     """Shorten the path of a shipped file to its name in scenes/."""
     return str(Path(value).relative_to(SCENES)) if isinstance(value, str) and value.startswith(str(SCENES)) else value
-
-
-def si_unit(name: str) -> str:
-    """The SI unit of a model field, from the suffix of its name."""
-    match = SI_SUFFIX.search(name)
-    return SI_UNITS.get(match[1], "") if match else ""
 
 
 def display_unit(file_key: str) -> str:

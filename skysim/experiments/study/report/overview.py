@@ -46,12 +46,13 @@ def overview(plan: Plan) -> Overview:
         try:
             scene, _ = resolve_point(plan.spec, plan.spec.trial_settings(point.settings, 0))
             testbed = build_testbed(scene, plan.spec.programs)
+            lines = checks.check(testbed).findings
         except InputError:
             continue
         checked += 1
         may_be_ambiguous |= may_report_ambiguity(scene)
         rows = rows or scene_rows(plan, testbed)
-        for line in checks.warnings(scene, testbed.sources, testbed.mount):
+        for line in lines:
             found.setdefault(line, []).append(levels)
     findings = [line if len(at) == checked else f"{line} [{'; '.join(at)}]" for line, at in found.items()]
     return Overview(rows, findings, may_be_ambiguous)

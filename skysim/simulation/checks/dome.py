@@ -1,4 +1,4 @@
-"""Pre-run warnings: where the scene breaks an assumption of its tracker or of the frames' WCS."""
+"""Warnings about a dome: where it breaks an assumption of its tracker or of the renderer."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.camera import wcs
 from skysim.camera.optics import Optics, disk_image_axes
 from skysim.camera.psf.kernel import build_kernel
 from skysim.core.types import Floats, Mount, Sources
 from skysim.dynamics import guidance
 from skysim.dynamics.profiles.load import load_profiles
-from skysim.scene.light import DomeConfig, StarsConfig, SurveyedSurfaceConfig
+from skysim.scene.light import DomeConfig, SurveyedSurfaceConfig
 from skysim.scene.scene import Scene
 from skysim.sources.dome import surface
 from skysim.sources.dome.surface import Radial, Surface
@@ -31,13 +30,8 @@ REFERENCE_POSES = 33  # of the maneuver, at which LEDs in view are collected
 
 
 def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
-    """Return the warnings for a scene, one line each. A bench (collimated display) gives none."""
-    if isinstance(scene.light, StarsConfig):
-        return [line for line in [wcs.accuracy_warning(scene.camera)] if line]
-    if not isinstance(scene.light, DomeConfig):
-        return []
-    if outside := camera_outside_warning(scene, mount):
-        return [outside]  # the others assume that it is inside
+    """The warnings for a dome whose inside holds the camera, one line each."""
+    assert isinstance(scene.light, DomeConfig)
     inside = surface.build_surface(scene.light.surface)
     lines = [
         surface_fit_warning(scene.light, inside),
@@ -74,7 +68,7 @@ def surface_fit_warning(light: DomeConfig, inside: Surface) -> str:
 
 
 def ellipsoid_warning(inside: Surface) -> str:
-    """Warn where the surface is more than MISFIT_M rms from the ellipsoid that the tracker's methods assume."""
+    """Warn where the surface is not the ellipsoid that the tracker's methods assume: MAX_ELLIPSOID_RMS_M rms."""
     rms_m = inside.nearest_ellipsoid().rms_m
     if rms_m <= MAX_ELLIPSOID_RMS_M:
         return ""

@@ -1,0 +1,199 @@
+"""Refuse options of a study that have no effect: keys of `set`, `trial` and factors.
+
+A key is refused if it has no effect at any level of any factor, each factor varied alone. The rules of scenes
+(`scene.keys.unused`) hold, and those below for the kinds of trial. `exposure.rate_hz` is always tolerated, because it
+bounds the exposure time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from skysim.core.errors import InputError
+from skysim.experiments.study.designs import make_point
+from skysim.experiments.study.factors import Settings, Value
+from skysim.experiments.study.plan import (
+    TRIAL,
+    CentroidTrial,
+    FlightTrial,
+    FrameTrial,
+    Plan,
+    Trial,
+    TrialSection,
+)
+from skysim.scene.keys import unused
+from skysim.scene.keys.unused import Rule
+from skysim.scene.leds import CelestialConfig, FibersConfig, LcdConfig
+from skysim.scene.light import DomeConfig
+from skysim.scene.scene import Scene
+from skysim.tracking import settings
+
+STREAK_ALGORITHMS = ("default", "streak")  # detectors and centroiders that use the streak measured by a gyro
+DYNAMICS = (
+    *("motion", "filter", "site", "vehicle.imu", "vehicle.wheels", "vehicle.fans", "vehicle.drag"),
+    *("vehicle.disturbances", "vehicle.mass", "vehicle.inertia", "vehicle.center_of_mass", "vehicle.torque_limit"),
+    "vehicle.tilt_stop_deg",
+)
+DETECTOR = tuple(
+    f"camera.detector.{key}"
+    for key in (
+        *("hardware_seed", "prnu", "dark_e_s", "dark_temperature_c", "dark_doubling_c", "temperature_c", "dsnu"),
+        *("hot_pixels", "hot_e_s", "particles", "full_well_e", "blooming", "anti_blooming", "cti_parallel"),
+        *("cti_serial", "read_noise_e", "reset_noise_e", "column_offset_e", "gain_e_dn", "offset_dn", "nonlinearity"),
+        *("bits", "noise"),
+    )
+)
+
+
+def ignores_streak(scene: Scene, trial: Trial) -> bool:
+    """Whether neither the detector nor the centroider of skysim's tracker uses a measured streak."""
+    chosen = settings.assumed_settings(scene)
+    used = {chosen.detector, chosen.centroider} & set(STREAK_ALGORITHMS)
+    return isinstance(trial, FrameTrial) and not unused.external(scene) and not used
+
+
+def in_dome(scene: Scene, trial: Trial) -> bool:
+    return isinstance(scene.light, DomeConfig)
+
+
+def merges_stars(scene: Scene) -> bool:
+    """Whether an LED's size decides which stars share an LED."""
+    layout = getattr(scene.light, "layout", None)
+    points = layout.points if isinstance(layout, FibersConfig | LcdConfig) else layout
+    return isinstance(points, CelestialConfig)
+
+
+RULES = (
+    Rule(
+        ("trial.gyro",),
+        ignores_streak,
+        "neither the detector nor the centroider uses the streak that a gyro measures",
+        f"tracker.detector: default, or tracker.centroider: {STREAK_ALGORITHMS[1]}",
+    ),
+    Rule(
+        ("trial.tilt_deg",),
+        lambda scene, trial: not in_dome(scene, trial),
+        "the boresight is drawn from the sphere",
+        "trial.dec_deg, or a scene with light of kind dome",
+    ),
+    Rule(("trial.dec_deg",), in_dome, "under a dome the tilt is drawn", "trial.tilt_deg"),
+    Rule(("seed",), lambda scene, trial: True, "every trial has its own seed", "the study's seed"),
+    Rule(
+        DYNAMICS,
+        lambda scene, trial: not isinstance(trial, FlightTrial),
+        "a trial of one attitude does not simulate the motion",
+        "trial.kind: flight",
+    ),
+    Rule(
+        ("exposure.frames",),
+        lambda scene, trial: not isinstance(trial, FlightTrial) and scene.exposure.frames != 1,
+        "a trial is one frame",
+        "1, or trial.kind: flight",
+    ),
+    Rule(
+        ("exposure.time_tag_offset", "exposure.time_tag_jitter", "tracker.exposure_control"),
+        lambda scene, trial: not isinstance(trial, FlightTrial),
+        "a trial is one frame, whose time is not used",
+        "trial.kind: flight",
+    ),
+    Rule(
+        ("exposure.first", "exposure.trigger_jitter"),
+        lambda scene, trial: (
+            isinstance(trial, FrameTrial) and (not isinstance(scene.light, DomeConfig) or unused.steady(scene))
+        ),
+        "the light of a trial's frame is steady",
+        "trial.kind: flight",
+    ),
+    Rule(
+        (
+            *("exposure.time", "exposure.first", "exposure.trigger_jitter", "background", "camera.transmission"),
+            *("camera.f_number", "camera.psf", "camera.shutter", *DETECTOR, "tracker.detector", "tracker.centroider"),
+            *("tracker.threshold_sigma", "tracker.min_area_px", "light.led.intensity", "light.led.radiant_intensity"),
+            *("light.led.pwm_period", "light.led.clock"),
+        ),
+        lambda scene, trial: isinstance(trial, CentroidTrial),
+        "a trial of kind centroids has no image: trial.noise_px is the centroids' error",
+        "trial.kind: frames",
+    ),
+    Rule(
+        ("light.led.disk_diameter",),
+        lambda scene, trial: isinstance(trial, CentroidTrial) and not merges_stars(scene),
+        "a trial of kind centroids has no image: trial.noise_px is the centroids' error",
+        "trial.kind: frames",
+    ),
+)
+
+
+class CheckedPoint(NamedTuple):
+    """A point of a study at which options are checked: one factor at a level, the others at their middle.
+
+    own      : settings of that factor alone
+    settings : of all factors
+    """
+
+    factor: str
+    level: Value
+    own: Settings
+    settings: Settings
+    scene: Scene
+    trial: Trial
+
+
+class Fault(NamedTuple):
+    """A key that has no effect, the rule that says so, and the point where it was found."""
+
+    key: str
+    rule: Rule
+    point: CheckedPoint
+
+
+Resolve = Callable[[Settings], tuple[Scene, Trial]]
+
+
+def check(plan: Plan, points: Iterable[CheckedPoint], resolve: Resolve) -> None:
+    """Raise InputError, which begins with a key of the study, for an option that has no effect.
+
+    points  : every level of every factor, the other factors at their middle
+    resolve : makes the scene and the trial from the settings of all factors
+    """
+    written = [*plan.spec.base, *(f"{TRIAL}{key}" for key in plan.spec.trial if key != "kind")]
+    faults: dict[tuple[str, str, str], Fault | None] = {}  # by factor and level ("" for `set` and `trial`), and key
+    for point in points:
+        keys = [("", "", key) for key in written if key not in point.settings]
+        keys += [(point.factor, repr(point.level), key) for key in point.own]
+        for where in keys:
+            if faults.get(where, point) is not None:  # None: it has an effect at an earlier point
+                faults[where] = find(where[2], plan, point)
+    for (name, level, key), fault in faults.items():
+        if fault is None:
+            continue
+        text = unused.message(fault.key, fault.rule)
+        if not name:
+            raise InputError(text if key.startswith(TRIAL) else f"set: {text}")
+        if not has_effect_elsewhere(plan, fault.point, key, resolve):
+            raise InputError(f"factors.{name}: {level}: {text}")
+
+
+def find(key: str, plan: Plan, point: CheckedPoint) -> Fault | None:
+    """The first key, of those that a key of the study sets at a point, that has no effect."""
+    scene, trial = point.scene, point.trial
+    if key.startswith(TRIAL):
+        found = unused.find(RULES, [key], TrialSection.model_construct(trial=trial), scene, trial)
+    else:
+        keys = list(unused.set_keys({key: (plan.spec.base | point.settings)[key]}))
+        found = unused.find(unused.RULES, keys, scene) or unused.find(RULES, keys, scene, scene, trial)
+    return Fault(*found, point) if found else None
+
+
+def has_effect_elsewhere(plan: Plan, point: CheckedPoint, key: str, resolve: Resolve) -> bool:
+    """Whether a key of one factor's level has an effect at some level of another factor, varied alone."""
+    others = {name: factor for name, factor in plan.study.factors.items() if name != point.factor}
+    middle = {name: factor.value_at(0.5) for name, factor in others.items()}
+    for name, factor in others.items():
+        for option in factor.options():
+            everything = make_point(middle | {name: option}).settings | point.own
+            scene, trial = resolve(everything)
+            if find(key, plan, point._replace(settings=everything, scene=scene, trial=trial)) is None:
+                return True
+    return False

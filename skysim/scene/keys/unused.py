@@ -1,0 +1,378 @@
+"""Refuse options that have no effect: the table of rules, and the search for keys that break one.
+
+A rule names keys, the scenes in which they change neither the motion nor a frame nor a solution, and why. A key is
+refused where it is written: in a scene's own file if it has no effect in the scene that this file makes, and in an
+override (`--set`, a study's `set` or factor) if it has none in the resulting scene. Keys of a base scene or a preset
+are tolerated, and so are keys of the file that only an override makes useless, and values that equal the default.
+
+Not refused is what is used elsewhere although a run does not use it: the time tags of frames and `start_time`, which
+are written to the results, and limits of actuators, which other controllers and the exported model obey.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+from skysim.core.errors import InputError
+from skysim.core.units import ConfigModel
+from skysim.core.yaml_reader import Files, location_of, parse_yaml
+from skysim.scene.camera import DetectorConfig
+from skysim.scene.leds import (
+    CelestialConfig,
+    DirectConfig,
+    FibersConfig,
+    FibonacciConfig,
+    LcdConfig,
+    ListedConfig,
+    PatchBoardsConfig,
+    PwmConfig,
+)
+from skysim.scene.light import DomeConfig
+from skysim.scene.scene import Scene
+
+SURFACE_SOLVERS = ("thesis", "ray_on_surface")  # the solvers that use the surveyed surface
+FIXED_DETECTORS = ("thesis",)  # the detectors with thresholds of their own
+OWN = "own"  # skysim's tracker
+
+
+class Rule(NamedTuple):
+    """Keys that have no effect where `applies` is true, why, and what is allowed.
+
+    keys    : dotted keys; that of a section stands for all keys in it
+    applies : takes the scene (in the rules of studies, the scene and the trial)
+    """
+
+    keys: tuple[str, ...]
+    applies: Callable[..., bool]
+    reason: str
+    allowed: str
+
+
+def under_dome(scene: Scene) -> bool:
+    return isinstance(scene.light, DomeConfig)
+
+
+def steady(scene: Scene) -> bool:
+    """Whether all light is steady."""
+    return isinstance(scene.light, DomeConfig) and isinstance(scene.light.led.drive, DirectConfig)
+
+
+def actuators(scene: Scene) -> str:
+    """The actuators that the controller uses; empty without a controller."""
+    return scene.motion.control.actuators if scene.motion.control else ""
+
+
+def external(scene: Scene) -> bool:
+    return scene.tracker.name != OWN
+
+
+def surface_unused(scene: Scene) -> bool:
+    """Whether a map replaces the surveyed LEDs and the solver does not use the surveyed surface."""
+    tracker = scene.tracker
+    return tracker.map is not None and (external(scene) or tracker.solver not in SURFACE_SOLVERS)
+
+
+def survey_draws_nothing(scene: Scene) -> bool:
+    """Whether no survey error is drawn from `tracker.survey.seed`."""
+    survey = scene.tracker.survey
+    surface_m = scene.light.surface.error_m if isinstance(scene.light, DomeConfig) else 0.0
+    return not (survey.led_sigma_m or survey.lever_sigma_m or (surface_m and survey.surface_seed is None))
+
+
+def listed_boards(scene: Scene) -> bool:
+    layout = getattr(scene.light, "layout", None)
+    return isinstance(layout, PatchBoardsConfig) and bool(layout.boards)
+
+
+def dome_draws_nothing(scene: Scene) -> bool:
+    """Whether LEDs, their brightness and their pulses are all without anything random."""
+    if not isinstance(scene.light, DomeConfig) or not steady(scene) or scene.light.led.scatter:
+        return False
+    layout = scene.light.layout
+    if isinstance(layout, FibersConfig) and layout.radius_variation:
+        return False
+    points = layout.points if isinstance(layout, FibersConfig | LcdConfig) else layout
+    if isinstance(points, FibonacciConfig):
+        return len(set(points.dimming)) == 1  # the level of each LED is drawn from the list
+    return isinstance(points, ListedConfig | CelestialConfig)
+
+
+def cold(detector: DetectorConfig) -> bool:
+    """Whether there is no dark current."""
+    return not (detector.dark_e_s or (detector.hot_pixels and detector.hot_e_s))
+
+
+def uniform_chip(detector: DetectorConfig) -> bool:
+    """Whether the chip has no fixed pattern."""
+    dsnu = detector.dsnu and detector.dark_e_s
+    hot = detector.hot_pixels and detector.hot_e_s
+    return not (detector.prnu or detector.column_offset_e or dsnu or hot)
+
+
+def earth_unused(scene: Scene) -> bool:
+    imu = scene.vehicle.imu
+    return not scene.vehicle.disturbances.earth_rotation and (imu is None or imu.earth_rate == "none")
+
+
+RULES = (
+    Rule(
+        ("tracker.catalog", "tracker.limit_mag"),
+        under_dome,
+        "under a dome the tracker's map is of LEDs",
+        "light of kind stars or collimated_display",
+    ),
+    Rule(
+        ("tracker.assumed_camera_body",),
+        lambda scene: not under_dome(scene),
+        "the tracker takes stars to be at infinity, whatever the camera's place",
+        "light of kind dome",
+    ),
+    Rule(
+        ("tracker.options", "tracker.time_limit"),
+        lambda scene: not external(scene),
+        "skysim's own tracker takes no options and has no time limit",
+        "tracker.name: an external tracker",
+    ),
+    Rule(
+        ("tracker.centroider", "tracker.identifier", "tracker.solver", "tracker.centroid_sigma_px"),
+        external,
+        "an external tracker has its own algorithms",
+        "tracker.name: own, or tracker.options",
+    ),
+    Rule(
+        ("tracker.detector", "tracker.threshold_sigma", "tracker.min_area_px", "tracker.brightest"),
+        lambda scene: external(scene) and scene.tracker.exposure_control is None,
+        "an external tracker has its own detection",
+        "tracker.name: own, or tracker.options",
+    ),
+    Rule(
+        ("tracker.threshold_sigma", "tracker.min_area_px"),
+        lambda scene: scene.tracker.detector in FIXED_DETECTORS,
+        "the detector thesis has two fixed thresholds",
+        "another tracker.detector, e.g. threshold",
+    ),
+    Rule(
+        ("tracker.survey.rotation_deg", "tracker.survey.seed", "tracker.survey.surface_seed", "light.surface.error"),
+        surface_unused,
+        "tracker.map replaces the survey of the LEDs, and the solver does not use the surface",
+        f"no tracker.map, or tracker.solver {' or '.join(SURFACE_SOLVERS)}",
+    ),
+    Rule(
+        ("tracker.survey.seed",),
+        survey_draws_nothing,
+        "no survey error is drawn from it",
+        "tracker.survey.led_sigma, tracker.survey.lever_sigma or light.surface.error above 0",
+    ),
+    Rule(
+        ("tracker.survey.surface_seed",),
+        lambda scene: not (isinstance(scene.light, DomeConfig) and scene.light.surface.error_m),
+        "it draws light.surface.error, which is 0",
+        "light.surface.error above 0",
+    ),
+    Rule(
+        ("light.led.pwm_period",),
+        lambda scene: isinstance(scene.light, DomeConfig) and not isinstance(scene.light.led.drive, PwmConfig),
+        "it is the period of the drive pwm",
+        "light.led.drive: {kind: pwm}",
+    ),
+    Rule(
+        ("light.led.clock",),
+        steady,
+        "the drive direct has no pulses to time",
+        "another light.led.drive",
+    ),
+    Rule(
+        ("light.layout.spacing", "light.layout.spread", "light.layout.lit", "light.layout.pwm_levels"),
+        listed_boards,
+        "light.layout.boards lists the boards",
+        "no light.layout.boards",
+    ),
+    Rule(
+        ("light.layout.hardware_seed", "light.layout.points.hardware_seed"),
+        dome_draws_nothing,
+        "nothing of this dome is random",
+        "light.led.scatter, pulsed LEDs or a random layout",
+    ),
+    Rule(
+        ("camera.detector.dsnu",),
+        lambda scene: not scene.camera.detector.dark_e_s,
+        "it is relative to camera.detector.dark_e_s, which is 0",
+        "camera.detector.dark_e_s above 0",
+    ),
+    Rule(
+        ("camera.detector.hot_pixels",),
+        lambda scene: not scene.camera.detector.hot_e_s,
+        "the mean of their dark current, camera.detector.hot_e_s, is 0",
+        "camera.detector.hot_e_s above 0",
+    ),
+    Rule(
+        ("camera.detector.hot_e_s",),
+        lambda scene: not scene.camera.detector.hot_pixels,
+        "there is no hot pixel",
+        "camera.detector.hot_pixels above 0",
+    ),
+    Rule(
+        ("camera.detector.dark_temperature_c", "camera.detector.dark_doubling_c"),
+        lambda scene: scene.camera.detector.temperature_c is None,
+        "the chip has no temperature of its own",
+        "camera.detector.temperature_c",
+    ),
+    Rule(
+        ("camera.detector.temperature_c", "camera.detector.dark_temperature_c", "camera.detector.dark_doubling_c"),
+        lambda scene: cold(scene.camera.detector),
+        "the chip has no dark current",
+        "camera.detector.dark_e_s above 0",
+    ),
+    Rule(
+        ("camera.detector.hardware_seed",),
+        lambda scene: uniform_chip(scene.camera.detector),
+        "the chip has no fixed pattern",
+        "camera.detector.prnu, dsnu, column_offset_e or hot_pixels above 0",
+    ),
+    Rule(
+        ("camera.detector.blooming", "camera.detector.anti_blooming", "camera.detector.particles"),
+        lambda scene: not scene.camera.detector.noise,
+        "with camera.detector.noise: false a frame is the expected value without full well and particles",
+        "camera.detector.noise: true",
+    ),
+    Rule(
+        ("camera.detector.anti_blooming",),
+        lambda scene: scene.camera.detector.blooming == "none",
+        "charge beyond a full well is clipped",
+        "camera.detector.blooming: column",
+    ),
+    Rule(
+        ("site",),
+        earth_unused,
+        "nothing depends on the Earth's rotation",
+        "vehicle.disturbances.earth_rotation, or a vehicle.imu whose earth_rate is not none",
+    ),
+    Rule(
+        ("vehicle.tilt_stop_deg",),
+        lambda scene: scene.vehicle.mount == "free",
+        "a free vehicle has no tilt stop",
+        "vehicle.mount: air_bearing",
+    ),
+    Rule(
+        ("vehicle.cmgs.gimbal_rate_limit_deg_s", "vehicle.cmgs.steering"),
+        lambda scene: actuators(scene) != "cmgs",
+        "nothing commands the CMGs",
+        "motion.control with actuators: cmgs",
+    ),
+    Rule(
+        ("vehicle.imu.gyro.bias_time",),
+        lambda scene: bool(scene.vehicle.imu and not scene.vehicle.imu.gyro.bias_deg_h),
+        "the bias does not vary",
+        "vehicle.imu.gyro.bias_deg_h above 0",
+    ),
+    Rule(
+        ("vehicle.imu.accelerometer.bias_time",),
+        lambda scene: bool(scene.vehicle.imu and not scene.vehicle.imu.accelerometer.bias_ug),
+        "the bias does not vary",
+        "vehicle.imu.accelerometer.bias_ug above 0",
+    ),
+    Rule(
+        ("motion.control.integral_rad_s",),
+        lambda scene: bool(scene.motion.control and scene.motion.control.law == "pd"),
+        "the law pd has no integral",
+        "motion.control.law: pid",
+    ),
+)
+
+
+def check(
+    scene: Scene,
+    own: Mapping[str, Any],
+    overrides: Mapping[str, str],
+    files: Files,
+    without_overrides: Callable[[], Scene],
+) -> None:
+    """Raise InputError for the first key that has no effect, of the overrides or of the scene's own file.
+
+    scene : with the overrides;  own : keys of its own file, not of its base;  files : for the location
+    without_overrides : makes the scene of the file alone
+    """
+    check_overrides([scene], overrides)
+    for key in set_keys(own):
+        broken = find(RULES, [key], scene)
+        if broken and (not overrides or useless_in_file(key, without_overrides)):
+            raise InputError(f"{message(*broken)} {location_of(key.split('.'), files, {})}")
+
+
+def check_overrides(scenes: Sequence[Scene], overrides: Mapping[str, str]) -> None:
+    """Raise InputError for the first key of the overrides that has no effect in any of the scenes."""
+    for key in override_keys(overrides):
+        broken = [find(RULES, [key], scene) for scene in scenes]
+        if broken[0] and all(broken):
+            raise InputError(f"{message(*broken[0])} (--set)")
+
+
+def useless_in_file(key: str, without_overrides: Callable[[], Scene]) -> bool:
+    """Whether a key of a file has no effect there; False if the file alone is not a valid scene."""
+    try:
+        return find(RULES, [key], without_overrides()) is not None
+    except InputError:
+        return False
+
+
+def message(key: str, rule: Rule) -> str:
+    """One line: the key, why it has no effect, and what is allowed."""
+    return f"{key}: has no effect: {rule.reason}; allowed: {rule.allowed}, or no {key.rpartition('.')[2]}"
+
+
+def find(rules: Iterable[Rule], keys: Iterable[str], model: ConfigModel, *subject: Any) -> tuple[str, Rule] | None:
+    """The first of the dotted keys whose value in the model is not the default and has no effect, and its rule.
+
+    subject : arguments of the rules; the model if left out
+    """
+    for key in keys:
+        for rule in rules:
+            section = section_of(key, rule)
+            if section and differs(model, section.split(".")) and rule.applies(*(subject or (model,))):
+                return key, rule
+    return None
+
+
+def reason(key: str, scene: Scene) -> str:
+    """Why a dotted key has no effect in a scene; empty if it has one."""
+    rules = (rule for rule in RULES if section_of(key, rule) and rule.applies(scene))
+    return next((rule.reason for rule in rules), "")
+
+
+def section_of(key: str, rule: Rule) -> str:
+    """The key of a rule that is a dotted key or a section that contains it; empty if there is none."""
+    return next((name for name in rule.keys if key == name or key.startswith(f"{name}.")), "")
+
+
+def differs(model: Any, path: list[str]) -> bool:
+    """Whether the value at a path of YAML keys is in the model, and not the default of its field."""
+    for depth, key in enumerate(path):
+        name = field_names(type(model)).get(key) if isinstance(model, ConfigModel) else None
+        if name is None:
+            return False
+        field, model = type(model).model_fields[name], getattr(model, name)
+        if depth == len(path) - 1:
+            return field.is_required() or bool(model != field.get_default(call_default_factory=True))
+    return False
+
+
+@cache
+def field_names(model: type[ConfigModel]) -> dict[str, str]:
+    """The names of a model's fields by YAML key."""
+    return {field.alias or name: name for name, field in model.model_fields.items()}
+
+
+def set_keys(tree: Mapping[str, Any], parent: str = "") -> Iterator[str]:
+    """The dotted keys that a raw section sets; lists are values."""
+    for key, value in tree.items():
+        if isinstance(value, dict) and value:
+            yield from set_keys(value, f"{parent}{key}.")
+        else:
+            yield f"{parent}{key}"
+
+
+def override_keys(overrides: Mapping[str, str]) -> list[str]:
+    """The dotted keys that overrides set; a section as a value sets all keys in it."""
+    return list(set_keys({key: parse_yaml(text)[1] for key, text in overrides.items()}))

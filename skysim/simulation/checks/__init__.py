@@ -1,0 +1,8 @@
+"""Check a plan before its run: facts about field, lights, images and expected errors, and warnings.
+
+`plan.check` computes all of it from a test bed whose motion is not simulated yet: `attitudes` samples directions,
+`views` projects the lights, `detection` and `expected_error` predict the tracker, `facts` and `findings` say it.
+"""
+
+from skysim.simulation.checks.plan import Check as Check
+from skysim.simulation.checks.plan import check as check

@@ -1,0 +1,129 @@
+"""Attitudes at which a scene is checked: those of its frames, and all that its motion could reach.
+
+The frames' attitudes are those of the reference maneuver, or of a constant rate if there is no controller: the motion
+itself is not simulated.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats, Mount
+from skysim.dynamics import guidance, multibody
+from skysim.scene.light import StarsConfig
+from skysim.scene.scene import Scene
+from skysim.simulation.testbed import Testbed
+
+MAX_FRAMES = 400  # frames at which the reference is evaluated to find the fastest and the most tilted one
+FRAMES = 16  # frames that are checked
+DIRECTIONS = 48  # attitudes that the motion could reach
+GOLDEN_RAD = math.pi * (3 - math.sqrt(5))  # between successive azimuths of a Fibonacci spiral
+GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
+
+
+class Attitudes(NamedTuple):
+    """N attitudes.
+
+    lab_from_body   : N rotations
+    rate_body_rad_s : (N, 3) in body axes; zeros where only the direction is of interest
+    t_s             : (N,) time of the frame; NaN where it is none
+    """
+
+    lab_from_body: Rotation
+    rate_body_rad_s: Floats
+    t_s: Floats
+
+
+def of_frames(testbed: Testbed) -> Attitudes:
+    """Attitudes at mid-exposure of some frames: evenly spaced ones, the fastest and the most tilted."""
+    scene, count = testbed.scene, testbed.scene.exposure.frames
+    exposure = scene.exposure
+    index = np.unique(np.linspace(0, count - 1, min(count, MAX_FRAMES)).astype(int))
+    t_s = exposure.first_s + index / exposure.rate_hz + exposure.time_s / 2
+    every = attitudes_at(testbed, t_s)
+    chosen = set(np.linspace(0, len(index) - 1, min(len(index), FRAMES)).astype(int))
+    chosen |= {int(np.linalg.norm(every.rate_body_rad_s, axis=1).argmax()), int(tilts_rad(every).argmax())}
+    rows = np.array(sorted(chosen))
+    tilt_rad = tilts_rad(every)[rows]
+    if scene.vehicle.mount == "air_bearing":
+        check_stop(scene, t_s[rows], np.degrees(tilt_rad))
+        rows = rows[tilt_rad <= math.radians(scene.vehicle.tilt_stop_deg)]
+    return Attitudes(every.lab_from_body[rows], every.rate_body_rad_s[rows], t_s[rows])
+
+
+def check_stop(scene: Scene, t_s: Floats, tilt_deg: Floats) -> None:
+    """Raise InputError for a start or a maneuver beyond the tilt stop, as a run would."""
+    stop_deg, beyond = scene.vehicle.tilt_stop_deg, np.flatnonzero(tilt_deg > scene.vehicle.tilt_stop_deg)
+    if len(beyond) == len(tilt_deg):
+        raise InputError(
+            f"motion.start: tilt of {tilt_deg[0]:.1f} deg; allowed: up to vehicle.tilt_stop_deg {stop_deg:g}"
+        )
+    if len(beyond) and scene.motion.control is not None:
+        raise InputError(
+            f"motion.maneuver: tilt of {tilt_deg[beyond[0]]:.3g} deg at {t_s[beyond[0]]:.3g} s; allowed: up to"
+            f" vehicle.tilt_stop_deg {stop_deg:g}"
+        )
+
+
+def attitudes_at(testbed: Testbed, t_s: Floats) -> Attitudes:
+    """The commanded attitudes at (N,) times; without a controller those of the initial rate, kept constant."""
+    scene, lab_from_start = testbed.scene, testbed.trajectory.lab_from_body[0]
+    if scene.motion.control is None:
+        rate = np.radians(scene.motion.rate_deg_s)
+        return Attitudes(lab_from_start * Rotation.from_rotvec(np.outer(t_s, rate)), np.tile(rate, (len(t_s), 1)), t_s)
+    reference = guidance.plan(scene.motion, lab_from_start, testbed.profiles)
+    states = [reference.state_at(float(t)) for t in t_s]
+    lab_from_body = Rotation.from_quat(np.array([state[0] for state in states]), scalar_first=True)
+    return Attitudes(lab_from_body, np.array([state[1] for state in states]), t_s)
+
+
+def tilts_rad(attitudes: Attitudes) -> Floats:
+    """(N,) angles between the body's z and the lab's."""
+    return np.radians(multibody.tilt_deg(attitudes.lab_from_body))
+
+
+def greatest_tilt_rad(scene: Scene, frames: Attitudes) -> float:
+    """The greatest tilt of the maneuver; without a controller on a bearing, the tilt stop."""
+    if scene.motion.control is None and scene.vehicle.mount == "air_bearing":
+        return math.radians(scene.vehicle.tilt_stop_deg)
+    return float(tilts_rad(frames).max())
+
+
+def within_reach(scene: Scene, mount: Mount, frames: Attitudes) -> Attitudes:
+    """Attitudes that a motion could reach: under the stars all, else any azimuth and yaw up to the greatest tilt.
+
+    Directions are even on a Fibonacci spiral; the angles about them are even too.
+    """
+    n = np.arange(DIRECTIONS)
+    turn_rad = 2 * np.pi * np.mod(n / GOLDEN_RATIO, 1.0)
+    if isinstance(scene.light, StarsConfig):
+        zenith_rad = np.arccos(1 - 2 * (n + 0.5) / DIRECTIONS)
+        lab_from_cam = Rotation.from_euler("ZYZ", np.column_stack([n * GOLDEN_RAD, zenith_rad, turn_rad]))
+        lab_from_body = lab_from_cam * mount.cam_from_body
+    else:
+        cosine = math.cos(greatest_tilt_rad(scene, frames))
+        tilt_rad = np.arccos(1 - n / (DIRECTIONS - 1) * (1 - cosine))  # the last one is the greatest tilt
+        azimuth_rad = n * GOLDEN_RAD
+        # With a yaw of minus the azimuth, the tilt is about a horizontal axis.
+        angles = np.column_stack([azimuth_rad, tilt_rad, turn_rad - azimuth_rad])
+        lab_from_body = Rotation.from_euler("ZYZ", angles)
+    return Attitudes(lab_from_body, np.zeros((DIRECTIONS, 3)), np.full(DIRECTIONS, np.nan))
+
+
+def describe(attitudes: Attitudes, n: int, scene: Scene, mount: Mount) -> str:
+    """An attitude in words: RA and Dec of the boresight, or the vehicle's roll, pitch, yaw and tilt; and the time."""
+    lab_from_body, t_s = attitudes.lab_from_body[n], attitudes.t_s[n]
+    if isinstance(scene.light, StarsConfig):
+        x, y, z = (lab_from_body * mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
+        ra_deg, dec_deg = math.degrees(math.atan2(y, x)) % 360, math.degrees(math.asin(min(max(z, -1.0), 1.0)))
+        where = f"RA {ra_deg:.1f}° Dec {dec_deg:+.1f}°"
+    else:
+        yaw, pitch, roll = (angle + 0.0 for angle in np.round(lab_from_body.as_euler("ZYX", degrees=True), 1))  # no -0
+        tilt_deg = float(multibody.tilt_deg(lab_from_body))
+        where = f"roll {roll:.1f}° pitch {pitch:.1f}° yaw {yaw:.1f}°, a tilt of {tilt_deg:.1f}°"
+    return where if math.isnan(t_s) else f"{where} (t = {t_s:.1f} s)"

@@ -1,0 +1,221 @@
+"""What the tracker believes of lights and hardware, and how that differs from the truth or may differ from it.
+
+Stars are measured elsewhere than believed because of the catalog's errors and because of neighbors: one within a star's
+image displaces its centroid. A weighted fit of a Gaussian g of N electrons over a background of b electrons^2 a pixel
+responds to f electrons at the distance d with the displacement along d
+
+    r = sum(w g' f g(x - d)) / sum(w (N + f exp(-d^2 / 4 s^2)) g'^2),      w = 1 / (b + N g),
+
+to first order; for d far below s this is f d / (N + f), the center of light.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from estimator.catalog import catalog
+from estimator.catalog.catalog import StarCatalog
+from skysim.core.types import Floats, Sources
+from skysim.scene.camera import CameraConfig
+from skysim.scene.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene.scene import Scene
+from skysim.simulation.checks.views import CameraModel
+from skysim.simulation.testbed import Testbed
+from skysim.sources.dome import display
+from skysim.tracking import dome_map_file
+from skysim.tracking.factory import onboard_catalog
+from skysim.tracking.onboard_model import assumed_camera
+from skysim.tracking.settings import assumed_settings
+
+REACH_PX = 7.0  # of neighbors
+WINDOW_PX = 3  # half the side of the fit's window
+
+
+@dataclass(frozen=True, slots=True)
+class Beliefs:
+    """What the tracker believes. Standard deviations are of a survey that is still to be drawn.
+
+    lights         : the sources that it knows, N of them
+    direction_error : (N, 3) measured minus believed direction of each star, from the catalog's error and from
+        neighbors, in lab axes; zeros for LEDs
+    led_sigma_m, lever_sigma_m : of the surveyed places, about each axis
+    surface_sigma_m : of the surveyed surface, along its normal, common to all LEDs
+    rotation_rad   : (3,) rotation of the survey's axes, in lab axes
+    lever_error_m  : (3,) believed minus true place of the camera, in body axes
+    focal_error, focal_sigma : relative error of the focal length, and its standard deviation
+    camera         : the camera with the believed distortion
+    faintest_mag   : of the stars that it knows; infinite under a dome
+    epoch_jyear    : of its star catalog; NaN under a dome
+    """
+
+    lights: Sources
+    direction_error: Floats
+    led_sigma_m: float
+    lever_sigma_m: float
+    surface_sigma_m: float
+    rotation_rad: Floats
+    lever_error_m: Floats
+    focal_error: float
+    focal_sigma: float
+    camera: CameraConfig
+    faintest_mag: float
+    epoch_jyear: float
+
+
+def of(testbed: Testbed, camera: CameraModel) -> Beliefs:
+    """The beliefs of a test bed's tracker. Raises InputError for a map or a catalog that cannot be read."""
+    scene = testbed.scene
+    tracker, believed = scene.tracker, assumed_camera(scene)
+    lights, direction_error, faintest_mag, epoch_jyear = known_lights(testbed, camera)
+    config = scene.camera.model_copy(update={"distortion": believed.distortion})
+    focal_error = believed.focal_px / scene.camera.focal_px - 1
+    assumed_m = tracker.assumed_camera_body_m
+    lever_error_m = np.zeros(3) if assumed_m is None else np.array(assumed_m) - testbed.mount.camera_body_m
+    if tracker.map:
+        mapped = dome_map_file.read_dome_map(Path(tracker.map))
+        return Beliefs(
+            lights,
+            direction_error,
+            float(np.median(mapped.sigma_m)),
+            mapped.lever_sigma_m,
+            0.0,
+            np.zeros(3),
+            np.zeros(3),
+            0.0,
+            mapped.focal_sigma_px / mapped.focal_px,
+            config,
+            faintest_mag,
+            epoch_jyear,
+        )
+    survey = tracker.survey
+    surface_m = scene.light.surface.error_m if isinstance(scene.light, DomeConfig) else 0.0
+    return Beliefs(
+        lights,
+        direction_error,
+        survey.led_sigma_m,
+        survey.lever_sigma_m,
+        surface_m,
+        np.radians(survey.rotation_deg),
+        lever_error_m,
+        focal_error,
+        0.0,
+        config,
+        faintest_mag,
+        epoch_jyear,
+    )
+
+
+def known_lights(testbed: Testbed, camera: CameraModel) -> tuple[Sources, Floats, float, float]:
+    """The sources that the tracker knows, (N, 3) errors of their directions, the faintest star, the catalog's epoch."""
+    scene, sources = testbed.scene, testbed.sources
+    if isinstance(scene.light, DomeConfig):
+        if scene.tracker.map:
+            known = np.isin(sources.id, dome_map_file.read_dome_map(Path(scene.tracker.map)).id)
+            sources = sources.take(known)
+        return sources, np.zeros((len(sources), 3)), math.inf, math.nan
+    stars = believed_stars(testbed)
+    lights, error = known_stars(testbed, stars, camera)
+    return lights, error, float(stars.v_mag.max(initial=-math.inf)), stars.epoch_yr
+
+
+def believed_stars(testbed: Testbed) -> StarCatalog:
+    """The tracker's stars at their believed directions in lab axes, unresolved ones merged. Raises InputError."""
+    scene = testbed.scene
+    stars = catalog.brighter_than(onboard_catalog(scene.tracker.catalog), scene.tracker.limit_mag)
+    directions = catalog.apparent(stars, catalog.on_earth(scene.start_time))
+    if isinstance(scene.light, CollimatedDisplayConfig):
+        directions = display.lab_from_icrs(scene.light).apply(directions)
+    merge_rad = assumed_settings(scene).merge_px / scene.camera.focal_px
+    return catalog.merge_doubles(replace(stars, vectors=directions), merge_rad)
+
+
+def known_stars(testbed: Testbed, stars: StarCatalog, camera: CameraModel) -> tuple[Sources, Floats]:
+    """The sources that the tracker knows, and (N, 3) measured minus believed direction of each, in lab axes."""
+    sources = testbed.sources
+    row, star = common(sources.id, stars.id)
+    place = sources.place[:, :3] / np.linalg.norm(sources.place[:, :3], axis=1, keepdims=True)
+    shift = neighbor_shift(place, sources.strength * testbed.optics.collecting_m2, row, camera)
+    return sources.take(row), place[row] + shift - stars.vectors[star]
+
+
+def neighbor_shift(place: Floats, rate_e_s: Floats, row: NDArray[np.int64], camera: CameraModel) -> Floats:
+    """(N, 3) displacement of the directions of some stars by the images of their neighbors.
+
+    place : (M, 3) unit vectors of all sources;  rate_e_s : (M,) photo-electrons per second
+    row   : (N,) the stars
+    """
+    focal_px = camera.optics.camera.focal_px
+    reach = cKDTree(place[row]).sparse_distance_matrix(cKDTree(place), REACH_PX / focal_px, output_type="ndarray")
+    pairs = reach[row[reach["i"]] != reach["j"]]
+    first, second = row[pairs["i"]], pairs["j"]
+    apart = place[second] - place[first]
+    apart_px = focal_px * np.linalg.norm(apart, axis=1)
+    electrons = rate_e_s * camera.exposure_s
+    moved_px = response_px(apart_px, electrons[first], electrons[second], camera)
+    shift = np.zeros((len(row), 3))
+    np.add.at(shift, pairs["i"], (moved_px / np.maximum(apart_px, 1e-9))[:, None] * apart)
+    return shift
+
+
+def response_px(apart_px: Floats, star_e: Floats, neighbor_e: Floats, camera: CameraModel) -> Floats:
+    """(P,) displacement of a star's fitted position toward a neighbor; see the module's description."""
+    x, y = (axis.ravel() for axis in np.mgrid[-WINDOW_PX : WINDOW_PX + 1, -WINDOW_PX : WINDOW_PX + 1])
+    s2 = camera.lens_px**2
+
+    def image(offset_px: Floats) -> Floats:
+        return np.asarray(np.exp(-((x - offset_px) ** 2 + y**2) / (2 * s2)) / (2 * math.pi * s2))
+
+    own, other = image(np.zeros(1)), image(apart_px[:, None])
+    slope = own * x / s2
+    weight = 1 / (camera.noise_e**2 + star_e[:, None] * own)
+    total_e = star_e + neighbor_e * np.exp(-(apart_px**2) / (4 * s2))
+    return np.asarray(neighbor_e * (weight * slope * other).sum(axis=1) / (total_e * (weight * slope**2).sum(axis=1)))
+
+
+def common(first: NDArray[np.int64], second: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The rows of equal numbers in two lists, in the order of the first."""
+    _, a, b = np.intersect1d(first, second, return_indices=True)
+    order = np.argsort(a)
+    return a[order], b[order]
+
+
+def describe(beliefs: Beliefs, scene: Scene) -> list[str]:
+    """What the tracker believes, one line for each thing that is uncertain or wrong; else that all is as it is."""
+    lines = []
+    if not math.isnan(beliefs.epoch_jyear):
+        error_arcsec = np.degrees(np.linalg.norm(beliefs.direction_error, axis=1)) * 3600
+        differ = f"; its stars are {np.median(error_arcsec):.2g}″ (median) from the sky's" if len(error_arcsec) else ""
+        lines.append(
+            f"{len(beliefs.lights)} stars to V {beliefs.faintest_mag:.2f} of {Path(scene.tracker.catalog).stem}, epoch"
+            f" J{beliefs.epoch_jyear:.2f} moved to {scene.start_time:%Y-%m-%d}{differ}"
+        )
+    source = f"tracker.map {Path(scene.tracker.map).name}" if scene.tracker.map else "tracker.survey"
+    sigmas = {
+        "LEDs": beliefs.led_sigma_m,
+        "the lever": beliefs.lever_sigma_m,
+        "the surface": beliefs.surface_sigma_m,
+    }
+    known = [f"{what} to {1e3 * sigma_m:.3g} mm" for what, sigma_m in sigmas.items() if sigma_m]
+    if known:
+        lines.append(f"{', '.join(known)} about each axis ({source})")
+    elif isinstance(scene.light, DomeConfig):
+        lines.append("every LED and the lever exactly (tracker.survey)")
+    if beliefs.rotation_rad.any():
+        lines.append(f"the survey's axes rotated by {np.degrees(np.linalg.norm(beliefs.rotation_rad)) * 3600:.3g}″")
+    if beliefs.lever_error_m.any() and isinstance(scene.light, DomeConfig):
+        lines.append(f"the lever wrong by {1e3 * np.linalg.norm(beliefs.lever_error_m):.3g} mm (assumed_camera_body)")
+    if beliefs.focal_error:
+        lines.append(f"the focal length wrong by {100 * beliefs.focal_error:+.3g} % (assumed_focal_length)")
+    if beliefs.focal_sigma:
+        lines.append(f"the focal length to {100 * beliefs.focal_sigma:.2g} % ({source})")
+    if beliefs.camera.distortion != scene.camera.distortion:
+        lines.append("another distortion than the lens's (assumed_distortion)")
+    elif not beliefs.focal_error and not beliefs.focal_sigma:
+        lines.append("focal length and distortion exactly")
+    return lines

@@ -1,0 +1,149 @@
+"""Which lights the tracker detects, and how accurate their centroids are."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import special
+
+from estimator.trackers.pipeline import SATURATED_SIGMA_PX, Settings
+from skysim.camera.detector.detector import saturation_dn
+from skysim.core.types import Floats
+from skysim.scene.camera import DetectorConfig
+from skysim.scene.light import DomeConfig
+from skysim.simulation.checks import beliefs
+from skysim.simulation.checks.beliefs import Beliefs
+from skysim.simulation.checks.views import CameraModel, View, peak_share
+from skysim.simulation.testbed import Testbed
+from skysim.sources.dome.surface import Surface, build_surface
+from skysim.tracking.settings import assumed_settings
+
+BINOMIAL_VARIANCE_PX2 = 0.5  # that the detectors' filter [1 2 1] / 4 adds to an image, each axis
+FILTERED_NOISE = 0.375  # factor of that filter on the noise of a pixel
+THESIS_THRESHOLD = 0.04  # of full scale: the detector `thesis`
+COG_MARGIN_PX = 4.5  # of the window about the pixels above the threshold, half a pixel included
+PHASES = 64  # of a pulse train against the exposure
+MAX_PULSES = 500  # in an exposure; with more the mean time of the light does not vary
+
+
+class Context(NamedTuple):
+    """What all checks share: the test bed, the tracker's settings and beliefs, the camera, and the dome's surface.
+
+    timing_s : (N,) standard deviation of the mean time of each light that the tracker knows within an exposure
+    """
+
+    testbed: Testbed
+    settings: Settings
+    beliefs: Beliefs
+    camera: CameraModel
+    surface: Surface | None
+    timing_s: Floats
+
+
+def context_of(testbed: Testbed) -> Context:
+    """The context of a test bed. Raises InputError for a map or a catalog that cannot be read."""
+    camera = CameraModel.of(testbed)
+    believed = beliefs.of(testbed, camera)
+    light, lights = testbed.scene.light, believed.lights
+    surface = build_surface(light.surface) if isinstance(light, DomeConfig) else None
+    timing_s = timing_sigma_s(lights.period_s, lights.on_s, testbed.scene.exposure.time_s)
+    return Context(testbed, assumed_settings(testbed.scene), believed, camera, surface, timing_s)
+
+
+def threshold_e(context: Context) -> float:
+    """Electrons above the background from which a pixel, filtered by the binomial, belongs to a detection."""
+    settings, camera = context.settings, context.camera
+    if settings.detector == "thesis":
+        full_e = full_scale_e(context.testbed.scene.camera.detector)
+        return max(THESIS_THRESHOLD * full_e - camera.background_e, 1.0)
+    return settings.threshold_sigma * FILTERED_NOISE * camera.noise_e
+
+
+def full_scale_e(detector: DetectorConfig) -> float:
+    """Electrons of a pixel at the saturation of the converter or the well."""
+    return (saturation_dn(detector) - detector.offset_dn) * detector.gain_e_dn
+
+
+def detected_area_px(view: View, context: Context) -> Floats:
+    """(n,) area of a light above the detection threshold, px^2.
+
+    A disk of radius R blurred by a Gaussian s is above the threshold T to r = R + s sqrt(2 ln(peak / T)), exact for a
+    Gaussian alone (R = 0); moved by L it covers pi r^2 + 2 r L.
+    """
+    blur2_px2 = view.blur2_px2 + BINOMIAL_VARIANCE_PX2
+    share = peak_share(blur2_px2, view.disk_px, view.defocus_px, view.streak_length_px)
+    ratio = np.maximum(view.electrons * share / threshold_e(context), 1e-9)
+    large, small = np.maximum(view.disk_px, view.defocus_px), np.minimum(view.disk_px, view.defocus_px)
+    radius = large + np.sqrt((blur2_px2 + small**2 / 4) * 2 * np.maximum(np.log(ratio), 0))
+    return np.asarray(np.where(ratio > 1, np.pi * radius**2 + 2 * radius * view.streak_length_px, 0.0))
+
+
+def usable(view: View, context: Context) -> View:
+    """The lights that the tracker detects whole on the chip, at most `tracker.brightest` of them."""
+    settings, config = context.settings, context.testbed.scene.camera
+    edge = np.minimum(view.xy_px, np.array([config.width_px, config.height_px]) - 1 - view.xy_px).min(axis=1)
+    area = detected_area_px(view, context)
+    found = np.flatnonzero((area >= settings.min_area_px) & (edge > np.sqrt(area / np.pi)))
+    return view.take(found[np.argsort(-view.electrons[found], kind="stable")][: settings.max_blobs])
+
+
+def centroid_variance(view: View, context: Context) -> Floats:
+    """(n, 2, 2) covariance of the centroids, px^2.
+
+    Photon noise sigma^2 / N and background noise of b electrons^2 a pixel: for a center of gravity in a window of side
+    W, sigma^2 / N + b W^4 / (12 N^2); for a fit, the Cramer-Rao bound of a Gaussian (`fit_loss`). Then sensitivity that
+    varies by p from pixel to pixel, p^2 sum(I^2 x^2) / N^2, which is p^2 / (8 pi) for a Gaussian and p^2 / (4 pi) for a
+    disk; the mean time of pulsed light, timing^2 v v'; and the plateau of a saturated image.
+    """
+    testbed, camera = context.testbed, context.camera
+    noise_e2, n_e = camera.noise_e**2, np.maximum(view.electrons, 1e-9)
+    along2 = view.sigma_px**2 + view.streak_length_px**2 / 12
+    if context.settings.centroider == "cog":
+        side = 2 * (np.sqrt(detected_area_px(view, context) / np.pi) + COG_MARGIN_PX)
+        floor = noise_e2 * side**4 / (12 * n_e**2)
+        along, across = along2 / n_e + floor, view.sigma_px**2 / n_e + floor
+    else:
+        loss = fit_loss(2 * np.pi * np.sqrt(along2) * view.sigma_px * noise_e2 / n_e)
+        along, across = along2 / n_e * loss, view.sigma_px**2 / n_e * loss
+    disk = (view.disk_px**2 + view.defocus_px**2) / 4 / view.sigma_px**2
+    pattern = testbed.scene.camera.detector.prnu**2 / (8 * np.pi) * (1 + disk)
+    plateau = SATURATED_SIGMA_PX**2 * (view.peak_e >= full_scale_e(testbed.scene.camera.detector))
+    unit = view.streak_px / np.maximum(view.streak_length_px, 1e-12)[:, None]
+    along_path = unit[:, :, None] * unit[:, None, :]
+    moved = (view.streak_px / testbed.scene.exposure.time_s) * context.timing_s[view.row, None]
+    return np.asarray(
+        (across + pattern + plateau)[:, None, None] * np.eye(2)
+        + (along - across)[:, None, None] * along_path
+        + moved[:, :, None] * moved[:, None, :]
+    )
+
+
+def fit_loss(tau: Floats) -> Floats:
+    """Factor on sigma^2 / N by which background increases the least variance of a Gaussian's fitted position.
+
+    1 / (1 + integral from 0 to 1 of ln t / (1 + t / tau) dt), tau = 2 pi sigma^2 b / N (Mortensen et al. 2010, Nature
+    Methods 7, 377); the integral is tau Li2(-1 / tau). It is 1 without background and tends to 4 tau.
+    """
+    tau = np.maximum(tau, 1e-9)
+    return np.asarray(1 / (1 + tau * special.spence(1 + 1 / tau)))
+
+
+def timing_sigma_s(period_s: Floats, on_s: Floats, exposure_s: float) -> Floats:
+    """(N,) standard deviation of the mean time of pulsed light within an exposure, over the phase of the pulses.
+
+    The first and the last pulse are cut at the ends of the exposure by an amount that the phase decides.
+    """
+    pairs, index = np.unique(np.column_stack([period_s, on_s]), axis=0, return_inverse=True)
+    sigma = np.zeros(len(pairs))
+    for k, (period, on) in enumerate(pairs):
+        count = int(exposure_s / period) + 2
+        if on >= period or count > MAX_PULSES:
+            continue
+        begin = (np.arange(PHASES) + 0.5)[:, None] / PHASES * period + (np.arange(count) - 1) * period
+        first, last = np.clip(begin, 0, exposure_s), np.clip(begin + on, 0, exposure_s)
+        lit = last - first
+        total = lit.sum(axis=1)
+        mean = (lit * (first + last) / 2).sum(axis=1)[total > 0] / total[total > 0]
+        sigma[k] = np.std(mean) if len(mean) else 0.0
+    return np.asarray(sigma[index.ravel()])

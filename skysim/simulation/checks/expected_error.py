@@ -1,0 +1,252 @@
+"""Expected error of a solution, from the Jacobians of the image positions, and its causes.
+
+A solution is a rotation of the camera, found by weighted least squares from the image positions x_i of n lights. For a
+small rotation w of the lights in camera axes, dx_i = J_i w. An error e_i of the measured or predicted position causes,
+to first order, the attitude error
+
+    w = sum_i K_i e_i,      K_i = M^-1 J_i' / s_i^2,      M = sum_i J_i' J_i / s_i^2,
+
+with M the Fisher information of the rotation for the standard deviations s_i that the tracker believes (its weights).
+Each cause is an e_i, so each has its own covariance of w:
+
+    independent in each light, covariance S_i      sum_i K_i S_i K_i'         centroid noise, LED survey
+    common to all lights, E_i p, p unit variance   B B',  B = sum_i K_i E_i   lever, surface, focal length, ...
+
+A known error is one of the second kind with p = 1. With G_i the derivative of x_i by the light's place in camera axes:
+
+    centroid noise : S_i of `centroid_variance`
+    LED survey     : S_i = sigma^2 G_i G_i'                  lever survey : E_i = -sigma G_i
+    surface survey : E_i = sigma G_i R n_i, n_i the normal   focal length : E_i = relative error (x_i - center)
+    survey rotation r : E_i = G_i R (r x P_i)                distortion, star places : difference of the image positions
+    rolling shutter : E_i = velocity times the row's delay from the middle row
+
+The error of a solver's own approximation (thesis, infinity, ...) is what it errs for exact rays. `pnp` also fits the
+camera's place, so its J_i has three more columns. Variances about x and y add up to cross, that about z is roll.
+Star places are those of the catalog and of images with
+neighbors (star_places.py). Errors that are left out: neighbors of LEDs, jitter, a light's identity.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.dome_map import LedMap, Lever
+from estimator.attitude.nearfield import SOLVERS
+from estimator.identification.chance import MIN_EVIDENCE_MATCHES
+from skysim.camera.optics import Optics
+from skysim.core.types import Floats
+from skysim.core.units import ARCSEC_RAD
+from skysim.scene.camera import RollingShutterConfig
+from skysim.simulation.checks.attitudes import Attitudes
+from skysim.simulation.checks.detection import Context, centroid_variance
+from skysim.simulation.checks.views import View
+
+
+class Independent(NamedTuple):
+    """An error that is independent in each light: (n, 2, 2) covariances of the image positions, px^2."""
+
+    covariance_px2: Floats
+
+
+class Common(NamedTuple):
+    """Errors common to all lights: (n, 2, k) displacement of the image positions by k of unit variance, px."""
+
+    displacement_px: Floats
+
+
+class Expected(NamedTuple):
+    """Variances of the attitude error at A attitudes, by cause: (A,) each, rad^2; NaN with too few lights."""
+
+    cross_rad2: dict[str, Floats]
+    roll_rad2: dict[str, Floats]
+
+    def by_cause(self, angle: str) -> dict[str, Floats]:
+        """The variances of `cross` or `roll`."""
+        return self.cross_rad2 if angle == "cross" else self.roll_rad2
+
+    def total(self, angle: str) -> Floats:
+        """(A,) variance of `cross` or `roll` of all causes together; NaN with too few lights."""
+        return np.asarray(sum(self.by_cause(angle).values()))
+
+    def rms_arcsec(self) -> tuple[float, float]:
+        """Root mean square of cross and roll over the attitudes; NaN without any solution."""
+        return mean_root(self.total("cross")), mean_root(self.total("roll"))
+
+
+def mean_root(variance_rad2: Floats) -> float:
+    """Root of the mean of the finite variances, arcseconds; NaN if there is none."""
+    finite = variance_rad2[np.isfinite(variance_rad2)]
+    return float(np.sqrt(finite.mean()) / ARCSEC_RAD) if len(finite) else math.nan
+
+
+# Causes of the attitude error. Each returns the errors of the image positions, or None if there is no such cause.
+
+
+def led_survey(view: View, lab_from_cam: Rotation, context: Context) -> Independent | None:
+    sigma_m = context.beliefs.led_sigma_m
+    return Independent(sigma_m**2 * view.gradient @ np.swapaxes(view.gradient, 1, 2)) if sigma_m else None
+
+
+def lever_survey(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    sigma_m = context.beliefs.lever_sigma_m
+    return Common(-sigma_m * view.gradient) if sigma_m else None
+
+
+def surface_survey(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    sigma_m, surface = context.beliefs.surface_sigma_m, context.surface
+    if not sigma_m or surface is None:
+        return None
+    normal = surface.inward(context.beliefs.lights.place[view.row, :3])
+    return displacement(view, -sigma_m * normal, lab_from_cam)
+
+
+def survey_rotation(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    rotation_rad = context.beliefs.rotation_rad
+    if not rotation_rad.any():
+        return None
+    return displacement(view, np.cross(rotation_rad, context.beliefs.lights.place[view.row, :3]), lab_from_cam)
+
+
+def assumed_lever(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    error_m = context.beliefs.lever_error_m
+    if not error_m.any() or context.surface is None:
+        return None
+    return Common(-(view.gradient @ context.testbed.mount.cam_from_body.apply(error_m))[:, :, None])
+
+
+def focal_length(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    error = math.hypot(context.beliefs.focal_error, context.beliefs.focal_sigma)
+    if not error:
+        return None
+    return Common(error * (view.xy_px - np.array(context.camera.optics.camera.center_px))[:, :, None])
+
+
+def distortion(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    believed = context.beliefs.camera
+    if believed.distortion == context.camera.optics.camera.distortion:
+        return None
+    shift_px = Optics.from_camera(believed).project(view.offset_m) - view.xy_px
+    return Common(np.nan_to_num(shift_px)[:, :, None])
+
+
+def star_places(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    error = context.beliefs.direction_error[view.row]
+    return displacement(view, error, lab_from_cam) if error.any() else None
+
+
+def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    camera = context.camera.optics.camera
+    if not isinstance(camera.shutter, RollingShutterConfig):
+        return None
+    delay_s = camera.shutter.row_time_s * (view.xy_px[:, 1] - (camera.height_px - 1) / 2)
+    return Common((view.streak_px / context.testbed.scene.exposure.time_s * delay_s[:, None])[:, :, None])
+
+
+def displacement(view: View, shift_lab: Floats, lab_from_cam: Rotation) -> Common:
+    """The displacement of the images by shifts (n, 3) of the lights in lab axes."""
+    return Common(np.einsum("nij,nj->ni", view.gradient, lab_from_cam.inv().apply(shift_lab))[:, :, None])
+
+
+CAUSES: dict[str, Callable[[View, Rotation, Context], Independent | Common | None]] = {
+    "LED survey": led_survey,
+    "lever survey": lever_survey,
+    "surface survey": surface_survey,
+    "survey rotation": survey_rotation,
+    "assumed lever": assumed_lever,
+    "focal length": focal_length,
+    "distortion": distortion,
+    "star places": star_places,
+    "rolling shutter": rolling_shutter,
+}
+CENTROIDS, SOLVER = "centroid noise", "solver"  # the causes that are not displacements of all images
+EXACT_SOLVERS = ("rotation_only", "pnp")  # without an error of their own
+
+
+# Propagation to the attitude.
+
+
+def gains(view: View, sigma_px: Floats, fits_place: bool = False) -> Floats:
+    """(n, 3, 2) K_i: the rotation by a unit error of each image position, for weights 1 / sigma^2.
+
+    fits_place : the camera's place is fitted too
+    Raises LinAlgError if the lights do not determine the rotation.
+    """
+    jacobian = np.concatenate([view.jacobian, view.gradient], axis=2) if fits_place else view.jacobian
+    weighted = jacobian / sigma_px[:, None, None] ** 2
+    # Columns are scaled, because a rotation and a shift in meters have different sizes.
+    size = np.sqrt(np.einsum("nij,nij->j", jacobian, jacobian))
+    information = np.einsum("nij,nik->jk", weighted, jacobian) / np.outer(size, size)
+    if np.linalg.cond(information) > 1e14:
+        raise np.linalg.LinAlgError("singular")
+    inverse = np.linalg.inv(information) / np.outer(size, size)
+    return np.asarray((inverse @ np.swapaxes(weighted, 1, 2))[:, :3])
+
+
+def covariance(gain: Floats, errors: Independent | Common) -> Floats:
+    """(3, 3) covariance of the rotation in camera axes, rad^2."""
+    if isinstance(errors, Independent):
+        return np.asarray(np.einsum("nij,njk,nlk->il", gain, errors.covariance_px2, gain))
+    response = np.einsum("nij,njk->ik", gain, errors.displacement_px)
+    return np.asarray(response @ response.T)
+
+
+def believed_sigma_px(view: View, noise: Independent, context: Context) -> Floats:
+    """(n,) standard deviation of an image position as the tracker believes it: centroid, floor and LED survey."""
+    settings, beliefs = context.settings, context.beliefs
+    own2 = np.trace(noise.covariance_px2, axis1=1, axis2=2) / 2
+    survey_px = 0.0
+    if beliefs.led_sigma_m:
+        survey_px = context.camera.optics.camera.focal_px * beliefs.led_sigma_m / float(view.distance_m.min())
+    return np.asarray(np.sqrt(own2 + settings.centroid_sigma_px**2 + survey_px**2))
+
+
+def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
+    """(3,) rotation vector in camera axes by which the dome's solver errs for exact rays; None if it is exact."""
+    testbed = context.testbed
+    name, surface = context.settings.solver, context.surface
+    if surface is None or name in EXACT_SOLVERS:
+        return None
+    place_m = context.beliefs.lights.place[view.row, :3]
+    center_m, semi_axes_m = surface.as_ellipsoid()
+    leds = LedMap(view.row, place_m, center_m, semi_axes_m, None, 0.0)
+    lever = Lever(testbed.mount.camera_body_m, testbed.mount.cam_from_body, 0.0)
+    rays = view.offset_m / np.linalg.norm(view.offset_m, axis=1, keepdims=True)
+    body_from_lab = testbed.mount.cam_from_body.inv() * lab_from_cam.inv()
+    try:
+        solved, _ = SOLVERS[name](rays, np.full(len(rays), 1e-5), place_m, leds, lever, body_from_lab)
+    except (ValueError, np.linalg.LinAlgError):
+        return None
+    cam_from_body = testbed.mount.cam_from_body
+    return np.asarray((cam_from_body * solved * body_from_lab.inv() * cam_from_body.inv()).as_rotvec())
+
+
+def expected(views: list[View], attitudes: Attitudes, context: Context) -> Expected:
+    """The expected errors at some attitudes with the lights that the tracker uses there."""
+    cross, roll = ({name: np.zeros(len(views)) for name in (CENTROIDS, *CAUSES, SOLVER)} for _ in range(2))
+    cam_from_body = context.testbed.mount.cam_from_body
+    for a, view in enumerate(views):
+        variances = causes_at(view, attitudes.lab_from_body[a] * cam_from_body.inv(), context)
+        for name, variance in variances.items():
+            cross[name][a], roll[name][a] = variance[:2].sum(), variance[2]
+    return Expected(cross, roll)
+
+
+def causes_at(view: View, lab_from_cam: Rotation, context: Context) -> dict[str, Floats]:
+    """(3,) variances about the camera's axes at one attitude by cause, rad^2; NaN if the lights are too few."""
+    noise = Independent(centroid_variance(view, context))
+    fits_place = context.surface is not None and context.settings.solver == "pnp"
+    try:
+        if len(view) < MIN_EVIDENCE_MATCHES:
+            raise np.linalg.LinAlgError("too few lights")
+        gain = gains(view, believed_sigma_px(view, noise, context), fits_place)
+    except np.linalg.LinAlgError:
+        return {CENTROIDS: np.full(3, np.nan)}
+    causes = {name: cause(view, lab_from_cam, context) for name, cause in CAUSES.items()} | {CENTROIDS: noise}
+    variances = {name: np.diag(covariance(gain, errors)) for name, errors in causes.items() if errors is not None}
+    bias = solver_error(view, lab_from_cam, context)
+    return variances if bias is None else variances | {SOLVER: bias**2}

@@ -1,0 +1,283 @@
+"""The facts of a plan, as text and as numbers: field, lights, spot, peak, smear, focus, beliefs, expected error."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.camera.psf.otf import blur_radius_px
+from skysim.core.types import Floats
+from skysim.core.units import ARCSEC_RAD
+from skysim.scene.light import DomeConfig, StarsConfig
+from skysim.simulation.checks import attitudes, beliefs
+from skysim.simulation.checks.attitudes import Attitudes
+from skysim.simulation.checks.detection import Context, full_scale_e
+from skysim.simulation.checks.expected_error import Expected, mean_root
+from skysim.simulation.checks.views import View
+
+GAUSSIAN_WIDTH = 4.0  # width of an image over its rms radius: D4sigma (ISO 11146), the diameter of a uniform disk
+SIDES = 12  # to which the greatest tilt is tried, and rays around the field
+MIN_SHARE = 0.005  # of the variance of a cause that is printed
+ARCSEC = "″"
+
+
+def short(value: float, digits: int = 3) -> str:
+    """A number with some significant digits and without an exponent."""
+    return f"{float(f'{value:.{digits}g}'):.10g}"
+
+
+class Sampled(NamedTuple):
+    """Some attitudes, what the camera sees there, and the expected errors.
+
+    seen : the lights on the chip that the tracker knows;  used : those that it also detects
+    """
+
+    attitudes: Attitudes
+    seen: list[View]
+    used: list[View]
+    error: Expected
+
+    def counts(self) -> Floats:
+        """(A,) number of lights that the tracker uses."""
+        return np.array([len(view) for view in self.used])
+
+    def joined(self, name: str) -> Floats:
+        """A column of the views of all attitudes end to end."""
+        return np.concatenate([getattr(view, name) for view in self.seen])
+
+
+class Samples(NamedTuple):
+    """The two sets of attitudes: those of the frames, and all that the motion could reach."""
+
+    frames: Sampled
+    reach: Sampled
+
+
+class Fact(NamedTuple):
+    """One fact: its name, its text in lines, and its numbers by name."""
+
+    name: str
+    lines: list[str]
+    values: dict[str, Any]
+
+
+def field_of_view(context: Context, samples: Samples) -> Fact:
+    """Angles between the centers of opposite edges and corners of the chip, without distortion."""
+    camera = context.camera.optics.camera
+    width, height, diagonal = (
+        2 * math.degrees(math.atan(px / 2 / camera.focal_px))
+        for px in (camera.width_px, camera.height_px, math.hypot(camera.width_px, camera.height_px))
+    )
+    arcsec_px = 1 / camera.focal_px / ARCSEC_RAD
+    text = f"{width:.2f}° × {height:.2f}°, diagonal {diagonal:.2f}°; {arcsec_px:.4g}{ARCSEC} a pixel"
+    return Fact("field of view", [text], {"field_deg": [width, height, diagonal], "arcsec_px": arcsec_px})
+
+
+def lights_in_field(context: Context, samples: Samples) -> Fact:
+    """How many lights the tracker knows and detects in the field: mean and least, and where the least are."""
+    scene, mount = context.testbed.scene, context.testbed.mount
+    lines, values = [], {}
+    reach = "in the whole sky" if isinstance(scene.light, StarsConfig) else reached(context, samples)
+    for key, what, sampled in (("frames", "at the frames", samples.frames), ("reach", reach, samples.reach)):
+        counts, seen = sampled.counts(), np.array([len(view) for view in sampled.seen])
+        where = attitudes.describe(sampled.attitudes, int(counts.argmin()), scene, mount)
+        missed = f" (of {seen.mean():.1f} on the chip)" if seen.mean() > counts.mean() + 0.5 else ""
+        lines.append(f"{what}: mean {counts.mean():.1f}{missed}, least {counts.min()} at {where}")
+        values[key] = {"mean": counts.mean(), "least": counts.min(), "least_at": where, "on_chip": seen.mean()}
+    return Fact("lights in the field", lines, values)
+
+
+def reached(context: Context, samples: Samples) -> str:
+    """What directions the motion could reach, in words."""
+    tilt_deg = math.degrees(attitudes.greatest_tilt_rad(context.testbed.scene, samples.frames.attitudes))
+    return f"any azimuth and yaw to {tilt_deg:.1f}° of tilt"
+
+
+def spot(context: Context, samples: Samples) -> Fact:
+    """Width of the median image without motion, and what it is made of."""
+    sampled = samples.frames if sum(map(len, samples.frames.seen)) else samples.reach
+    sigma, disk, defocus = (sampled.joined(name) for name in ("sigma_px", "disk_px", "defocus_px"))
+    lens_px = GAUSSIAN_WIDTH * context.camera.lens_px
+    if not len(sigma):
+        return Fact("image size", [f"lens {lens_px:.1f} px; no light in the field"], {"lens_px": lens_px})
+    width, disk_px, defocus_px = (float(np.median(one)) for one in (GAUSSIAN_WIDTH * sigma, 2 * disk, 2 * defocus))
+    text = f"{width:.1f} px wide (D4σ): lens {lens_px:.1f}, LED {disk_px:.1f}, defocus {defocus_px:.1f} px"
+    values = {"width_px": width, "lens_px": lens_px, "led_px": disk_px, "defocus_px": defocus_px}
+    return Fact("image size", [text], values)
+
+
+def fill(context: Context, samples: Samples) -> Floats:
+    """Peaks of all lights at the frames over the full well, or over the converter's range if that is less."""
+    return samples.frames.joined("peak_e") / full_scale_e(context.testbed.scene.camera.detector)
+
+
+def peak(context: Context, samples: Samples) -> Fact:
+    """Mean electrons in the brightest pixel of a centered image over the full well."""
+    ratio, full_e = fill(context, samples), full_scale_e(context.testbed.scene.camera.detector)
+    if not len(ratio):
+        return Fact("peak", ["no light in the field"], {"full_e": full_e})
+    full = float((ratio >= 1).mean())
+    text = f"brightest light {ratio.max():.3g}, median {np.median(ratio):.2g} of saturation ({full_e:.0f} electrons)"
+    full_text = f"; {100 * full:.0f} % saturated" if full else ""
+    values = {"brightest": ratio.max(), "median": np.median(ratio), "saturated": full, "full_e": full_e}
+    return Fact("peak", [text + full_text], values)
+
+
+def smear(context: Context, samples: Samples) -> Fact:
+    """Path of the images during an exposure at the rates of the frames."""
+    frames = samples.frames
+    rate_deg_s = np.degrees(np.linalg.norm(frames.attitudes.rate_body_rad_s, axis=1))
+    length_px = np.array([np.median(view.streak_length_px) if len(view) else 0.0 for view in frames.seen])
+    fastest = int(rate_deg_s.argmax())
+    text = (
+        f"{length_px[fastest]:.2g} px at {rate_deg_s[fastest]:.3g} deg/s, the fastest frame; median"
+        f" {np.median(length_px):.2g} px"
+    )
+    values = {"largest_px": length_px[fastest], "median_px": np.median(length_px), "rate_deg_s": rate_deg_s[fastest]}
+    return Fact("smear", [text], values)
+
+
+class CapMargin(NamedTuple):
+    """The cap of a dome's LEDs, the greatest tilt, and what the field needs there; degrees from the zenith."""
+
+    cap_deg: float
+    tilt_deg: float
+    needed_deg: float
+
+
+def cap_margin(context: Context, samples: Samples) -> CapMargin | None:
+    """How far the LEDs reach beyond the field at the greatest tilt; None without a layout that fills a cap.
+
+    The field is taken as the circle of half its longer side, since any side may point outward. Rays of that circle are
+    traced to the surface from the pupil, at the greatest tilt to all sides; their angle from the zenith, as seen from
+    the bearing, is what `light.layout.cap_deg` is compared with.
+    """
+    light, surface, camera = context.testbed.scene.light, context.surface, context.camera.optics.camera
+    if not isinstance(light, DomeConfig) or surface is None:
+        return None
+    points = getattr(light.layout, "points", light.layout)
+    if points.kind == "listed" or getattr(points, "boards", ()):
+        return None
+    mount = context.testbed.mount
+    tilt_rad = attitudes.greatest_tilt_rad(context.testbed.scene, samples.frames.attitudes)
+    azimuth = 2 * np.pi * np.arange(SIDES) / SIDES
+    radius = max(camera.width_px, camera.height_px) / 2 / camera.focal_px
+    rays_cam = np.column_stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.ones(SIDES)])
+    needed_deg = 0.0
+    for lab_from_body in Rotation.from_euler("ZYZ", np.column_stack([azimuth, np.full(SIDES, tilt_rad), -azimuth])):
+        rays = lab_from_body.apply(mount.cam_from_body.inv().apply(rays_cam))
+        met = surface.meet(lab_from_body.apply(mount.camera_body_m), rays)
+        # A ray that misses the surface passes below its rim: its own direction is the least that it needs.
+        met = np.where(np.isnan(met), rays, met)
+        needed_deg = max(needed_deg, float(np.degrees(np.arctan2(np.hypot(*met.T[:2]), met[:, 2])).max()))
+    return CapMargin(float(points.cap_deg), math.degrees(tilt_rad), needed_deg)
+
+
+def cap(context: Context, samples: Samples) -> Fact | None:
+    """Margin of the LED cap over the tilt plus half the field."""
+    found = cap_margin(context, samples)
+    if found is None:
+        return None
+    margin_deg = found.cap_deg - found.needed_deg
+    text = (
+        f"LEDs to {found.cap_deg:.3g}° from the zenith; the field's edge reaches {found.needed_deg:.1f}° at a tilt of"
+        f" {found.tilt_deg:.1f}°: margin {margin_deg:+.1f}°"
+    )
+    return Fact("LED cap", [text], {**found._asdict(), "margin_deg": margin_deg})
+
+
+def depth_of_focus(context: Context, samples: Samples) -> Fact:
+    """Distances at which the defocus disk is one pixel wide: 1 / u = 1 / focus ± pixel / (pupil image_distance)."""
+    camera = context.camera.optics.camera
+    spread = camera.pixel_m / (camera.pupil_m * camera.image_distance_m)
+    near_m = 1 / (1 / camera.focus_m + spread)
+    far_m = 1 / (1 / camera.focus_m - spread) if 1 / camera.focus_m > spread else math.inf
+    near, far = (f"{value:.3g} m" if math.isfinite(value) else "infinity" for value in (near_m, far_m))
+    text = f"from {near} to {far} (defocus below one pixel)"
+    distance_m = np.concatenate([sampled.joined("distance_m") for sampled in samples])
+    values = {"near_m": near_m, "far_m": far_m}
+    if len(distance_m) and np.isfinite(distance_m).all():
+        low_m, high_m = distance_m.min(), distance_m.max()
+        within = "within" if near_m <= low_m and high_m <= far_m else "not all within"
+        text += f"; LEDs at {low_m:.3g} to {high_m:.3g} m: {within}"
+        values |= {"nearest_led_m": low_m, "farthest_led_m": high_m}
+    elif len(distance_m):
+        text += f"; stars: {'within' if math.isinf(far_m) else f'{2 * blur_radius_px(camera, math.inf):.2g} px wide'}"
+    return Fact("depth of focus", [text], values)
+
+
+def tracker_beliefs(context: Context, samples: Samples) -> Fact:
+    """What the tracker believes, and what of it is uncertain or wrong."""
+    believed = context.beliefs
+    values = {
+        "led_sigma_m": believed.led_sigma_m,
+        "lever_sigma_m": believed.lever_sigma_m,
+        "surface_sigma_m": believed.surface_sigma_m,
+        "survey_rotation_rad": believed.rotation_rad.tolist(),
+        "lever_error_m": believed.lever_error_m.tolist(),
+        "focal_error": believed.focal_error,
+        "focal_sigma": believed.focal_sigma,
+        "distortion": list(believed.camera.distortion),
+        "catalog_epoch_jyear": believed.epoch_jyear,
+    }
+    return Fact("tracker knows", beliefs.describe(believed, context.testbed.scene), values)
+
+
+def expected_error(context: Context, samples: Samples) -> Fact:
+    """Expected cross and roll error, 1 sigma, and the causes in the order of their share."""
+    scene, mount = context.testbed.scene, context.testbed.mount
+    lines: list[str] = []
+    values: dict[str, Any] = {}
+    for key, what, sampled in (("frames", "at the frames", samples.frames), ("reach", "in reach", samples.reach)):
+        cross, roll = sampled.error.rms_arcsec()
+        failing = int(np.isnan(sampled.error.total("roll")).sum())
+        few = f"; too few lights at {failing} of {len(sampled.seen)}" if failing else ""
+        worst = ""
+        if key == "reach" and failing < len(sampled.seen):
+            n = int(np.nanargmax(sampled.error.total("roll")))
+            where = attitudes.describe(sampled.attitudes, n, scene, mount)
+            worst = f"; worst roll {short(math.sqrt(sampled.error.total('roll')[n]) / ARCSEC_RAD)}{ARCSEC} at {where}"
+        errors = f"cross {short(cross)}{ARCSEC}, roll {short(roll)}{ARCSEC} (1σ)" if cross == cross else "no solution"
+        lines.append(f"{what}: {errors}{worst}{few}")
+        values[key] = {"cross_arcsec": cross, "roll_arcsec": roll, "without_solution": failing}
+        values[key] |= {f"{angle}_causes_arcsec": causes(sampled, angle) for angle in ("cross", "roll")}
+    chosen = samples.frames if np.isfinite(values["frames"]["roll_arcsec"]) else samples.reach
+    lines += [f"{angle}: {cause_text(chosen, angle)}" for angle in ("cross", "roll") if causes(chosen, angle)]
+    return Fact("expected error", lines, values)
+
+
+def causes(sampled: Sampled, angle: str) -> dict[str, float]:
+    """The causes of an error and their size, rms over the attitudes, arcseconds, the largest first."""
+    by_cause = sampled.error.by_cause(angle)
+    known = np.isfinite(sampled.error.total(angle))
+    size = {name: mean_root(variance[known]) for name, variance in by_cause.items()}
+    return {name: value for name, value in sorted(size.items(), key=lambda item: -item[1]) if value > 0}
+
+
+def cause_text(sampled: Sampled, angle: str) -> str:
+    """The causes with their size and their share of the variance."""
+    sizes = causes(sampled, angle)
+    total = math.fsum(size**2 for size in sizes.values())
+    parts = [
+        f"{name} {short(size)}{ARCSEC} ({100 * size**2 / total:.0f} %)"
+        for name, size in sizes.items()
+        if size**2 >= MIN_SHARE * total
+    ]
+    return ", ".join(parts)
+
+
+FACTS: tuple[Callable[[Context, Samples], Fact | None], ...] = (
+    field_of_view,
+    lights_in_field,
+    spot,
+    peak,
+    smear,
+    cap,
+    depth_of_focus,
+    tracker_beliefs,
+    expected_error,
+)

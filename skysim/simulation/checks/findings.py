@@ -1,0 +1,212 @@
+"""Warnings about a plan: each names the key to change, what is wrong, and what to change it to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from skysim.scene.leds import FibersConfig, Layout, LcdConfig
+from skysim.scene.light import DomeConfig, StarsConfig
+from skysim.simulation.checks import attitudes
+from skysim.simulation.checks.detection import (
+    BINOMIAL_VARIANCE_PX2,
+    Context,
+    detected_area_px,
+    full_scale_e,
+    threshold_e,
+)
+from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, Samples, cap_margin, fill, short
+from skysim.simulation.checks.views import peak_share
+from skysim.sources.photometry import SUN, star_flux_e_s_m2
+
+MAX_SATURATED = 0.25  # fraction of saturated lights that gives no warning: a bright star or LED now and then
+TARGET_FILL = 0.7  # of full well, for the light that a fraction MAX_SATURATED exceeds
+MIN_LIGHTS = 4  # that an identification needs
+MIN_DETECTED = 0.5  # fraction of the lights on the chip that the tracker should detect
+MAX_FEW = 0.02  # fraction of the directions in reach that may have fewer
+MAX_SMEAR_PX, MAX_SMEAR_WIDTHS = 4.0, 2.0  # a path that is longer than both gives a warning; in widths of the image
+MAX_DEFOCUS = 0.5  # width of the defocus disk over that of the image in focus
+MIN_DEFOCUS_PX = 1.0
+LIMIT_MARGIN_MAG = 0.3  # by which the camera may see fainter stars than the sky holds
+DEEPEST_V = 10.0  # of a sky that `skysim catalog build` makes
+
+
+def saturation(context: Context, samples: Samples) -> str:
+    """Warn where many lights are saturated."""
+    ratio, scene = fill(context, samples), context.testbed.scene
+    full = float((ratio >= 1).mean()) if len(ratio) else 0.0
+    if full <= MAX_SATURATED:
+        return ""
+    factor = TARGET_FILL / float(np.quantile(ratio, 1 - MAX_SATURATED))
+    text = (
+        f"{100 * full:.0f} % of the lights are saturated, the median light at {short(np.median(ratio), 2)} times"
+        f" {full_scale_e(scene.camera.detector):.0f} electrons; change it to"
+    )
+    led = getattr(scene.light, "led", None)
+    if led is None:
+        return f"exposure.time: {text} {short(1e3 * factor * scene.exposure.time_s, 2)} ms"
+    if led.intensity_cd is not None:
+        return f"light.led.intensity: {text} {short(1e3 * factor * led.intensity_cd, 2)} mcd"
+    return f"light.led.radiant_intensity: {text} {short(1e6 * factor * led.radiant_intensity_w_sr, 2)} uW / sr"
+
+
+def few_lights(context: Context, samples: Samples) -> str:
+    """Warn where the tracker has fewer than four lights: at the frames, or on a bearing under a dome in reach."""
+    scene, mount = context.testbed.scene, context.testbed.mount
+    if cap_too_small(context, samples):
+        return ""  # more LEDs where there are some would not help
+    for sampled, allowed in ((samples.frames, 0.0), (samples.reach, MAX_FEW)):
+        counts = sampled.counts()
+        few = float((counts < MIN_LIGHTS).mean())
+        if few > allowed:
+            break
+        if scene.vehicle.mount == "free":
+            return ""
+    else:
+        return ""
+    on_chip = np.array([len(view) for view in sampled.seen])
+    where = attitudes.describe(sampled.attitudes, int(counts.argmin()), scene, mount)
+    text = (
+        f"fewer than {MIN_LIGHTS} lights that the tracker detects at {100 * few:.0f} % of the"
+        f" {'frames' if sampled is samples.frames else 'directions in reach'}, least {counts.min()} at {where}"
+    )
+    if (on_chip[counts < MIN_LIGHTS] >= MIN_LIGHTS).mean() > MIN_DETECTED:
+        return ""  # they are on the chip: `undetected` says why they are not detected
+    if isinstance(scene.light, DomeConfig):
+        return f"{density_key(scene.light.layout)}: {text}; {denser(scene.light.layout, float(on_chip.mean()))}"
+    fainter = scene.tracker.limit_mag + 1
+    return f"tracker.limit_mag: {text}; change it to {fainter:g}, or take a shorter camera.focal_length"
+
+
+def density_key(layout: Layout) -> str:
+    """The key that sets how many LEDs a layout has."""
+    key, points = "light.layout", layout
+    if isinstance(layout, FibersConfig | LcdConfig):
+        key, points = "light.layout.points", layout.points
+    for name in ("count", "spacing_m", "limit_mag"):
+        if getattr(points, name, None) is not None:
+            return f"{key}.{name.removesuffix('_m')}"
+    return key
+
+
+def denser(layout: Layout, mean: float) -> str:
+    """How to get a mean of three times the lights that an identification needs, from the mean number on the chip."""
+    points = layout.points if isinstance(layout, FibersConfig | LcdConfig) else layout
+    factor = max(3 * MIN_LIGHTS / max(mean, 0.5), 1.5)
+    count, spacing_m = getattr(points, "count", None), getattr(points, "spacing_m", None)
+    if count is not None:
+        return f"change it to {math.ceil(factor * count)}"
+    if spacing_m is not None:
+        return f"change it to {1e3 * spacing_m / math.sqrt(factor):.3g} mm"
+    return f"add LEDs: {factor:.1f} times as many"
+
+
+def undetected(context: Context, samples: Samples) -> str:
+    """Warn where most of the lights on the chip are too faint or too small for the detector."""
+    scene, settings = context.testbed.scene, context.settings
+    seen, used = (sum(map(len, views)) for views in (samples.frames.seen, samples.frames.used))
+    if not seen or used >= MIN_DETECTED * seen or scene.tracker.brightest is not None:
+        return ""
+    area = np.concatenate([detected_area_px(view, context) for view in samples.frames.seen])
+    text = f"the tracker detects {100 * used / seen:.0f} % of the lights in the field"
+    if np.median(area) > 0.5:
+        return (
+            f"tracker.min_area_px: {text}: images have {np.median(area):.0f} px above the threshold, it wants"
+            f" {settings.min_area_px}; change it to {max(int(np.median(area) / 3), 1)}"
+        )
+    peak_e = samples.frames.joined("peak_e") - context.camera.background_e
+    factor = 3 * threshold_e(context) / max(float(np.median(peak_e)), 1e-3)
+    change = f"{short(1e3 * factor * scene.exposure.time_s, 2)} ms"
+    led = getattr(scene.light, "led", None)
+    brighter = ", or light.led.intensity as much" if led is not None else ", or camera.f_number to a faster lens"
+    return f"exposure.time: {text}: the others are below the threshold; change it to {change}{brighter}"
+
+
+def cap_too_small(context: Context, samples: Samples) -> str:
+    """Warn where the field reaches beyond the LEDs at the greatest tilt."""
+    found, light = cap_margin(context, samples), context.testbed.scene.light
+    if found is None or not isinstance(light, DomeConfig) or found.needed_deg <= found.cap_deg:
+        return ""
+    key = "light.layout.points.cap_deg" if hasattr(light.layout, "points") else "light.layout.cap_deg"
+    uncovered = "the tilt itself is not covered" if found.tilt_deg > found.cap_deg else "its edge has no LED"
+    return (
+        f"{key}: LEDs end at {found.cap_deg:.3g} deg from the zenith, but at a tilt of {found.tilt_deg:.1f} deg the"
+        f" field reaches {found.needed_deg:.1f} deg: {uncovered}; change it to {math.ceil(found.needed_deg)}"
+    )
+
+
+def out_of_focus(context: Context, samples: Samples) -> str:
+    """Warn where the defocus disk is wide beside the image in focus."""
+    sampled = samples.frames
+    defocus, sigma, distance_m = (sampled.joined(name) for name in ("defocus_px", "sigma_px", "distance_m"))
+    if not len(defocus):
+        return ""
+    blur_px = 2 * float(np.median(defocus))
+    sharp_px = GAUSSIAN_WIDTH * float(np.median(np.sqrt(np.maximum(sigma**2 - defocus**2 / 4, 0))))
+    if blur_px <= max(MAX_DEFOCUS * sharp_px, MIN_DEFOCUS_PX):
+        return ""
+    middle = float(1 / distance_m.min() + 1 / distance_m.max()) / 2  # 1/m; 0 for stars
+    best = f"{1 / middle:.3g} m" if middle else "infinity"
+    text = f"images are {blur_px:.1f} px out of focus and would be {sharp_px:.1f} px wide"
+    return f"camera.focus: {text}; change it to {best}"
+
+
+def long_smear(context: Context, samples: Samples) -> str:
+    """Warn where images move by more than some pixels and than their own width."""
+    frames, scene = samples.frames, context.testbed.scene
+    length_px, sigma = frames.joined("streak_length_px"), frames.joined("sigma_px")
+    if not len(length_px):
+        return ""
+    limit_px = max(MAX_SMEAR_PX, MAX_SMEAR_WIDTHS * GAUSSIAN_WIDTH * float(np.median(sigma)))
+    longest_px = float(length_px.max())
+    if longest_px <= limit_px:
+        return ""
+    rate_deg_s = float(np.degrees(np.linalg.norm(frames.attitudes.rate_body_rad_s, axis=1)).max())
+    shorter_ms = 1e3 * scene.exposure.time_s * limit_px / longest_px
+    return (
+        f"exposure.time: images move by up to {longest_px:.0f} px during an exposure, at {rate_deg_s:.3g} deg/s; change"
+        f" it to {short(shorter_ms, 2)} ms"
+    )
+
+
+def sky_too_shallow(context: Context, samples: Samples) -> str:
+    """Warn where the camera detects fainter stars than the simulated sky holds."""
+    light, sky = context.testbed.scene.light, context.testbed.sources.magnitude
+    if not isinstance(light, StarsConfig) or light.limit_mag is not None or not len(sky):
+        return ""
+    limit_mag, faintest_mag = detection_limit_mag(context, samples), float(np.nanmax(sky))
+    if limit_mag <= min(faintest_mag + LIMIT_MARGIN_MAG, DEEPEST_V):
+        return ""
+    wanted = min(math.ceil(2 * limit_mag) / 2, DEEPEST_V)
+    return (
+        f"light.catalog: the camera detects stars to V {limit_mag:.1f}, but the sky ends at V {faintest_mag:.1f};"
+        f" change it to a file of `skysim catalog build --source gaia --limit {wanted:g}`"
+    )
+
+
+def detection_limit_mag(context: Context, samples: Samples) -> float:
+    """V of the faintest star like the Sun that is detected at the slowest frame, about half of such stars being so.
+
+    A Gaussian of variance s^2 has the least area A above the threshold T if its peak is T exp(A / (2 pi s^2)), see
+    `detection.detected_area_px`.
+    """
+    camera, lengths = context.camera, [np.median(view.streak_length_px) for view in samples.frames.seen if len(view)]
+    blur2_px2 = camera.lens_px**2 + BINOMIAL_VARIANCE_PX2
+    peak_e = threshold_e(context) * math.exp(context.settings.min_area_px / (2 * math.pi * blur2_px2))
+    none = np.zeros(1)
+    share = peak_share(np.array([blur2_px2]), none, none, np.array([min(lengths, default=0.0)]))[0]
+    reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.testbed.band))
+    return 2.5 * math.log10(reference_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s * share / peak_e)
+
+
+FINDINGS: tuple[Callable[[Context, Samples], str], ...] = (
+    saturation,
+    few_lights,
+    undetected,
+    cap_too_small,
+    out_of_focus,
+    long_smear,
+    sky_too_shallow,
+)

@@ -1,0 +1,60 @@
+"""Check a plan before its run: what will be in the field, how accurate solutions will be, and what to change."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from skysim.camera import wcs
+from skysim.scene.light import DomeConfig, StarsConfig
+from skysim.simulation.checks import attitudes, dome
+from skysim.simulation.checks.attitudes import Attitudes
+from skysim.simulation.checks.detection import Context, context_of, usable
+from skysim.simulation.checks.expected_error import expected
+from skysim.simulation.checks.facts import FACTS, Fact, Sampled, Samples
+from skysim.simulation.checks.findings import FINDINGS
+from skysim.simulation.checks.views import views
+from skysim.simulation.testbed import Testbed
+
+
+class Check(NamedTuple):
+    """The facts of a plan, and its warnings: one line each, which begins with the key to change."""
+
+    facts: list[Fact]
+    findings: list[str]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        numbers = {fact.name.replace(" ", "_"): {"text": fact.lines, **fact.values} for fact in self.facts}
+        return {"facts": numbers, "findings": self.findings}
+
+
+def check(testbed: Testbed) -> Check:
+    """Check the plan of a test bed whose motion need not be simulated. Raises InputError for unreadable files."""
+    scene = testbed.scene
+    first = [line for line in [dome.camera_outside_warning(scene, testbed.mount)] if line]
+    if first:
+        return Check([], first)  # all else assumes that the camera is inside
+    context = context_of(testbed)
+    frames = attitudes.of_frames(testbed)
+    reach = attitudes.within_reach(scene, testbed.mount, frames)
+    samples = Samples(sampled(frames, context), sampled(reach, context))
+    facts = [fact for build in FACTS if (fact := build(context, samples)) is not None]
+    findings = [line for find in FINDINGS if (line := find(context, samples))]
+    return Check(facts, findings + broken_assumptions(testbed))
+
+
+def sampled(at: Attitudes, context: Context) -> Sampled:
+    """What the camera sees at some attitudes, and the expected errors there."""
+    seen = views(context.testbed, context.beliefs.lights, at, context.camera)
+    used = [usable(view, context) for view in seen]
+    return Sampled(at, seen, used, expected(used, at, context))
+
+
+def broken_assumptions(testbed: Testbed) -> list[str]:
+    """Warnings where the scene breaks an assumption of its tracker, of the renderer or of the frames' WCS."""
+    scene = testbed.scene
+    if isinstance(scene.light, StarsConfig):
+        return [line for line in [wcs.accuracy_warning(scene.camera)] if line]
+    if not isinstance(scene.light, DomeConfig):
+        return []
+    return dome.warnings(scene, testbed.sources, testbed.mount)

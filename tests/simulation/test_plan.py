@@ -1,0 +1,295 @@
+"""The check of a plan: its facts against counts and closed forms, and a warning for each mistake that names the key."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.core.units import ARCSEC_RAD
+from skysim.dynamics import multibody
+from skysim.scene import loader
+from skysim.simulation import exposure, run
+from skysim.simulation.checks import attitudes, check, detection, facts, findings, plan
+from skysim.simulation.checks.facts import Fact, Samples
+from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.tracking.factory import solve_frame
+
+TILTED = '[{kind: slew, pitch_deg: 25, rate_deg_s: 5}, {kind: hold, duration: "30 s"}]'
+AT_REST = {"motion.control": "none", "motion.maneuver": "[]", "exposure.frames": "1"}
+
+
+def bed(name: str, **changes: str) -> Testbed:
+    return build_testbed(loader.load(name, {key.replace("__", "."): value for key, value in changes.items()}))
+
+
+def fact(result: plan.Check, name: str) -> Fact:
+    (found,) = [one for one in result.facts if one.name == name]
+    return found
+
+
+@pytest.fixture(scope="module")
+def afit() -> plan.Check:
+    return check(bed("afit_simsat"))
+
+
+def samples_of(testbed: Testbed) -> tuple[detection.Context, Samples]:
+    context = detection.context_of(testbed)
+    frames = attitudes.of_frames(testbed)
+    reach = attitudes.within_reach(testbed.scene, testbed.mount, frames)
+    return context, Samples(plan.sampled(frames, context), plan.sampled(reach, context))
+
+
+# Attitudes
+
+
+def test_frames_are_checked_where_the_vehicle_will_be() -> None:
+    """The reference at mid-exposure; the controller follows it to a hundredth of a degree."""
+    testbed = bed("afit_simsat", exposure__frames="40")
+    flown = run.simulate_motion(testbed)
+    frames = attitudes.of_frames(testbed)
+    apart = (flown.trajectory.attitude_at(frames.t_s) * frames.lab_from_body.inv()).magnitude()
+    assert np.degrees(apart).max() < 0.1
+    rates = np.array([flown.trajectory.rate_at(t_s) for t_s in frames.t_s])
+    assert np.degrees(np.abs(rates - frames.rate_body_rad_s)).max() < 0.1
+    every = [0.005 + 1 + n / 2 for n in range(40)]
+    fastest = max(np.linalg.norm(flown.trajectory.rate_at(t_s)) for t_s in every)
+    assert np.linalg.norm(frames.rate_body_rad_s, axis=1).max() == pytest.approx(fastest, rel=0.01)
+
+
+def test_the_reach_is_even_up_to_the_greatest_tilt_and_over_the_whole_sky() -> None:
+    dome, sky = bed("afit_simsat"), bed("shefex2")
+    frames = attitudes.of_frames(dome)
+    reach = attitudes.within_reach(dome.scene, dome.mount, frames)
+    tilt_deg = multibody.tilt_deg(reach.lab_from_body)
+    assert tilt_deg.max() == pytest.approx(multibody.tilt_deg(frames.lab_from_body).max(), abs=1e-4)
+    height = 1 - np.cos(np.radians(tilt_deg))
+    assert np.median(height) == pytest.approx(height.max() / 2, rel=0.1)
+    everywhere = attitudes.within_reach(sky.scene, sky.mount, frames).lab_from_body
+    boresight = (everywhere * sky.mount.cam_from_body.inv()).apply([0, 0, 1])
+    assert np.linalg.norm(boresight.mean(axis=0)) < 0.05
+    nearest_deg = np.degrees(cKDTree(boresight).query(boresight, k=2)[0][:, 1])
+    assert nearest_deg.min() > 15  # 48 even directions are some 30 deg apart
+
+
+def test_without_a_controller_the_bearing_may_tilt_to_its_stop() -> None:
+    testbed = bed("afit_simsat", motion__control="none", motion__maneuver="[]")
+    frames = attitudes.of_frames(testbed)
+    assert math.degrees(attitudes.greatest_tilt_rad(testbed.scene, frames)) == pytest.approx(30)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"motion__start": "{pitch_deg: 40}", "motion__maneuver": "[]"}, "motion.start: tilt of 40.0 deg"),
+        ({"motion__maneuver": TILTED.replace("25", "35")}, "motion.maneuver: tilt of 3"),
+    ],
+)
+def test_a_tilt_beyond_the_stop_is_refused_as_by_a_run(changes: dict[str, str], told: str) -> None:
+    with pytest.raises(InputError, match=f"{told}.*allowed: up to vehicle.tilt_stop_deg 30"):
+        check(bed("afit_simsat", **changes))
+
+
+# Facts
+
+
+def test_the_field_and_the_pixel_are_the_pinhole_s(afit: plan.Check) -> None:
+    """1600 pixels of 4 um, 36.53 mm behind the lens: 10.0 deg, as the scene says."""
+    field = fact(afit, "field of view").values
+    assert field["field_deg"][0] == pytest.approx(2 * math.degrees(math.atan(800 * 4e-6 / 36.53e-3)), rel=1e-3)
+    assert field["arcsec_px"] == pytest.approx(4e-6 / 36.53e-3 / ARCSEC_RAD, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["afit_simsat", "shefex2", "apl_dome"])
+def test_as_many_lights_are_counted_as_the_tracker_uses(name: str) -> None:
+    testbed = bed(name, exposure__frames="1")
+    flown = run.simulate_motion(testbed)
+    frame, _ = exposure.render_frame(flown, 0)
+    report = solve_frame(build_tracker(flown), frame)
+    assert report.attitude.match is not None
+    found = fact(check(testbed), "lights in the field").values["frames"]
+    assert found["mean"] == pytest.approx(len(report.attitude.match.observed), rel=0.1, abs=1.5)
+    assert found["least"] <= found["mean"] <= found["on_chip"]
+
+
+def test_the_least_lights_are_where_it_says() -> None:
+    testbed = bed("afit_simsat")
+    context, samples = samples_of(testbed)
+    text = facts.lights_in_field(context, samples).values["reach"]["least_at"]
+    roll, pitch, yaw = (float(re.search(rf"{name} (\S+)°", text)[1]) for name in ("roll", "pitch", "yaw"))  # type: ignore[index]
+    there = attitudes.Attitudes(
+        Rotation.from_euler("ZYX", [[yaw, pitch, roll]], degrees=True), np.zeros((1, 3)), np.full(1, np.nan)
+    )
+    assert len(plan.sampled(there, context).used[0]) == pytest.approx(samples.reach.counts().min(), abs=1)
+
+
+def test_the_depth_of_focus_ends_where_defocus_is_a_pixel(afit: plan.Check) -> None:
+    """By similar triangles: a pupil of 35 / 8 mm, a chip 36.53 mm behind it focused at 33 in."""
+    values = fact(afit, "depth of focus").values
+    for distance_m in (values["near_m"], values["far_m"]):
+        image_m = 1 / (1 / 0.035 - 1 / distance_m)
+        chip_m = 1 / (1 / 0.035 - 1 / (33 * 0.0254))
+        assert 0.035 / 8 * abs(image_m - chip_m) / image_m == pytest.approx(4e-6, rel=1e-6)
+    assert values["near_m"] < 33 * 0.0254 < values["far_m"]
+    assert fact(check(bed("shefex2")), "depth of focus").values["far_m"] == math.inf
+
+
+def test_smear_is_the_rate_times_the_exposure() -> None:
+    """Stars cross f w T pixels; under a dome the pupil on its lever moves too: by R / (R - M) more."""
+    moving = fact(check(bed("shefex2", motion__rate_deg_s="[3, 4, 0]")), "smear").values
+    focal_px = bed("shefex2").scene.camera.focal_px
+    assert moving["largest_px"] == pytest.approx(focal_px * math.radians(5) * 0.04, rel=0.02)
+    assert moving["rate_deg_s"] == pytest.approx(5)
+    dome = bed("afit_simsat")
+    values = fact(check(dome), "smear").values
+    far = np.linalg.norm(dome.sources.place[:, :3], axis=1).mean() / 0.838
+    assert values["largest_px"] < far * dome.scene.camera.focal_px * math.radians(values["rate_deg_s"]) * 0.01
+
+
+def test_the_cap_s_margin_is_the_angle_beyond_the_field() -> None:
+    """On a sphere of R about the bearing: half field h at the pupil M above is h - asin(M sin h / R) at the bearing."""
+    testbed = bed(
+        "afit_simsat",
+        light__surface="{kind: sphere, apex: 48 in, radius: 48 in}",
+        light__layout="{kind: fibonacci, count: 900, cap_deg: 27}",
+        vehicle__camera="[0 in, 0 in, 15 in]",
+        motion__maneuver=TILTED,
+    )
+    found = facts.cap_margin(*samples_of(testbed))
+    assert found is not None
+    half = math.atan(testbed.scene.camera.width_px / 2 / testbed.scene.camera.focal_px)
+    at_bearing = half - math.asin(15 / 48 * math.sin(half))
+    assert found.tilt_deg == pytest.approx(25, abs=1e-3)
+    assert found.needed_deg == pytest.approx(25 + math.degrees(at_bearing), abs=1e-3)
+
+
+def test_what_the_tracker_believes_is_said() -> None:
+    changes = {
+        "tracker__survey": "{led_sigma: 0.3 mm, rotation_deg: [0.01, 0, 0]}",
+        "tracker__assumed_focal_length": "35.07 mm",
+        "tracker__assumed_distortion": "[0.1, 0, 0, 0, 0]",
+        "tracker__assumed_camera_body": "[0 mm, 0 mm, 385 mm]",
+    }
+    lines = " ".join(fact(check(bed("afit_simsat_ideal", **changes)), "tracker knows").lines)
+    for words in ("LEDs to 0.3 mm", "rotated by 36″", "length wrong by +0.2 %", "another distortion", "lever wrong by"):
+        assert words in lines
+    told = " ".join(fact(check(bed("shefex2")), "tracker knows").lines)
+    assert "epoch J1991.25 moved to 2012-06-22" in told
+
+
+def test_causes_are_in_order_and_each_is_found_where_it_is_put() -> None:
+    """Beside half a millimeter of lever, 0.1 deg of the survey's axes is the first."""
+    result = check(bed("afit_simsat", tracker__survey__rotation_deg="[0, 0, 0.1]"))
+    values = fact(result, "expected error").values["frames"]
+    roll = values["roll_causes_arcsec"]
+    assert next(iter(roll)) == "survey rotation"
+    assert roll["survey rotation"] == pytest.approx(360, rel=0.1)
+    assert list(roll.values()) == sorted(roll.values(), reverse=True)
+    assert values["roll_arcsec"] == pytest.approx(math.sqrt(math.fsum(value**2 for value in roll.values())), rel=1e-6)
+    assert next(iter(values["cross_causes_arcsec"])) in ("lever survey", "survey rotation")
+
+
+def test_a_solver_s_own_error_is_a_cause() -> None:
+    """`infinity` ignores the lever: half a degree on this dome at every tilt (nearfield.py)."""
+    values = fact(check(bed("afit_simsat_ideal", tracker__solver="infinity")), "expected error").values["frames"]
+    assert next(iter(values["cross_causes_arcsec"])) == "solver"
+    assert 0.02 < values["cross_arcsec"] / 3600 < 1
+
+
+# Findings
+
+
+@pytest.mark.parametrize(
+    ("scene", "changes", "key", "words"),
+    [
+        ("afit_simsat", {"light__led__intensity": "60 mcd"}, "light.led.intensity", "of the lights are saturated"),
+        ("shefex2", {"exposure__time": "99 ms", "camera__detector__full_well_e": "300"}, "exposure.time", "saturated"),
+        (
+            "afit_simsat",
+            {"light__layout__cap_deg": "25"},
+            "light.layout.cap_deg",
+            "its edge has no LED",
+        ),
+        ("afit_simsat", {"light__layout__cap_deg": "24"}, "light.layout.cap_deg", "the tilt itself is not covered"),
+        ("afit_simsat", {"light__layout__spacing": "7 in"}, "light.layout.spacing", "fewer than 4 lights"),
+        ("shefex2", {"tracker__limit_mag": "1.5"}, "tracker.limit_mag", "fewer than 4 lights"),
+        ("afit_simsat", {"tracker__min_area_px": "900"}, "tracker.min_area_px", "px above the threshold, it wants 900"),
+        ("shefex2", {"exposure__time": "1 ms"}, "exposure.time", "the others are below the threshold"),
+        ("afit_simsat", {"camera__focus": "24 in"}, "camera.focus", "out of focus"),
+        ("shefex2", {"camera__focus": "3 m"}, "camera.focus", "change it to infinity"),
+        ("shefex2", {"motion__rate_deg_s": "[3, 4, 0]"}, "exposure.time", "images move by up to 9 px"),
+        (
+            "shefex2",
+            {"camera__f_number": "0.8", "exposure__time": "100 ms", "motion__rate_deg_s": "[0, 0, 0]"},
+            "light.catalog",
+            "the sky ends at V 8.0",
+        ),
+    ],
+)
+def test_a_mistake_is_warned_of_with_its_key(scene: str, changes: dict[str, str], key: str, words: str) -> None:
+    """And with what to change it to; the plan as it ships gives no such warning."""
+    tilted = {"motion__maneuver": TILTED} if key.endswith("cap_deg") else {}
+    lines = [line for line in check(bed(scene, **tilted, **changes)).findings if line.startswith(f"{key}: ")]
+    assert [line for line in lines if words in line and "; change it to " in line]
+    assert not [line for line in check(bed(scene)).findings if words in line]
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"light.led.intensity": "60 mcd"}, "light.led.intensity"),
+        ({"light.layout.spacing": "5 in"}, "light.layout.spacing"),
+    ],
+)
+def test_following_the_advice_silences_the_warning(changes: dict[str, str], key: str) -> None:
+    (line,) = [one for one in check(build_testbed(loader.load("afit_simsat", changes))).findings if one.startswith(key)]
+    value = line.rpartition("change it to ")[2]
+    again = check(build_testbed(loader.load("afit_simsat", changes | {key: value}))).findings
+    assert not [one for one in again if one.startswith(key)]
+
+
+def test_half_of_the_stars_at_the_limit_are_detected() -> None:
+    """The limit that `light.catalog` is compared with, on rendered frames: most brighter by half a magnitude are."""
+    testbed = bed("shefex2", exposure__frames="1", motion__rate_deg_s="[0, 0, 0]")
+    limit = findings.detection_limit_mag(*samples_of(testbed))
+    tracker, rng, found, faint = build_tracker(testbed), np.random.default_rng(3), [], []
+    for n in range(6):
+        still = testbed.in_run(n).at_rest(Rotation.random(rng=rng))
+        frame, truth = exposure.render_frame(still, 0)
+        magnitude = dict(zip(testbed.sources.id.tolist(), testbed.sources.magnitude.tolist(), strict=True))
+        near = cKDTree(solve_frame(tracker, frame).centroids.xy_px).query(truth.sources.xy_px)[0] < 1.5
+        v_mag = np.array([magnitude[hip] for hip in truth.sources.id.tolist()])
+        found += near[np.abs(v_mag - limit + 0.5) < 0.25].tolist()
+        faint += near[np.abs(v_mag - limit - 0.5) < 0.25].tolist()
+    assert np.mean(found) > 0.7
+    assert np.mean(faint) < 0.3
+
+
+@pytest.mark.parametrize("name", ["afit_simsat", "nps_tas2", "shefex2", "scoreboard", "collimated_display"])
+def test_a_plan_that_ships_gives_no_warning(name: str) -> None:
+    assert check(bed(name)).findings == []
+
+
+@pytest.mark.long
+def test_only_the_plans_with_saturated_and_too_few_leds_are_warned_of() -> None:
+    """AFIT's tests of two and of five LEDs, as they were made."""
+    warned = {name for name in loader.list_scenes() if check(build_testbed(loader.load(name))).findings}
+    assert {name.removesuffix("_ideal") for name in warned} == {"afit_test2", "afit_test3"}
+
+
+def test_a_check_costs_a_fraction_of_a_second() -> None:
+    """Of CPU, after its functions were loaded once: against the time to set up the same scene, twice."""
+    testbed = bed("shefex2")
+    check(testbed)
+    began = time.process_time()
+    check(testbed)
+    checked = time.process_time()
+    for _ in range(2):
+        build_tracker(bed("shefex2"))
+    assert checked - began < 2 * (time.process_time() - checked)
