@@ -8,8 +8,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, field_validator, model_validator
 
+from skysim.core.tolerance import LengthError
 from skysim.core.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
-from skysim.scene.leds import Layout, LedConfig, PixelsConfig
+from skysim.scene.layouts import Layout, PixelsConfig
+from skysim.scene.leds import LedConfig
 
 SKY = "gaia_v8.0"  # as faint as any camera of a shipped scene detects
 Tilt = Annotated[Number, Field(ge=-45, le=45)]
@@ -22,14 +24,14 @@ class SurfaceConfig(ConfigModel):
 
     offset   : the whole dome's displacement
     tilt_deg : about the lab's x, then about its y, through the surface's own center (the origin of surveyed points)
-    error    : standard deviation of the lab's survey of it, along the normal: one draw for the whole surface, because
-               errors of single points average out; drawn by `tracker.survey.seed`
+    error    : standard deviation of the lab's survey of it, along the normal, or a tolerance: one draw for the whole
+               surface, because errors of single points average out; drawn by `tracker.survey.seed`
     """
 
     kind: Literal["sphere", "ellipsoid", "flat", "cylinder", "surveyed"]
     offset_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
     tilt_deg: tuple[Tilt, Tilt] = (0.0, 0.0)
-    error_m: Annotated[Length, Field(ge=0)] = 0.0
+    error_m: LengthError = 0.0
 
     @model_validator(mode="wrap")
     @classmethod

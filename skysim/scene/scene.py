@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from skysim.core.tolerance import TimeError
 from skysim.core.units import ConfigModel, Number, Time, in_utc
 from skysim.scene.camera import CameraConfig
 from skysim.scene.light import DomeConfig, Glow, Light
@@ -36,7 +37,7 @@ class ExposureConfig(ConfigModel):
 
     trigger_jitter  : an exposure begins up to so much late, uniformly distributed
     time_tag_offset : the time given to a frame minus the true time of mid-exposure, on average
-    time_tag_jitter : its standard deviation from frame to frame
+    time_tag_jitter : its standard deviation from frame to frame, or a tolerance
     """
 
     time_s: Annotated[Time, Field(ge=1e-6)]
@@ -45,7 +46,7 @@ class ExposureConfig(ConfigModel):
     first_s: Annotated[Time, Field(ge=0)] = 0.0
     trigger_jitter_s: Annotated[Time, Field(ge=0)] = 0.0
     time_tag_offset_s: Annotated[Time, Field(ge=-1, le=1)] = 0.0
-    time_tag_jitter_s: Annotated[Time, Field(ge=0, le=1)] = 0.0
+    time_tag_jitter_s: Annotated[TimeError, Field(le=1)] = 0.0
 
     @model_validator(mode="after")
     def check_period(self) -> ExposureConfig:

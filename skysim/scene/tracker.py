@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, model_validator
 
+from skysim.core.tolerance import LengthError
 from skysim.core.units import ConfigModel, Length, NotNegative, Number, Positive, Spin, Time
 from skysim.core.yaml_reader import is_file
 
@@ -21,8 +22,8 @@ def existing_file(value: str) -> str:
 class SurveyErrorsConfig(ConfigModel):
     """Errors of the survey of LEDs and camera, drawn once from their own seed; also draws `light.surface.error`.
 
-    led_sigma    : standard deviation of every LED's surveyed place, about each axis of the lab
-    lever_sigma  : of the camera's surveyed place, about each axis of the body
+    led_sigma    : standard deviation of every LED's surveyed place, along each axis of the lab, or its tolerance
+    lever_sigma  : of the camera's surveyed place, along each axis of the body
     rotation_deg     : rotation vector of the survey's axes relative to the lab's: the error of the level or IMU that it
         was referenced to. All surveyed LEDs are rotated by it
     surface_seed : draws `light.surface.error`; `seed` if left out
@@ -30,8 +31,8 @@ class SurveyErrorsConfig(ConfigModel):
 
     rotation_deg: tuple[Spin, Spin, Spin] = (0.0, 0.0, 0.0)
     surface_seed: Annotated[int, Field(ge=0)] | None = None
-    led_sigma_m: Annotated[Length, Field(ge=0, le=0.1)] = 0.0
-    lever_sigma_m: Annotated[Length, Field(ge=0, le=0.1)] = 0.0
+    led_sigma_m: Annotated[LengthError, Field(le=0.1)] = 0.0
+    lever_sigma_m: Annotated[LengthError, Field(le=0.1)] = 0.0
     seed: Annotated[int, Field(ge=0)] = 0
 
 

@@ -14,7 +14,8 @@ from skysim.core.types import Mount, Sources
 from skysim.scene.camera import CameraConfig
 from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
-from skysim.sources.dome import layout, surface, survey_errors
+from skysim.sources.dome import surface, survey_errors
+from skysim.sources.dome.layouts import registry
 from skysim.tracking import dome_map_file
 
 
@@ -22,7 +23,7 @@ def assumed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
     """The dome map that the tracker uses: the true LED positions and surface with the errors of the survey."""
     inside, survey = surface.build_surface(light.surface), scene.tracker.survey
     position_m = survey_errors.assumed_leds_m(inside, sources.place[:, :3], survey)
-    board = layout.board_of(light.layout, sources.id)
+    board = registry.board_of(light.layout, sources.id)
     ellipsoid = survey_errors.assumed_ellipsoid(inside, survey)
     return LedMap(sources.id, position_m, *ellipsoid, board, survey.led_sigma_m)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from skysim.core.types import Sources
 from skysim.scene import light
-from skysim.sources.dome.layout import HOLES as HOLES
-from skysim.sources.dome.layout import LAYOUTS as LAYOUTS
-from skysim.sources.dome.layout import board_of as board_of
-from skysim.sources.dome.layout import cap as cap
-from skysim.sources.dome.layout import patch_boards as patch_boards
+from skysim.scene.layouts import HOLES as HOLES
+from skysim.sources.dome.layouts.boards import patch_boards as patch_boards
+from skysim.sources.dome.layouts.placing import cap as cap
+from skysim.sources.dome.layouts.registry import LAYOUTS as LAYOUTS
+from skysim.sources.dome.layouts.registry import board_of as board_of
 from skysim.sources.dome.surface import SURFACES as SURFACES
 from skysim.sources.dome.surface import Ellipsoid as Ellipsoid
 from skysim.sources.dome.surface import Plane as Plane

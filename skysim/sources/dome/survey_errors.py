@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
 from skysim.scene.tracker import SurveyErrorsConfig
 from skysim.sources.dome.surface import Surface
@@ -23,8 +24,8 @@ def standard_normals(seed: int, kind: str, shape: tuple[int, ...]) -> Floats:
 
 
 def assumed_m(place_m: Floats, sigma_m: float, seed: int, kind: str) -> Floats:
-    """Surveyed places: the true ones (..., 3) plus a Gaussian error of sigma about each axis; unchanged for sigma 0."""
-    return place_m + sigma_m * standard_normals(seed, kind, place_m.shape) if sigma_m else place_m
+    """Surveyed places: the true ones (..., 3) plus an error of this size along each axis; unchanged for 0."""
+    return place_m + scaled_errors(sigma_m, standard_normals(seed, kind, place_m.shape)) if sigma_m else place_m
 
 
 def surface_seed(config: SurveyErrorsConfig) -> int:
@@ -40,12 +41,12 @@ def rotate_survey(places_m: Floats, config: SurveyErrorsConfig) -> Floats:
 
 
 def surface_offset_m(surface: Surface, seed: int) -> float:
-    """Offset of the surveyed surface, outward along the normal of the true one: N(0, light.surface.error).
+    """Offset of the surveyed surface, outward along the normal of the true one, of the size light.surface.error.
 
     One draw for the whole surface (the arm's zero, its probe's radius). Independent errors of a thousand points
     average out in a fitted ellipsoid.
     """
-    return float(surface.survey_sigma_m * standard_normals(seed, "surface", (1,))[0])
+    return float(scaled_errors(surface.survey_sigma_m, standard_normals(seed, "surface", (1,)))[0])
 
 
 def assumed_leds_m(surface: Surface, place_m: Floats, config: SurveyErrorsConfig) -> Floats:
