@@ -140,6 +140,52 @@ class RandomPlacesConfig(DimmedConfig):
     count: Count
 
 
+class LitConfig(DimmedConfig):
+    """Base of the regular layouts: of their places, drawn by hardware_seed, `lit_fraction` carry an LED that is lit.
+
+    All fields of a regular layout look alike, so that a tracker without other information cannot tell them apart
+    unless LEDs are left out or differ in brightness. An LED keeps its number among all places.
+    """
+
+    lit_fraction: Annotated[Number, Field(gt=0, le=1)] = 1.0
+
+
+class GeodesicConfig(LitConfig):
+    """LEDs at the vertices of a geodesic sphere about the bearing, with one vertex at the zenith.
+
+    frequency    : parts into which an edge of the icosahedron is divided (class I), or twice the parts into which half
+        of a face's height is divided (class II: even)
+    class        : I: lines of the division parallel to the icosahedron's edges; II: perpendicular to them
+    rotation_deg : about the zenith; at 0 one of the five edges from the zenith's vertex runs along the lab's x
+    """
+
+    kind: Literal["geodesic"]
+    frequency: Annotated[int, Field(ge=1, le=100)]
+    class_: Annotated[Literal["I", "II"], Field(alias="class")] = "I"
+    rotation_deg: Number = 0.0
+
+    @model_validator(mode="after")
+    def check_frequency(self) -> GeodesicConfig:
+        if self.class_ == "II" and self.frequency % 2:
+            raise ValueError(f"frequency: {self.frequency} is odd; allowed with class: II: even")
+        return self
+
+
+class StringConfig(LitConfig):
+    """LED tape wound on the surface about the vertical through the bearing, numbered along the tape.
+
+    winding : latitude: circles at equal angles from the zenith, each cut where it closes, the first half a spacing from
+        the apex; spiral: one tape from the apex to the rim
+    pitch   : from one LED of the tape to the next, along the surface
+    spacing : between two circles or turns, along the surface, in the mean of all azimuths
+    """
+
+    kind: Literal["string"]
+    pitch_m: Annotated[Length, Field(ge=1e-3)]
+    spacing_m: Annotated[Length, Field(ge=1e-3)]
+    winding: Literal["latitude", "spiral"] = "latitude"
+
+
 class OptimizedConfig(DimmedConfig):
     """`count` LEDs placed for one camera's best accuracy at its worst attitudes: tilts to tilt_deg, any yaw.
 
@@ -224,7 +270,14 @@ class ListedConfig(DimmedConfig):
 
 
 Points = Annotated[
-    FibonacciConfig | PoissonDiskConfig | RandomPlacesConfig | OptimizedConfig | CelestialConfig | ListedConfig,
+    FibonacciConfig
+    | PoissonDiskConfig
+    | RandomPlacesConfig
+    | GeodesicConfig
+    | StringConfig
+    | OptimizedConfig
+    | CelestialConfig
+    | ListedConfig,
     Field(discriminator="kind"),
 ]
 
@@ -291,6 +344,8 @@ Layout = Annotated[
     | FibonacciConfig
     | PoissonDiskConfig
     | RandomPlacesConfig
+    | GeodesicConfig
+    | StringConfig
     | OptimizedConfig
     | CelestialConfig
     | ListedConfig

@@ -149,7 +149,9 @@ def is_quantity(annotation: object, metadata: Iterable[object]) -> bool:
     """Whether it, or each of it, is filled by a value such as "48 in"."""
     parsers = [one.func for one in metadata if isinstance(one, BeforeValidator)]
     sizes = [one.quantity for one in metadata if isinstance(one, ErrorSchema)]
-    own = any(is_quantity(one, getattr(one, "__metadata__", ())) for one in sizes) or any(parser is camera.focus_distance or parser.__qualname__.startswith("quantity") for parser in parsers)
+    own = any(is_quantity(one, getattr(one, "__metadata__", ())) for one in sizes) or any(
+        parser is camera.focus_distance or parser.__qualname__.startswith("quantity") for parser in parsers
+    )
     return own or any(is_quantity(one, getattr(one, "__metadata__", ())) for one in get_args(annotation))
 
 

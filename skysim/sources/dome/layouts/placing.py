@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
-from skysim.scene.layouts import HOLES
+from skysim.scene.layouts import HOLES, LitConfig
 from skysim.scene.leds import LedConfig
 from skysim.sources.dome.led import DRIVES, DriveInput, full_strength_e_s_sr, strength_factors
 from skysim.sources.dome.surface import Surface
@@ -79,6 +80,13 @@ def dimmed_sources(
     """Sources of LEDs at (N, 3) places on the surface, each with a random level of `dimming`."""
     level = rng.choice(dimming, len(place_m))
     return led_sources(on_surface(surface, place_m, level), led, band, rng)
+
+
+def lit_sources(config: LitConfig, surface: Surface, place_m: Floats, led: LedConfig, band: Band) -> Sources:
+    """Sources of the drawn fraction of LEDs at (N, 3) places; each keeps its number among all places."""
+    rng = random_stream(config.hardware_seed)
+    number = np.sort(rng.permutation(len(place_m))[: max(round(config.lit_fraction * len(place_m)), 1)])
+    return replace(dimmed_sources(config.dimming, surface, place_m[number], led, band, rng), id=number)
 
 
 def cap(count: int, half_angle_rad: float) -> Floats:

@@ -18,9 +18,11 @@ from skysim.scene.leds import LedConfig
 from skysim.sources.dome import celestial as celestial_dome
 from skysim.sources.dome import display
 from skysim.sources.dome.layouts.boards import patch_boards
+from skysim.sources.dome.layouts.geodesic import geodesic
 from skysim.sources.dome.layouts.listed import listed
 from skysim.sources.dome.layouts.placing import Ints, PlacedLeds, led_sources
 from skysim.sources.dome.layouts.spreads import fibonacci, optimized, poisson_disk, random_places
+from skysim.sources.dome.layouts.string import string
 from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
 
@@ -55,6 +57,8 @@ LAYOUTS: dict[str, Callable[[Any, Surface, LedConfig, Band], Sources]] = {
     "fibonacci": fibonacci,
     "poisson_disk": poisson_disk,
     "random": random_places,
+    "geodesic": geodesic,
+    "string": string,
     "optimized": optimized,
     "celestial": celestial,
     "listed": listed,
