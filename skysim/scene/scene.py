@@ -85,7 +85,10 @@ class Scene(ConfigModel):
         """Check what depends on the kind of light source, and that the shutter reads all rows within a frame period."""
         # Survey errors and maps need LEDs. The start is a pointing under the stars and an attitude otherwise.
         sky, tracker = self.light.kind == "stars", self.tracker
-        if not isinstance(self.light, DomeConfig) and (tracker.survey != SurveyErrorsConfig() or tracker.map):
+        # Without LEDs the focal length alone is surveyed.
+        lens = {"focal_length_sigma_m": tracker.survey.focal_length_sigma_m, "seed": tracker.survey.seed}
+        lens_only = SurveyErrorsConfig().model_copy(update=lens if tracker.survey.focal_length_sigma_m else {})
+        if not isinstance(self.light, DomeConfig) and (tracker.survey != lens_only or tracker.map):
             key = "map" if tracker.map else "survey"
             raise ValueError(f"tracker.{key}: light of kind {self.light.kind} has no LEDs to survey; allowed: dome")
         if sky != isinstance(self.motion.start, PointingConfig):
