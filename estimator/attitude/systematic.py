@@ -13,6 +13,7 @@ import numpy as np
 
 from estimator.attitude.nearfield import tangent_gradients, tangent_jacobian
 from estimator.core.arrays import Floats
+from estimator.core.camera import Camera
 
 
 class Geometry(NamedTuple):
@@ -66,18 +67,47 @@ def isotropic(sigma_rad: Floats) -> Floats:
     return sigma_rad[:, None, None] ** 2 * np.eye(2)
 
 
-def with_focal_error(
-    covariance_rad2: Floats, seen_cam: Floats, sigma_rad: Floats, focal_sigma: float
-) -> tuple[Floats, Floats | None]:
-    """The (3, 3) covariance of a star attitude with the focal length's error as it is, and that part alone.
+def with_survey(
+    covariance_rad2: Floats, view: Geometry, sigma_rad: Floats, noise_rad2: Floats, own_rad2: Floats, common_rad: Floats
+) -> tuple[Floats, Floats]:
+    """The (3, 3) covariance of an attitude with its errors as they are, and the part that successive frames share.
 
-    covariance_rad2 : with that error, focal_sigma times the tangent, as independent from star to star
-    seen_cam        : (K, 3) unit vectors of the stars in camera axes;  sigma_rad : (K,) on which it is based
-    None in place of the part if focal_sigma is 0.
+    covariance_rad2 : of the solver, for independent errors of sigma_rad (K,), equal in all directions
+    noise_rad2      : (K, 2, 2) of the tangents in one frame;  own_rad2 : of each light's survey
+    common_rad      : (M, K, 2) change of the tangents by one standard deviation of each error that all lights share
+
+    The errors are propagated through the least-squares solution of the tangents, whose covariance is S = L L'. A solver
+    with the covariance L_0 L_0' is taken to respond as that solution does after the rotation L_0 L^-1.
     """
-    if not focal_sigma:
+    solver, least_squares = (
+        np.linalg.cholesky(covariance_rad2),
+        np.linalg.cholesky(from_independent(view, sigma_rad, isotropic(sigma_rad))),
+    )
+    adapt = solver @ np.linalg.inv(least_squares)
+    shared = from_independent(view, sigma_rad, own_rad2) + from_common(view, sigma_rad, common_rad)
+    noise = from_independent(view, sigma_rad, noise_rad2)
+    return adapt @ (noise + shared) @ adapt.T, adapt @ shared @ adapt.T
+
+
+def focal_error_px(camera: Camera, xy_px: Floats) -> Floats:
+    """(N,) standard deviation of a calibrated focal length times the distance from the principal point."""
+    return np.asarray(camera.focal_sigma * np.linalg.norm(xy_px - camera.center_px, axis=1))
+
+
+def with_focal_error(
+    covariance_rad2: Floats, camera: Camera, xy_px: Floats, seen_cam: Floats, sigma_rad: Floats
+) -> tuple[Floats, Floats | None]:
+    """The (3, 3) covariance of an attitude with the error of the focal length as it is, and that part alone.
+
+    covariance_rad2 : with that error, `focal_error_px`, as independent from star to star
+    xy_px, seen_cam : (K, 2) centroids and (K, 3) unit vectors of their stars in camera axes
+    sigma_rad       : (K,) on which the covariance is based
+    None in place of the part if the focal length is known exactly.
+    """
+    if not camera.focal_sigma:
         return covariance_rad2, None
     view = geometry(seen_cam, seen_cam)
-    assumed = isotropic(focal_sigma * np.linalg.norm(view.tangent, axis=1))
-    common = from_common(view, sigma_rad, focal_sigma * view.tangent[None])
-    return covariance_rad2 - from_independent(view, sigma_rad, assumed) + common, common
+    focal_rad = focal_error_px(camera, xy_px) / camera.focal_px
+    noise = isotropic(np.sqrt(np.maximum(sigma_rad**2 - focal_rad**2, (0.01 * sigma_rad) ** 2)))
+    common = camera.focal_sigma * view.tangent[None]
+    return with_survey(covariance_rad2, view, sigma_rad, noise, np.zeros_like(noise), common)

@@ -171,8 +171,8 @@ class DomeTracker:
         cam_from_lab = self.lever.cam_from_body * body_from_lab
         R_cam_from_body = self.lever.cam_from_body.as_matrix()
         residual = self._residual_px(centroids, observed, star, body_from_lab)
-        covariance = misfit * R_cam_from_body @ covariance @ R_cam_from_body.T
-        covariance, systematic = self._with_survey(covariance, misfit, cam_from_lab, rays[observed], sigma_rad, star)
+        covariance = R_cam_from_body @ covariance @ R_cam_from_body.T
+        covariance, shared = self._with_survey(covariance, misfit, cam_from_lab, rays[observed], sigma_rad, star)
         lever_covariance = self._lever_covariance(cam_from_lab, star)
         return Attitude(
             "solved",
@@ -181,7 +181,7 @@ class DomeTracker:
             StarMatch(observed, star, cam_from_lab, match.log10_chance),
             float(np.sqrt(np.mean(residual**2))),
             self.camera,
-            systematic + lever_covariance,
+            shared + lever_covariance,
         )
 
     def _sigma_rad(self, solver: str, pixel_rad: Floats, rays: Floats, observed: NDArray, star: NDArray) -> Floats:
@@ -200,26 +200,26 @@ class DomeTracker:
         """The covariance of K matches with the survey's errors as they are, and the part that successive frames share.
 
         covariance : (3, 3) in camera axes, with each LED's error independent of the others' and equal in all directions
+        misfit     : factor of `_reject_blends` on all but the common errors
         sigma_rad  : (K,) errors on which it is based, (K, 3) rays and (K,) LEDs
         """
         led_rad, focal_rad = self.led_sigma_rad[star], focal_error_rad(rays, self.camera)
         if self.leds.covariance_m2 is None and self.leds.common_m is None and not self.camera.focal_sigma:
             # The LEDs' share of the error variance of a ray: of the covariance too, if it is the same for all rays.
-            return covariance, float(np.mean(led_rad**2 / sigma_rad**2)) * covariance
+            return misfit * covariance, float(np.mean(led_rad**2 / sigma_rad**2)) * misfit * covariance
         place_cam = cam_from_lab.apply(self.leds.position_m[star])
         view = systematic.geometry(place_cam, place_cam - self.lever.cam_from_body.apply(self.lever.camera_body_m))
         by_place = view.gradient @ cam_from_lab.as_matrix()
-        led_rad2 = systematic.isotropic(led_rad)
+        own_rad2 = systematic.isotropic(led_rad)
         if self.leds.covariance_m2 is not None:
-            led_rad2 = by_place @ self.leds.covariance_m2[star] @ np.moveaxis(by_place, 1, 2)
-        assumed_rad2 = systematic.isotropic(np.hypot(led_rad, focal_rad))
+            own_rad2 = by_place @ self.leds.covariance_m2[star] @ np.moveaxis(by_place, 1, 2)
+        noise_rad2 = systematic.isotropic(np.sqrt(np.maximum(sigma_rad**2 - led_rad**2 - focal_rad**2, 0)))
         common_rad = [self.camera.focal_sigma * view.tangent[None]]
         if self.leds.common_m is not None:
             common_rad.append(np.einsum("kij,mkj->mki", by_place, self.leds.common_m[:, star]))
-        common = systematic.from_common(view, sigma_rad, np.concatenate(common_rad))
-        own = misfit * systematic.from_independent(view, sigma_rad, led_rad2)
-        assumed = misfit * systematic.from_independent(view, sigma_rad, assumed_rad2)
-        return covariance - assumed + own + common, own + common
+        return systematic.with_survey(
+            covariance, view, sigma_rad, misfit * noise_rad2, misfit * own_rad2, np.concatenate(common_rad)
+        )
 
     def _residual_px(self, centroids: Centroids, observed: NDArray, star: NDArray, body_from_lab: Rotation) -> Floats:
         """(K, 2) predicted minus observed pixels."""

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.solvers import SOLVERS, covariance
-from estimator.attitude.systematic import with_focal_error
+from estimator.attitude.systematic import focal_error_px, with_focal_error
 from estimator.catalog import catalog, pair_index, sky_index
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
@@ -184,7 +184,8 @@ class StarTracker:
         seen_cam = cam_from_ref.apply(vectors)
         residual = self.camera.pixels(seen_cam) - centroids.xy_px[observed]
         covariance_rad2 = covariance(rays, sigma_rad, self.settings.solver)
-        covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, seen_cam, sigma_rad, self.camera.focal_sigma)
+        xy_px = centroids.xy_px[observed]
+        covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, self.camera, xy_px, seen_cam, sigma_rad)
         match = StarMatch(observed, star, cam_from_ref, float("nan"))
         rms_px = float(np.sqrt(np.mean(residual**2)))
         return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, self.camera, common_rad2)
@@ -269,7 +270,8 @@ class StarTracker:
         rms_px = solution.rms * self.camera.focal_px
         sigma_rad = sigma_px[solution.observed] / camera.focal_px
         seen_cam = cam_from_ref.apply(self.stars.vectors[solution.star])
-        covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, seen_cam, sigma_rad, camera.focal_sigma)
+        xy_px = centroids.xy_px[solution.observed]
+        covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, camera, xy_px, seen_cam, sigma_rad)
         return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2)
 
     def _candidates(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
@@ -318,7 +320,7 @@ class StarTracker:
             if fit_lens:
                 camera, cam_from_ref = fit_camera(camera, cam_from_ref, xy, vectors)
             rays = camera.rays(xy)
-            focal_rad = camera.focal_sigma * np.linalg.norm(rays[:, :2] / rays[:, 2:], axis=1)
+            focal_rad = focal_error_px(camera, xy) / camera.focal_px
             sigma_rad = np.hypot(direction_sigma_rad(centroids.take(observed), camera, self.settings), focal_rad)
             try:
                 cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
@@ -340,7 +342,7 @@ class StarTracker:
         seen_cam = cam_from_ref.apply(vectors)
         rms_px = float(np.sqrt(np.mean((camera.pixels(seen_cam) - xy) ** 2)))
         covariance_rad2 = covariance(rays, sigma_rad, self.settings.solver)
-        covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, seen_cam, sigma_rad, camera.focal_sigma)
+        covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, camera, xy, seen_cam, sigma_rad)
         match = StarMatch(observed, star, cam_from_ref, chance)
         return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2)
 

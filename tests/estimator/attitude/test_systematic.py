@@ -156,11 +156,11 @@ def test_the_star_tracker_claims_the_error_of_its_focal_length(focal: float) -> 
     tracker = StarTracker.for_sky(camera, limit_mag=6.0)
     cam_from_ref = Rotation.from_euler("xyz", [80, 10, 30], degrees=True)
     rows, exact_px = tracker.in_field(camera, cam_from_ref)
-    chosen = exact_px[:, 0] > 500
+    chosen = exact_px[:, 0] > 900
     rows, exact_px = rows[chosen], exact_px[chosen]
-    assert len(rows) >= 8
+    assert len(rows) >= 5
     rng, squares = np.random.default_rng(8), []
-    for _ in range(300):
+    for _ in range(1000):
         scale = 1 + focal * rng.standard_normal()
         xy_px = camera.center_px + (exact_px - camera.center_px) * scale
         xy_px = xy_px + np.hypot(0.05, 0.1) * rng.standard_normal(xy_px.shape)
@@ -169,4 +169,4 @@ def test_the_star_tracker_claims_the_error_of_its_focal_length(focal: float) -> 
         error = (answer.cam_from_ref * cam_from_ref.inv()).as_rotvec()
         squares.append(error @ np.linalg.solve(answer.covariance_rad2, error))
         assert (answer.systematic_rad2 is None) == (focal == 0)
-    assert abs(np.mean(squares) - 3) < 5 * np.sqrt(6 / 300)
+    assert abs(np.mean(squares) - 3) < 5 * np.sqrt(6 / 1000)
