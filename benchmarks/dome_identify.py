@@ -20,7 +20,7 @@ from estimator.identification.leds.index import DomeIndex, build_dome_index
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.simulation.testbed import build_testbed
-from skysim.sources.dome import layout
+from skysim.sources.dome.layouts import placing
 from skysim.sources.dome.placement import optimize
 from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking.onboard_model import calibration
@@ -60,8 +60,8 @@ def leds_m(places: str, count: int, surface: Surface, rng: np.random.Generator) 
     """
     half = np.radians(CAP_DEG)
     if places == "fibonacci":
-        return layout.project_from_bearing(surface, layout.cap(count, half))
-    darts_m = layout.project_from_bearing(surface, layout.scattered_cap(100 * count, half, rng))
+        return placing.project_from_bearing(surface, placing.cap(count, half))
+    darts_m = placing.project_from_bearing(surface, placing.scattered_cap(100 * count, half, rng))
     if places == "random":
         return darts_m[:count]
     area_m2 = 2 * np.pi * 1.22**2 * (1 - np.cos(half))

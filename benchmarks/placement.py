@@ -21,11 +21,11 @@ from estimator.core.camera import Camera
 from estimator.identification.leds.index import build_dome_index
 from skysim.core.types import Floats
 from skysim.core.units import ARCSEC_RAD
+from skysim.scene import layouts, loader
 from skysim.scene import leds as led_schema
-from skysim.scene import loader
 from skysim.scene.light import DomeConfig
 from skysim.simulation.testbed import build_testbed
-from skysim.sources.dome import layout
+from skysim.sources.dome.layouts import registry
 from skysim.sources.dome.placement import fisher, optimize
 from skysim.sources.dome.surface import Surface, build_surface
 from skysim.sources.photometry import Band
@@ -49,7 +49,7 @@ class Setup:
     surface: Surface
     camera: Camera
     lever: Lever
-    boards: led_schema.PatchBoardsConfig
+    boards: layouts.PatchBoardsConfig
     led: led_schema.LedConfig
     band: Band
     cap_deg: float
@@ -87,17 +87,17 @@ def build_setup() -> Setup:
     light, camera = testbed.scene.light, calibration(testbed.scene.camera)
     lever = Lever(np.array(testbed.mount.camera_body_m), testbed.mount.cam_from_body)
     assert isinstance(light, DomeConfig)
-    assert isinstance(light.layout, led_schema.PatchBoardsConfig)
+    assert isinstance(light.layout, layouts.PatchBoardsConfig)
     surface = build_surface(light.surface)
     wide = Setup(surface, camera, lever, light.layout, light.led, testbed.band, 40.0)
     reach_deg = float(np.degrees(optimize.field_reach_rad(optimized_config(wide, 3, 0), surface)))
     return Setup(surface, camera, lever, light.layout, light.led, testbed.band, reach_deg)
 
 
-def optimized_config(setup: Setup, count: int, seed: int) -> led_schema.OptimizedConfig:
+def optimized_config(setup: Setup, count: int, seed: int) -> layouts.OptimizedConfig:
     """Configuration of an optimized layout, with defaults for all optional keys."""
     half = np.array([setup.camera.width_px, setup.camera.height_px]) / 2 / setup.camera.focal_px
-    return led_schema.OptimizedConfig.model_validate(
+    return layouts.OptimizedConfig.model_validate(
         {
             "kind": "optimized",
             "cap_deg": setup.cap_deg,
@@ -118,11 +118,11 @@ def leds(setup: Setup, kind: str, count: int, seed: int) -> tuple[Floats, Ints |
     there are enough, and surplus LEDs are dropped at random.
     """
     cap = {"cap_deg": setup.cap_deg, "hardware_seed": seed}
-    configs: list[led_schema.Layout] = []
+    configs: list[layouts.Layout] = []
     if kind == "optimized":
         configs = [optimized_config(setup, count, seed)]
     elif kind == "Fibonacci":
-        configs = [led_schema.FibonacciConfig.model_validate({"kind": "fibonacci", "count": count} | cap)]
+        configs = [layouts.FibonacciConfig.model_validate({"kind": "fibonacci", "count": count} | cap)]
     area_m2 = 2 * np.pi * np.square(setup.surface.meet(np.zeros(3), np.eye(3)[2:])[0, 2])
     each_m2 = area_m2 * (1 - np.cos(np.radians(setup.cap_deg))) / count
     # Candidates with up to 50% more LEDs than asked for, in small steps; the first with enough of them is used.
@@ -132,11 +132,11 @@ def leds(setup: Setup, kind: str, count: int, seed: int) -> tuple[Floats, Ints |
             configs.append(setup.boards.model_copy(update=cap | {"spacing_m": spacing_m}))
         else:
             disk = {"kind": "poisson_disk", "spacing": f"{np.sqrt(0.66 * each_m2 / density)} m"}
-            configs.append(led_schema.PoissonDiskConfig.model_validate(disk | cap))
-    candidates = (layout.LAYOUTS[config.kind](config, setup.surface, setup.led, setup.band) for config in configs)
+            configs.append(layouts.PoissonDiskConfig.model_validate(disk | cap))
+    candidates = (registry.LAYOUTS[config.kind](config, setup.surface, setup.led, setup.band) for config in configs)
     sources = next(candidate for candidate in candidates if len(candidate) >= count)
     selected = np.sort(np.random.default_rng(seed).permutation(len(sources))[:count])
-    return sources.place[selected, :3], layout.board_of(configs[0], sources.id[selected])
+    return sources.place[selected, :3], registry.board_of(configs[0], sources.id[selected])
 
 
 def sigmas_arcsec(setup: Setup, place_m: Floats) -> tuple[Floats, Floats, Floats]:

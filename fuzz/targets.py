@@ -30,7 +30,8 @@ from skysim.results.files import recording
 from skysim.scene import loader, opencv_calibration
 from skysim.sources import catalog as star_catalog
 from skysim.sources import photometry
-from skysim.sources.dome import layout, point_cloud
+from skysim.sources.dome import point_cloud
+from skysim.sources.dome.layouts import listed
 from skysim.tracking import dome_map_file
 from skysim.tracking.external import interface
 
@@ -117,7 +118,7 @@ def calibrations(data: bytes) -> None:
 def tables(data: bytes) -> None:
     """CSV tables: LEDs, surveyed points of a dome, a curve over wavelength, a point-spread function."""
     path = write_file(data, "table.csv")
-    rejects(lambda: layout.read_csv(path), InputError)
+    rejects(lambda: listed.read_csv(path), InputError)
     rejects(lambda: point_cloud.fit(point_cloud.read(str(path), "m"), 2, str(path)), InputError)
     rejects(lambda: photometry._read_curve.__wrapped__(path), InputError)  # bypass the cache, whose key is the path
     rejects(lambda: otf.read_cells.__wrapped__(str(path)), InputError)

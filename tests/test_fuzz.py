@@ -28,7 +28,8 @@ from skysim.core import images, yaml_reader
 from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.sources import photometry
-from skysim.sources.dome import layout, point_cloud
+from skysim.sources.dome import point_cloud
+from skysim.sources.dome.layouts import listed
 
 AS_IT_IS = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -151,8 +152,8 @@ def test_any_override_is_taken_or_refused(told: dict[str, str]) -> None:
 
 TABLES: dict[str, Callable[[Path], object]] = {
     "a, b, c": lambda path: point_cloud.read(str(path), "m"),
-    "x_m,y_m,z_m,magnitude": layout.read_csv,
-    "azimuth_deg,tilt_deg,level": layout.read_csv,
+    "x_m,y_m,z_m,magnitude": listed.read_csv,
+    "azimuth_deg,tilt_deg,level": listed.read_csv,
     "wavelength_nm,response": photometry._read_curve,
     "1,2,3": lambda path: read_cells(str(path)),
 }

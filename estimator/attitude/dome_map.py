@@ -25,7 +25,10 @@ class LedMap:
     position_m : (N, 3)
     center_m, semi_axes_m : (3,) the ellipsoid |(x - center) / semi_axes| = 1 that the LEDs are on
     board      : (N,) label of the patch board of each LED, as all boards have the same pattern; None without boards
-    sigma_m    : standard deviation of an LED's position along each axis
+    sigma_m    : standard deviation of an LED's position along each axis; the rms of all, if covariance_m2 says more
+    covariance_m2 : (N, 3, 3) of each LED's own error; None if it is the same for all, along all axes
+    common_m   : (M, N, 3) displacement of each LED by one standard deviation of each error that all LEDs share: of the
+        surface, of the instrument's place and orientation; None without any
     """
 
     id: Ints
@@ -34,6 +37,8 @@ class LedMap:
     semi_axes_m: Floats
     board: Ints | None = None
     sigma_m: float = 0.0
+    covariance_m2: Floats | None = None
+    common_m: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)

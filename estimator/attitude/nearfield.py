@@ -74,7 +74,7 @@ def rotation_only(
     for _ in range(30):
         b = cam_from_body.apply(body_from_lab.apply(position_m))
         q = b - cam_from_body.apply(lever.camera_body_m)
-        jacobian = _jacobian(b, q) * weight[:, None]
+        jacobian = tangent_jacobian(b, q) * weight[:, None]
         residual = (measured - q[:, :2] / q[:, 2:]).ravel() * weight
         step, _, rank, _ = np.linalg.lstsq(jacobian, residual, rcond=None)
         # Rank 2: the LEDs lie in one direction from the bearing, about which any rotation fits.
@@ -91,7 +91,7 @@ def rotation_only(
     return body_from_lab, _in_body_axes(covariance_cam, lever)
 
 
-def _tangent_gradients(q: Floats) -> Floats:
+def tangent_gradients(q: Floats) -> Floats:
     """Return the (N, 2, 3) derivative of the tangents (q_x / q_z, q_y / q_z) with respect to q."""
     inverse_z = 1 / q[:, 2]
     zero = np.zeros_like(inverse_z)
@@ -100,10 +100,10 @@ def _tangent_gradients(q: Floats) -> Floats:
     return np.stack([d_x, d_y], axis=1)
 
 
-def _jacobian(b: Floats, q: Floats) -> Floats:
+def tangent_jacobian(b: Floats, q: Floats) -> Floats:
     """Return the (2 N, 3) derivative of the tangents of q = b - r by a small rotation w of b: dq = w x b."""
     # d . (w x b) = w . (b x d)
-    return np.cross(b[:, None, :], _tangent_gradients(q)).reshape(-1, 3)
+    return np.cross(b[:, None, :], tangent_gradients(q)).reshape(-1, 3)
 
 
 def _in_body_axes(covariance_cam: np.ndarray, lever: Lever) -> Floats:
@@ -222,7 +222,7 @@ def thesis(
     by_tangent[:, [0, 1], [0, 1]] = distance_m
     by_tangent[:, 2, :] = -distance_m * across_m / point_cam[:, 2:]
     R_body_from_cam = lever.cam_from_body.inv().as_matrix()
-    by_ray_m = R_body_from_cam @ by_tangent @ _tangent_gradients(rays_cam) @ R_body_from_cam.T
+    by_ray_m = R_body_from_cam @ by_tangent @ tangent_gradients(rays_cam) @ R_body_from_cam.T
     point = point_cam @ R_body_from_cam.T + lever.camera_body_m
     distances_m = np.full(len(rays_cam), distance_m)
     body_from_lab = _wahba(point, distances_m, sigma_rad, position_m)
@@ -354,7 +354,7 @@ def _six_dof_residual(
     """Return the tangents' weighted residual (2 N,) and its Jacobian (2 N, 6) by a small rotation and a shift."""
     b = cam_from_lab.apply(pattern_m)
     q = b + shift_m
-    jacobian = np.hstack([_jacobian(b, q), _tangent_gradients(q).reshape(-1, 3)])
+    jacobian = np.hstack([tangent_jacobian(b, q), tangent_gradients(q).reshape(-1, 3)])
     return (measured - q[:, :2] / q[:, 2:]).ravel() * weight, jacobian * weight[:, None]
 
 

@@ -24,6 +24,7 @@ class Camera:
     focal_px : focal length divided by the pixel pitch
     center_px: principal point (x, y); the center of pixel (0, 0) is (0, 0)
     distortion: k1, k2, p1, p2, k3 in OpenCV's order
+    focal_sigma: relative standard deviation of the focal length: the error of a calibration, the same in every frame
     """
 
     width_px: int
@@ -31,6 +32,7 @@ class Camera:
     focal_px: float
     center_px: tuple[float, float]
     distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
+    focal_sigma: float = 0.0
 
     @classmethod
     def from_fov(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from estimator.attitude import systematic
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, on_sphere, project
 from estimator.attitude.nearfield import SOLVERS, fitted_sigma_rad
 from estimator.catalog import pair_index
@@ -77,6 +78,26 @@ IDENTIFIERS: dict[str, Callable[[Camera, LedMap, Lever, Settings], Identify]] = 
 }
 
 
+def led_sigma_rad(leds: LedMap, lever: Lever) -> Floats:
+    """(L,) standard deviation of the direction to each LED from the camera, by the error of its place.
+
+    Equal errors of all LEDs are divided by the least distance of any. Otherwise the rms across the line from the
+    bearing is divided by the LED's own distance less the lever.
+    """
+    radius_m, lever_m = np.linalg.norm(leds.position_m, axis=1), float(np.linalg.norm(lever.camera_body_m))
+    if leds.covariance_m2 is None:
+        return np.full(len(radius_m), leds.sigma_m / (radius_m.min() - lever_m))
+    along = leds.position_m / radius_m[:, None]
+    total_m2 = np.trace(leds.covariance_m2, axis1=1, axis2=2)
+    along_m2 = np.einsum("ni,nij,nj->n", along, leds.covariance_m2, along)
+    return np.asarray(np.sqrt((total_m2 - along_m2) / 2) / (radius_m - lever_m))
+
+
+def focal_error_rad(rays_cam: Floats, camera: Camera) -> Floats:
+    """(N,) standard deviation of rays' tangents by the error of the focal length, rms of both axes."""
+    return np.asarray(camera.focal_sigma * np.linalg.norm(rays_cam[:, :2] / rays_cam[:, 2:], axis=1) / np.sqrt(2))
+
+
 class DomeTracker:
     """Lost-in-space tracker under an LED dome, with the camera on a lever arm about the bearing center.
 
@@ -94,8 +115,7 @@ class DomeTracker:
         check_lever(leds, lever)
         self.camera, self.leds, self.lever, self.settings = camera, leds, lever, settings
         self.identify = IDENTIFIERS[settings.identifier](camera, leds, lever, settings)
-        min_range_m = np.linalg.norm(leds.position_m, axis=1).min() - np.linalg.norm(lever.camera_body_m)
-        self.led_sigma_rad = float(leds.sigma_m / min_range_m)
+        self.led_sigma_rad = led_sigma_rad(leds, lever)
 
     def solve(self, image: NDArray, streak_px: tuple[float, float] | None = None) -> Report:
         """Solve one frame. Raises ImageError for bad input; any other failure is reported in the status.
@@ -110,7 +130,9 @@ class DomeTracker:
         if len(centroids) < MIN_EVIDENCE_MATCHES:
             return Attitude(NO_STARS)
         bright = brightest(centroids, self.settings)
-        match = self.identify(self.camera.rays(bright.xy_px), direction_sigma_rad(bright, self.camera, self.settings))
+        rays = self.camera.rays(bright.xy_px)
+        focal_rad = focal_error_rad(rays, self.camera)
+        match = self.identify(rays, np.hypot(direction_sigma_rad(bright, self.camera, self.settings), focal_rad))
         clock.lap("identify")
         if isinstance(match, str):
             return Attitude(match)
@@ -127,28 +149,31 @@ class DomeTracker:
         observed, star = match.observed, match.star
         body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
         rays = self.camera.rays(centroids.xy_px)
-        sigma_rad = self._sigma_rad(centroids, rays, "rotation_only")
-        radius_px = max(4.0, 4 * float(np.median(sigma_rad)) * self.camera.focal_px)
+        pixel_rad = np.hypot(
+            direction_sigma_rad(centroids, self.camera, self.settings), focal_error_rad(rays, self.camera)
+        )
+        radius_px = max(4.0, 4 * self.camera.focal_px * float(np.median(np.hypot(pixel_rad, self.led_sigma_rad.max()))))
         try:
             for factor in (3.0, 1.0):
+                sigma_rad = self._sigma_rad("rotation_only", pixel_rad, rays, observed, star)
                 body_from_lab, _ = self._solve("rotation_only", rays, sigma_rad, observed, star, body_from_lab)
                 observed, star = self._nearest(centroids, body_from_lab, factor * radius_px)
                 # The exact geometry must confirm as many matches as identification found.
                 if len(observed) < len(match.observed):
                     return Attitude(NO_MATCH)
+            sigma_rad = self._sigma_rad("rotation_only", pixel_rad, rays, observed, star)
             observed, star, misfit = self._reject_blends(centroids, sigma_rad, observed, star, body_from_lab)
             solver = self.settings.solver
-            sigma_rad = self._sigma_rad(centroids, rays, solver)
+            sigma_rad = self._sigma_rad(solver, pixel_rad, rays, observed, star)
             body_from_lab, covariance = self._solve(solver, rays, sigma_rad, observed, star, body_from_lab)
         except (ValueError, np.linalg.LinAlgError) as error:
             return Attitude(f"no attitude: {error}")
         cam_from_lab = self.lever.cam_from_body * body_from_lab
         R_cam_from_body = self.lever.cam_from_body.as_matrix()
         residual = self._residual_px(centroids, observed, star, body_from_lab)
-        covariance = misfit * R_cam_from_body @ covariance @ R_cam_from_body.T
+        covariance = R_cam_from_body @ covariance @ R_cam_from_body.T
+        covariance, shared = self._with_survey(covariance, misfit, cam_from_lab, rays[observed], sigma_rad, star)
         lever_covariance = self._lever_covariance(cam_from_lab, star)
-        # The LEDs' share of the error variance of a ray: of the covariance too, if it is the same for all rays.
-        survey_share = float(np.mean(self.led_sigma_rad**2 / sigma_rad[observed] ** 2))
         return Attitude(
             "solved",
             cam_from_lab,
@@ -156,13 +181,45 @@ class DomeTracker:
             StarMatch(observed, star, cam_from_lab, match.log10_chance),
             float(np.sqrt(np.mean(residual**2))),
             self.camera,
-            survey_share * covariance + lever_covariance,
+            shared + lever_covariance,
         )
 
-    def _sigma_rad(self, centroids: Centroids, rays: Floats, solver: str) -> Floats:
-        """(N,) standard deviation of a solver's residuals, from the centroids and the LED positions."""
-        pixel_rad = direction_sigma_rad(centroids, self.camera, self.settings)
-        return np.hypot(fitted_sigma_rad(solver, rays, pixel_rad), self.led_sigma_rad)
+    def _sigma_rad(self, solver: str, pixel_rad: Floats, rays: Floats, observed: NDArray, star: NDArray) -> Floats:
+        """(K,) standard deviation of a solver's residuals for K matches, from the centroids and the LED positions."""
+        return np.hypot(fitted_sigma_rad(solver, rays[observed], pixel_rad[observed]), self.led_sigma_rad[star])
+
+    def _with_survey(
+        self,
+        covariance: Floats,
+        misfit: float,
+        cam_from_lab: Rotation,
+        rays: Floats,
+        sigma_rad: Floats,
+        star: NDArray,
+    ) -> tuple[Floats, Floats]:
+        """The covariance of K matches with the survey's errors as they are, and the part that successive frames share.
+
+        covariance : (3, 3) in camera axes, with each LED's error independent of the others' and equal in all directions
+        misfit     : factor of `_reject_blends` on all but the common errors
+        sigma_rad  : (K,) errors on which it is based, (K, 3) rays and (K,) LEDs
+        """
+        led_rad, focal_rad = self.led_sigma_rad[star], focal_error_rad(rays, self.camera)
+        if self.leds.covariance_m2 is None and self.leds.common_m is None and not self.camera.focal_sigma:
+            # The LEDs' share of the error variance of a ray: of the covariance too, if it is the same for all rays.
+            return misfit * covariance, float(np.mean(led_rad**2 / sigma_rad**2)) * misfit * covariance
+        place_cam = cam_from_lab.apply(self.leds.position_m[star])
+        view = systematic.geometry(place_cam, place_cam - self.lever.cam_from_body.apply(self.lever.camera_body_m))
+        by_place = view.gradient @ cam_from_lab.as_matrix()
+        own_rad2 = systematic.isotropic(led_rad)
+        if self.leds.covariance_m2 is not None:
+            own_rad2 = by_place @ self.leds.covariance_m2[star] @ np.moveaxis(by_place, 1, 2)
+        noise_rad2 = systematic.isotropic(np.sqrt(np.maximum(sigma_rad**2 - led_rad**2 - focal_rad**2, 0)))
+        common_rad = [self.camera.focal_sigma * view.tangent[None]]
+        if self.leds.common_m is not None:
+            common_rad.append(np.einsum("kij,mkj->mki", by_place, self.leds.common_m[:, star]))
+        return systematic.with_survey(
+            covariance, view, sigma_rad, misfit * noise_rad2, misfit * own_rad2, np.concatenate(common_rad)
+        )
 
     def _residual_px(self, centroids: Centroids, observed: NDArray, star: NDArray, body_from_lab: Rotation) -> Floats:
         """(K, 2) predicted minus observed pixels."""
@@ -184,7 +241,7 @@ class DomeTracker:
         freedom; if its reduced chi-square exceeds 1 by more than 3 standard deviations, it is the factor, else 1.
         """
         residual = self._residual_px(centroids, observed, star, body_from_lab)
-        length = np.linalg.norm(residual, axis=1) / (sigma_rad[observed] * self.camera.focal_px)
+        length = np.linalg.norm(residual, axis=1) / (sigma_rad * self.camera.focal_px)
         inlier = length <= 5 * max(float(np.median(length)), 1.0)
         if inlier.sum() < max(MIN_EVIDENCE_MATCHES, len(inlier) / 2):
             inlier[:] = True
@@ -214,7 +271,7 @@ class DomeTracker:
     ) -> tuple[Rotation, Floats]:
         """body_from_lab and its covariance in body axes, from the matched rays."""
         position_m = self.leds.position_m[star]
-        return SOLVERS[solver](rays[observed], sigma_rad[observed], position_m, self.leds, self.lever, body_from_lab)
+        return SOLVERS[solver](rays[observed], sigma_rad, position_m, self.leds, self.lever, body_from_lab)
 
     def _nearest(self, centroids: Centroids, body_from_lab: Rotation, radius_px: float) -> tuple[NDArray, NDArray]:
         """Mutual nearest neighbors of centroids and LEDs within a radius: rows of both."""

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.solvers import SOLVERS, covariance
+from estimator.attitude.systematic import focal_error_px, with_focal_error
 from estimator.catalog import catalog, pair_index, sky_index
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
@@ -180,19 +181,22 @@ class StarTracker:
             cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
         except ValueError as error:
             return Attitude(f"no attitude: {error}")
-        residual = self.camera.pixels(cam_from_ref.apply(vectors)) - centroids.xy_px[observed]
-        return Attitude(
-            "solved",
-            cam_from_ref,
-            covariance(rays, sigma_rad, self.settings.solver),
-            StarMatch(observed, star, cam_from_ref, float("nan")),
-            float(np.sqrt(np.mean(residual**2))),
-            self.camera,
-        )
+        seen_cam = cam_from_ref.apply(vectors)
+        residual = self.camera.pixels(seen_cam) - centroids.xy_px[observed]
+        covariance_rad2 = covariance(rays, sigma_rad, self.settings.solver)
+        xy_px = centroids.xy_px[observed]
+        covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, self.camera, xy_px, seen_cam, sigma_rad)
+        match = StarMatch(observed, star, cam_from_ref, float("nan"))
+        rms_px = float(np.sqrt(np.mean(residual**2)))
+        return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, self.camera, common_rad2)
 
     def sigma_px(self, centroids: Centroids, min_error_px: float = MIN_ERROR_PX, relative_error: float = 0.0) -> Floats:
-        """(N,) total centroid error: its own, a floor, and relative_error times the distance from the image center."""
+        """(N,) total centroid error: its own, a floor, and relative_error times the distance from the image center.
+
+        The error of a calibrated focal length is the least relative_error.
+        """
         sigma_px = np.hypot(centroids.sigma_px, max(self.settings.centroid_sigma_px, min_error_px))
+        relative_error = max(relative_error, self.camera.focal_sigma)
         if relative_error == 0:
             return sigma_px
         radius_px = np.linalg.norm(centroids.xy_px - self.camera.center_px, axis=1)
@@ -264,7 +268,11 @@ class StarTracker:
             covariance_rad2 = covariance(rays, sigma_rad, solver)
         match = StarMatch(solution.observed, solution.star, cam_from_ref, -solution.dex)
         rms_px = solution.rms * self.camera.focal_px
-        return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera)
+        sigma_rad = sigma_px[solution.observed] / camera.focal_px
+        seen_cam = cam_from_ref.apply(self.stars.vectors[solution.star])
+        xy_px = centroids.xy_px[solution.observed]
+        covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, camera, xy_px, seen_cam, sigma_rad)
+        return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2)
 
     def _candidates(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
         """Candidate attitudes and cameras by the published identifier that the settings name.
@@ -311,8 +319,9 @@ class StarTracker:
             xy, vectors = centroids.xy_px[observed], self.stars.vectors[star]
             if fit_lens:
                 camera, cam_from_ref = fit_camera(camera, cam_from_ref, xy, vectors)
-            sigma_rad = direction_sigma_rad(centroids.take(observed), camera, self.settings)
             rays = camera.rays(xy)
+            focal_rad = focal_error_px(camera, xy) / camera.focal_px
+            sigma_rad = np.hypot(direction_sigma_rad(centroids.take(observed), camera, self.settings), focal_rad)
             try:
                 cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
             except ValueError as error:
@@ -330,15 +339,12 @@ class StarTracker:
             return Attitude(NO_MATCH)
         if abs(camera.fov_rad / self.camera.fov_rad - 1) > 1.2 * self.focal_uncertainty + 1e-9:
             return Attitude(NO_MATCH)
-        residual = camera.pixels(cam_from_ref.apply(vectors)) - xy
-        return Attitude(
-            "solved",
-            cam_from_ref,
-            covariance(rays, sigma_rad, self.settings.solver),
-            StarMatch(observed, star, cam_from_ref, chance),
-            float(np.sqrt(np.mean(residual**2))),
-            camera,
-        )
+        seen_cam = cam_from_ref.apply(vectors)
+        rms_px = float(np.sqrt(np.mean((camera.pixels(seen_cam) - xy) ** 2)))
+        covariance_rad2 = covariance(rays, sigma_rad, self.settings.solver)
+        covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, camera, xy, seen_cam, sigma_rad)
+        match = StarMatch(observed, star, cam_from_ref, chance)
+        return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2)
 
     def in_field(self, camera: Camera, cam_from_ref: Rotation) -> tuple[NDArray, Floats]:
         """Rows and pixels of the catalog stars on the sensor, brightest first."""

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.background import pixel_directions, viewing_geometry
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats
-from skysim.scene import leds, light
+from skysim.scene import layouts, leds, light
 from skysim.sources.dome.display import black_transmission, panel_surface
 from skysim.sources.dome.led import LOBES, full_strength_e_s_sr
 from skysim.sources.dome.surface import build_surface
@@ -31,7 +31,7 @@ def black_glow(
     exposure and the row times of a rolling shutter are left out.
     """
     screen = config.layout if isinstance(config, light.DomeConfig) else config
-    if not isinstance(screen, leds.PixelsConfig) or not screen.contrast:
+    if not isinstance(screen, layouts.PixelsConfig) or not screen.contrast:
         return None
     view = viewing_geometry(*chip_directions(optics), optics, cam_from_lab, band)
     if isinstance(config, light.CollimatedDisplayConfig):
@@ -55,7 +55,7 @@ def panel_radiance_e_s_m2_sr(config: light.DomeConfig, toward_lab: Floats, camer
 
     0 for directions (N, 3) that miss it. p is the pitch, I a white pixel's intensity from the LED's lobe.
     """
-    assert isinstance(config.layout, leds.LcdConfig)
+    assert isinstance(config.layout, layouts.LcdConfig)
     panel = panel_surface(config.layout, build_surface(config.surface))
     hits_panel = np.isfinite(panel.meet(camera_m, toward_lab)[:, 0])
     cos_emission = np.where(hits_panel, -toward_lab @ panel.inward(panel.center_m[None])[0], 1.0)

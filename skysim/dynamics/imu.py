@@ -22,6 +22,7 @@ from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.random_streams import random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
 from skysim.scene.vehicle import AccelerometerConfig, GyroConfig, ImuConfig, SiteConfig
 
@@ -267,7 +268,7 @@ def gyro_triad(config: GyroConfig, hardware: Floats, start: Floats) -> Triad:
     per_hour = math.radians(1) / 3600
     return Triad(
         matrix=response_matrix(config.scale_ppm, config.misalignment_arcsec, hardware[1:]),
-        turn_on_bias=config.turn_on_bias_deg_h * per_hour * hardware[0],
+        turn_on_bias=per_hour * scaled_errors(config.turn_on_bias_deg_h, hardware[0]),
         markov_bias=config.bias_deg_h * per_hour * start,
         markov_sd=config.bias_deg_h * per_hour,
         markov_time_s=config.bias_time_s,
@@ -284,7 +285,7 @@ def accelerometer_triad(config: AccelerometerConfig, hardware: Floats, start: Fl
     ug = 1e-6 * STANDARD_GRAVITY_M_S2
     return Triad(
         matrix=response_matrix(config.scale_ppm, config.misalignment_arcsec, hardware[1:]),
-        turn_on_bias=config.turn_on_bias_ug * ug * hardware[0],
+        turn_on_bias=ug * scaled_errors(config.turn_on_bias_ug, hardware[0]),
         markov_bias=config.bias_ug * ug * start,
         markov_sd=config.bias_ug * ug,
         markov_time_s=config.bias_time_s,
@@ -296,8 +297,9 @@ def accelerometer_triad(config: AccelerometerConfig, hardware: Floats, start: Fl
 
 def response_matrix(scale_ppm: float, misalignment_arcsec: float, normal: Floats) -> Floats:
     """(3, 3) identity plus the scale errors on its diagonal and every sensor's misalignment off it."""
-    tilt = math.radians(misalignment_arcsec / 3600)
-    return np.eye(3) + np.where(np.eye(3) > 0, 1e-6 * scale_ppm, tilt) * normal
+    scale = 1e-6 * scaled_errors(scale_ppm, normal)
+    tilt_rad = math.radians(1 / 3600) * scaled_errors(misalignment_arcsec, normal)
+    return np.eye(3) + np.where(np.eye(3) > 0, scale, tilt_rad)
 
 
 @dataclass(slots=True)

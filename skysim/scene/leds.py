@@ -1,13 +1,12 @@
-"""Schema of a dome's LEDs: layout, brightness, drive and emission lobe."""
+"""Schema of the LED type of a dome: emission lobe, drive, brightness."""
 
 from __future__ import annotations
 
-import datetime
-from collections.abc import Sequence
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from skysim.core.tolerance import NumberError, Tolerance
 from skysim.core.units import (
     Ascending,
     ConfigModel,
@@ -19,294 +18,6 @@ from skysim.core.units import (
     Time,
     check_table,
 )
-
-HOLES = 9  # of a patch board: 3x3
-Level = Annotated[Number, Field(gt=0, le=1)]
-Levels = Annotated[tuple[Level, ...], Field(min_length=1)]
-Magnitudes = Annotated[tuple[Annotated[Number, Field(ge=-30, le=30)], ...], Field(min_length=1)]
-Cap = Annotated[Number, Field(gt=0, le=90)]
-Count = Annotated[int, Field(ge=1, le=100_000)]
-Seed = Annotated[int, Field(ge=0)]
-FieldOfView = Annotated[Number, Field(ge=1, le=90)]
-
-
-def relative_levels(magnitudes: Sequence[float]) -> tuple[float, ...]:
-    """Levels by Pogson's law, 10^(-0.4 m), relative to the brightest of the list, which has level 1."""
-    return tuple(10.0 ** (-0.4 * (float(magnitude) - float(min(magnitudes)))) for magnitude in magnitudes)
-
-
-class BoardConfig(ConfigModel):
-    """One patch board, glued with its center in this direction from the bearing's center.
-
-    azimuth_deg, tilt_deg : from the lab's +x toward +y, and from the zenith
-    rotation_deg : rotation of its columns about its normal
-    leds     : the holes that hold an LED, 0 to 8, row by row;  levels : one per LED, full brightness if left out
-    """
-
-    azimuth_deg: Number
-    tilt_deg: Annotated[Number, Field(ge=0, le=90)]
-    rotation_deg: Number = 0.0
-    leds: Annotated[tuple[Annotated[int, Field(ge=0, lt=HOLES)], ...], Field(min_length=1)]
-    levels: Levels | None = None
-
-    @model_validator(mode="after")
-    def check_leds(self) -> BoardConfig:
-        if len(set(self.leds)) < len(self.leds):
-            raise ValueError(f"leds: {list(self.leds)} has a duplicate hole")
-        if self.levels is not None and len(self.levels) != len(self.leds):
-            raise ValueError(f"leds has {len(self.leds)} holes, levels {len(self.levels)}")
-        return self
-
-
-class PatchBoardsConfig(ConfigModel):
-    """3x3 LED boards on a cap of the surface: spread evenly or on a grid with random patterns, or listed.
-
-    cap_deg : angle from the zenith, seen from the bearing, to which the dome carries LEDs; so for every layout
-    spacing, lit, pwm_levels : of boards that are spread; `boards` replaces them
-    spread  : spiral: as evenly as possible; grid: rows and columns along the lab's x and y, seen from above. The
-        number of boards on a spiral is that of a dome with the apex's height in all directions
-    glue_scatter  : standard deviation of an LED's place along each axis of its board
-    glue_tilt_deg : greatest angle between a board's normal and the surface's; normals are uniform over that cap
-    """
-
-    kind: Literal["patch_boards"]
-    cap_deg: Cap
-    spacing_m: Annotated[Length, Field(gt=0)] | None = None
-    pitch_m: Annotated[Length, Field(gt=0)]
-    spread: Literal["spiral", "grid"] = "spiral"
-    lit: tuple[int, int] = (4, 6)
-    pwm_levels: Levels = (1.0,)
-    boards: tuple[BoardConfig, ...] = ()
-    glue_scatter_m: Annotated[Length, Field(ge=0)] = 0.0
-    glue_tilt_deg: Annotated[Number, Field(ge=0, le=30)] = 0.0
-    hardware_seed: Seed = 0
-
-    @field_validator("lit")
-    @classmethod
-    def check_lit(cls, value: tuple[int, int]) -> tuple[int, int]:
-        if not 1 <= value[0] <= value[1] <= HOLES:
-            raise ValueError(f"{value} is not a range of LEDs on a 3x3 board; allowed: 1 <= least <= most <= 9")
-        return value
-
-    @model_validator(mode="after")
-    def check_spacing(self) -> PatchBoardsConfig:
-        if self.spacing_m is None and not self.boards:
-            raise ValueError("patch_boards takes spacing, or boards by list")
-        if self.spacing_m is not None and self.spacing_m < 3 * self.pitch_m:
-            raise ValueError(f"spacing {self.spacing_m:g} m: boards of three LEDs at {self.pitch_m:g} m would overlap")
-        return self
-
-
-class DimmedConfig(ConfigModel):
-    """Base of the layouts of single LEDs: their brightness, as fractions of full brightness or as magnitudes.
-
-    Each LED's brightness is drawn from the list (in `listed`, the list has one value per LED). The smallest magnitude
-    is full brightness.
-    """
-
-    cap_deg: Cap
-    levels: Levels | None = None
-    magnitudes: Magnitudes | None = None
-    hardware_seed: Seed = 0
-
-    @property
-    def dimming(self) -> tuple[float, ...]:
-        """The levels, given as levels or as magnitudes."""
-        return relative_levels(self.magnitudes) if self.magnitudes else self.levels or (1.0,)
-
-    @model_validator(mode="after")
-    def check_brightness(self) -> Self:
-        if self.levels is not None and self.magnitudes is not None:
-            raise ValueError("a layout takes either levels or magnitudes")
-        return self
-
-
-class FibonacciConfig(DimmedConfig):
-    """`count` LEDs on a Fibonacci spiral: as evenly as possible."""
-
-    kind: Literal["fibonacci"]
-    count: Count
-
-
-class PoissonDiskConfig(DimmedConfig):
-    """LEDs at random with a least spacing: as many as fit at `spacing`, or `count` of them as far apart as they fit."""
-
-    kind: Literal["poisson_disk"]
-    spacing_m: Annotated[Length, Field(gt=0)] | None = None
-    count: Annotated[int, Field(ge=1, le=20_000)] | None = None
-
-    @model_validator(mode="after")
-    def check_density(self) -> Self:
-        if (self.spacing_m is None) == (self.count is None):
-            raise ValueError("poisson_disk takes either spacing or count")
-        return self
-
-
-class RandomPlacesConfig(DimmedConfig):
-    """`count` LEDs at independent random places."""
-
-    kind: Literal["random"]
-    count: Count
-
-
-class OptimizedConfig(DimmedConfig):
-    """`count` LEDs placed for one camera's best accuracy at its worst attitudes: tilts to tilt_deg, any yaw.
-
-    field_deg : the camera's field of view along body x and y
-    camera    : its entrance pupil on the body; it looks along body z
-    spacing   : least distance between two LEDs
-    coincidence : LEDs of two fields coincide if they are closer than this when one field is laid on the other: a few
-        times the survey's error
-    min_leds  : LEDs that every field should hold; fewer are penalized
-    rounds    : how often each LED is offered another position
-    """
-
-    kind: Literal["optimized"]
-    count: Annotated[int, Field(ge=3, le=2000)]
-    tilt_deg: Annotated[Number, Field(ge=0, le=60)]
-    field_deg: tuple[FieldOfView, FieldOfView]
-    camera_m: tuple[Length, Length, Length]
-    spacing_m: Annotated[Length, Field(gt=0)]
-    coincidence_m: Annotated[Length, Field(gt=0)] = 1e-3
-    min_leds: Annotated[int, Field(ge=2, le=50)] = 5
-    rounds: Annotated[int, Field(ge=1, le=5000)] = 100
-
-
-class CelestialConfig(ConfigModel):
-    """The real sky: an LED for each of the brightest stars, where the camera at its nominal position sees it.
-
-    count or limit_mag : number of LEDs for the brightest stars on the dome, or all stars to this V
-    camera : the entrance pupil in the lab when the vehicle is level
-    zenith_ra_deg, zenith_dec_deg, roll_deg : the direction at the zenith, and the position angle there of the lab's
-        -y (a level camera's up), as `ra_deg`, `dec_deg`, `roll_deg` of a camera that looks up
-    epoch  : time of the apparent places, UTC
-    brightness : band: each LED is as bright as the chip measures its star, whose color the LED lacks; v: as its V
-    brightest_mag : no star is shown brighter than this, which is full brightness; the brightest star's if left out
-    """
-
-    kind: Literal["celestial"]
-    cap_deg: Cap
-    catalog: str = "hipparcos_hp6.5"
-    count: Count | None = None
-    limit_mag: Annotated[Number, Field(ge=-2, le=15)] | None = None
-    brightness: Literal["v", "band"] = "band"
-    brightest_mag: Number | None = None
-    camera_m: tuple[Length, Length, Length]
-    zenith_ra_deg: Annotated[Number, Field(ge=0, lt=360)]
-    zenith_dec_deg: Annotated[Number, Field(ge=-90, le=90)]
-    roll_deg: Number = 0.0
-    epoch: datetime.datetime = datetime.datetime(2000, 1, 1, 12)
-    hardware_seed: Seed = 0
-
-    @model_validator(mode="after")
-    def check_star_selection(self) -> CelestialConfig:
-        if (self.count is None) == (self.limit_mag is None):
-            raise ValueError("celestial takes either count or limit_mag")
-        if not 1900 <= self.epoch.year <= 2100:
-            raise ValueError(f"epoch: {self.epoch.isoformat()} is outside 1900 to 2100")
-        return self
-
-
-class ListedConfig(DimmedConfig):
-    """LEDs by list: places in the lab, or directions from the bearing onto the surface, or a CSV file of either.
-
-    directions_deg : azimuth from +x toward +y, and tilt from the zenith
-    file : columns x_m, y_m, z_m or azimuth_deg, tilt_deg, and level or magnitude
-    """
-
-    kind: Literal["listed"]
-    positions_m: Annotated[tuple[tuple[Length, Length, Length], ...], Field(min_length=1)] | None = None
-    directions_deg: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] | None = None
-    file: str | None = None
-
-    @model_validator(mode="after")
-    def check_positions(self) -> ListedConfig:
-        lists = [each for each in (self.positions_m, self.directions_deg, self.file) if each is not None]
-        if len(lists) != 1:
-            raise ValueError("listed takes one of positions, directions_deg, file")
-        dimmed = len(self.levels or self.magnitudes or ())
-        if dimmed and self.file is not None:
-            raise ValueError("levels and magnitudes of a file belong in its columns")
-        if dimmed and dimmed != len(lists[0]):
-            raise ValueError(f"{len(lists[0])} LEDs, but {dimmed} levels or magnitudes")
-        return self
-
-
-Points = Annotated[
-    FibonacciConfig | PoissonDiskConfig | RandomPlacesConfig | OptimizedConfig | CelestialConfig | ListedConfig,
-    Field(discriminator="kind"),
-]
-
-
-class FibersConfig(ConfigModel):
-    """Ends of optical fibers through the shell (JHU/APL's dome), at the points of any layout of single LEDs.
-
-    radius_variation : greatest error of the dome's radius at a fiber, as a fraction of the distance from the bearing,
-        uniformly distributed: the end is displaced along the surface's normal, inward or outward
-    """
-
-    kind: Literal["fibers"]
-    points: Points
-    radius_variation: Annotated[Number, Field(ge=0, le=0.1)] = 0.0
-
-    @property
-    def cap_deg(self) -> float:
-        """Angle from the zenith to which there are points."""
-        return self.points.cap_deg
-
-
-class PixelsConfig(ConfigModel):
-    """A display's grid and gray levels, common to an LCD panel and a collimated micro-display.
-
-    pixels : columns and rows;  pitch : from one pixel to the next, along both
-    block  : a star is drawn as a square of this many pixels a side, all of one gray
-    gray_levels, gamma : gray g = 0, 1, ... transmits (g / (gray_levels - 1))^gamma of white
-    contrast : white over black, which glows all over the display; none: black is dark
-    """
-
-    pixels: tuple[Annotated[int, Field(ge=1, le=20_000)], Annotated[int, Field(ge=1, le=20_000)]]
-    pitch_m: Annotated[Length, Field(gt=0)]
-    block: Annotated[int, Field(ge=1)] = 1
-    gray_levels: Annotated[int, Field(ge=2, le=65536)] = 256
-    gamma: Annotated[Number, Field(gt=0, le=10)] = 2.2
-    contrast: Annotated[Number, Field(ge=2)] | None = None
-
-    @model_validator(mode="after")
-    def check_block(self) -> Self:
-        if self.block > min(self.pixels):
-            raise ValueError(f"block {self.block} is wider than the display; allowed: up to {min(self.pixels)} pixels")
-        return self
-
-
-class LcdConfig(PixelsConfig):
-    """A flat LCD panel (the Naval Postgraduate School's screen): any layout of single LEDs, drawn on its pixels.
-
-    It is centered on the flat surface and ends where its pixels end, with columns along the surface's own x and rows
-    along its y, which a level camera sees as right and down. `led` is one white pixel while its backlight is lit; its
-    disk_diameter is that of a disk of the pixel's area.
-    """
-
-    kind: Literal["lcd"]
-    points: Points
-
-    @property
-    def cap_deg(self) -> float:
-        """Angle from the zenith to which there are points."""
-        return self.points.cap_deg
-
-
-Layout = Annotated[
-    PatchBoardsConfig
-    | FibonacciConfig
-    | PoissonDiskConfig
-    | RandomPlacesConfig
-    | OptimizedConfig
-    | CelestialConfig
-    | ListedConfig
-    | FibersConfig
-    | LcdConfig,
-    Field(discriminator="kind"),
-]
 
 
 class CosineLobeConfig(ConfigModel):
@@ -371,17 +82,19 @@ Drive = Annotated[DirectConfig | PwmConfig | SequentialConfig | RefreshConfig, F
 class ClockConfig(ConfigModel):
     """Oscillators of the controllers: a crystal of tens of ppm, in a room whose temperature changes (assumed).
 
-    offset_ppm  : standard deviation of their frequency offsets, from the layout's hardware_seed
+    offset_ppm  : standard deviation of their frequency offsets, or their tolerance, from the layout's hardware_seed
     drift_ppm_h : standard deviation of the drift of the frequency per hour, from the scene's seed
     """
 
-    offset_ppm: Annotated[Number, Field(ge=0, le=10_000)] = 50.0
-    drift_ppm_h: Annotated[Number, Field(ge=0, le=10_000)] = 1.0
+    offset_ppm: Annotated[NumberError, Field(le=10_000)] = 50.0
+    drift_ppm_h: Annotated[NumberError, Field(le=10_000)] = 1.0
 
 
 class LedConfig(ConfigModel):
     """The one LED type of the dome: intensity along its normal, in candela or in watts per steradian.
 
+    scatter : of the intensity from LED to LED: standard deviation of its logarithm, or its tolerance as a fraction
+        (a bin of ±10 %: {tolerance: 0.1})
     drive : how its level is made; pwm_period belongs to the kind pwm
     clock : the oscillators that time the pulses; every run starts with phases of its own
     """
@@ -392,7 +105,7 @@ class LedConfig(ConfigModel):
     falloff: Literal["inverse_square"] = "inverse_square"
     lobe: Lobe = CosineLobeConfig()
     spectrum: Literal["white"] | Annotated[Length, Field(ge=300e-9, le=1100e-9)] = "white"
-    scatter: Annotated[Number, Field(ge=0, lt=0.5)] = 0.0
+    scatter: Annotated[NumberError, Field(lt=0.5)] = 0.0
     drive: Drive = PwmConfig()
     clock: ClockConfig = ClockConfig()
     pwm_period_s: Annotated[Time, Field(gt=0)] = 1e-3
@@ -402,3 +115,10 @@ class LedConfig(ConfigModel):
         if (self.intensity_cd is None) == (self.radiant_intensity_w_sr is None):
             raise ValueError("an LED takes either intensity or radiant_intensity")
         return self
+
+    @field_validator("scatter")
+    @classmethod
+    def check_scatter(cls, value: float) -> float:
+        if isinstance(value, Tolerance) and value.half_width >= 1:
+            raise ValueError(f"a tolerance of {value.half_width:g} leaves no light; allowed: below 1")
+        return value

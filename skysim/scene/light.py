@@ -8,8 +8,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, field_validator, model_validator
 
+from skysim.core.tolerance import LengthError
 from skysim.core.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
-from skysim.scene.leds import Layout, LedConfig, PixelsConfig
+from skysim.scene.layouts import Layout, PixelsConfig
+from skysim.scene.leds import LedConfig
 
 SKY = "gaia_v8.0"  # as faint as any camera of a shipped scene detects
 Tilt = Annotated[Number, Field(ge=-45, le=45)]
@@ -22,14 +24,14 @@ class SurfaceConfig(ConfigModel):
 
     offset   : the whole dome's displacement
     tilt_deg : about the lab's x, then about its y, through the surface's own center (the origin of surveyed points)
-    error    : standard deviation of the lab's survey of it, along the normal: one draw for the whole surface, because
-               errors of single points average out; drawn by `tracker.survey.seed`
+    error    : standard deviation of the lab's survey of it, along the normal, or a tolerance: one draw for the whole
+               surface, because errors of single points average out; drawn by `tracker.survey.seed`
     """
 
     kind: Literal["sphere", "ellipsoid", "flat", "cylinder", "surveyed"]
     offset_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
     tilt_deg: tuple[Tilt, Tilt] = (0.0, 0.0)
-    error_m: Annotated[Length, Field(ge=0)] = 0.0
+    error_m: LengthError = 0.0
 
     @model_validator(mode="wrap")
     @classmethod
@@ -163,10 +165,43 @@ AnySurface = Annotated[
 ]
 
 
+class RoomConfig(ConfigModel):
+    """The room in which the dome is to be built; a dome that does not fit is refused. Limits left out are not checked.
+
+    The shell is the surface within its rim or its width and height, else up to the layout's cap_deg, and as thick as
+    `thickness` outside of it.
+
+    height         : of the ceiling above the floor; the shell's top must be below
+    bearing_height : of the bearing's center above the floor, where the shell must end
+    width, length  : of the floor along the lab's x and y; the shell must fit between the walls
+    door           : width and height of the narrowest opening on the way in. Every part of the shell must go through:
+        two sides of a box around it, turned as fits best, must be within the door's
+    segments       : equal parts, cut along planes through the vertical, in which the shell is carried in
+    thickness      : of the shell with its ribs
+    """
+
+    height_m: Annotated[Length, Field(gt=0)] | None = None
+    bearing_height_m: Annotated[Length, Field(ge=0)] | None = None
+    width_m: Annotated[Length, Field(gt=0)] | None = None
+    length_m: Annotated[Length, Field(gt=0)] | None = None
+    door_m: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] | None = None
+    segments: Annotated[int, Field(ge=1, le=100)] = 1
+    thickness_m: Annotated[Length, Field(ge=0)] = 0.0
+
+    @model_validator(mode="after")
+    def check_limits(self) -> RoomConfig:
+        if self.height_m is not None and self.bearing_height_m is None:
+            raise ValueError("height requires bearing_height, the bearing's center above the floor")
+        if self.segments > 1 and self.door_m is None:
+            raise ValueError("segments: have no effect without a door; allowed: door, or no segments")
+        return self
+
+
 class DomeConfig(ConfigModel):
     """An LED dome as the light source.
 
     occlusion : whether the vehicle's parts and the dome's own wall hide LEDs
+    room      : limits of the room in which it is to be built; unlimited if left out
     """
 
     kind: Literal["dome"]
@@ -174,6 +209,7 @@ class DomeConfig(ConfigModel):
     layout: Layout
     led: LedConfig
     occlusion: bool = True
+    room: RoomConfig | None = None
 
     @model_validator(mode="after")
     def check_controller(self) -> DomeConfig:

@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from skysim.core.tolerance import TimeError
 from skysim.core.units import ConfigModel, Number, Time, in_utc
 from skysim.scene.camera import CameraConfig
 from skysim.scene.light import DomeConfig, Glow, Light
@@ -37,7 +38,7 @@ class ExposureConfig(ConfigModel):
 
     trigger_jitter  : an exposure begins up to so much late, uniformly distributed
     time_tag_offset : the time given to a frame minus the true time of mid-exposure, on average
-    time_tag_jitter : its standard deviation from frame to frame
+    time_tag_jitter : its standard deviation from frame to frame, or a tolerance
     """
 
     time_s: Annotated[Time, Field(ge=1e-6)]
@@ -46,7 +47,7 @@ class ExposureConfig(ConfigModel):
     first_s: Annotated[Time, Field(ge=0)] = 0.0
     trigger_jitter_s: Annotated[Time, Field(ge=0)] = 0.0
     time_tag_offset_s: Annotated[Time, Field(ge=-1, le=1)] = 0.0
-    time_tag_jitter_s: Annotated[Time, Field(ge=0, le=1)] = 0.0
+    time_tag_jitter_s: Annotated[TimeError, Field(le=1)] = 0.0
 
     @model_validator(mode="after")
     def check_period(self) -> ExposureConfig:
@@ -85,7 +86,10 @@ class Scene(ConfigModel):
         """Check what depends on the kind of light source, and that the shutter reads all rows within a frame period."""
         # Survey errors and maps need LEDs. The start is a pointing under the stars and an attitude otherwise.
         sky, tracker = self.light.kind == "stars", self.tracker
-        if not isinstance(self.light, DomeConfig) and (tracker.survey != SurveyErrorsConfig() or tracker.map):
+        # Without LEDs the focal length alone is surveyed.
+        lens = {"focal_length_sigma_m": tracker.survey.focal_length_sigma_m, "seed": tracker.survey.seed}
+        lens_only = SurveyErrorsConfig().model_copy(update=lens if tracker.survey.focal_length_sigma_m else {})
+        if not isinstance(self.light, DomeConfig) and (tracker.survey != lens_only or tracker.map):
             key = "map" if tracker.map else "survey"
             raise ValueError(f"tracker.{key}: light of kind {self.light.kind} has no LEDs to survey; allowed: dome")
         if self.motion.start != "profile" and sky != isinstance(self.motion.start, PointingConfig):

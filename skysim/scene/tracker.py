@@ -2,19 +2,50 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from skysim.core.tolerance import LengthError, NumberError
 from skysim.core.units import ConfigModel, Length, NotNegative, Number, Positive, Spin, Time
 from skysim.core.yaml_reader import existing_file
+
+
+class TotalStationConfig(ConfigModel):
+    """A total station that measures every LED by a horizontal direction, a zenith angle and a distance from one place.
+
+    Errors of the sight are drawn for each LED; those of the set-up once, and are common to all LEDs. See
+    `skysim.sources.dome.total_station`. Sizes are standard deviations or tolerances.
+
+    position           : of its center, where its axes meet, in the lab
+    angle_sigma_arcsec : of a direction and of a zenith angle, measured in both faces (ISO 17123-3); of each LED
+    distance_sigma     : a of the data sheet's a + b ppm (ISO 17123-4), without reflector if LEDs have none; of each LED
+    distance_ppm       : b, an error of the distances' scale; common
+    zero_sigma         : of the distance meter's zero point on these targets (additive constant); common
+    centering          : of its place along each axis of the lab; common
+    orientation_sigma_arcsec : of its horizontal circle's zero (the backsight), about the vertical; common
+    leveling_sigma_arcsec    : of its vertical axis, about each horizontal axis (the compensator); common
+    """
+
+    kind: Literal["total_station"]
+    position_m: tuple[Length, Length, Length]
+    angle_sigma_arcsec: NumberError
+    distance_sigma_m: LengthError
+    distance_ppm: NumberError = 0.0
+    zero_sigma_m: LengthError = 0.0
+    centering_m: LengthError = 0.0
+    orientation_sigma_arcsec: NumberError = 0.0
+    leveling_sigma_arcsec: NumberError = 0.0
 
 
 class SurveyErrorsConfig(ConfigModel):
     """Errors of the survey of LEDs and camera, drawn once from their own seed; also draws `light.surface.error`.
 
-    led_sigma    : standard deviation of every LED's surveyed place, about each axis of the lab
-    lever_sigma  : of the camera's surveyed place, about each axis of the body
+    instrument   : that measured the LEDs, with its own errors; none if left out
+    led_sigma    : standard deviation of every LED's surveyed place, along each axis of the lab, or its tolerance; of
+        the target (where in its window the LED is), if there is an instrument
+    lever_sigma  : of the camera's surveyed place, along each axis of the body
+    focal_length_sigma : of the focal length that the tracker assumes, about the true one
     rotation_deg     : rotation vector of the survey's axes relative to the lab's: the error of the level or IMU that it
         was referenced to. All surveyed LEDs are rotated by it
     surface_seed : draws `light.surface.error`; `seed` if left out
@@ -22,8 +53,10 @@ class SurveyErrorsConfig(ConfigModel):
 
     rotation_deg: tuple[Spin, Spin, Spin] = (0.0, 0.0, 0.0)
     surface_seed: Annotated[int, Field(ge=0)] | None = None
-    led_sigma_m: Annotated[Length, Field(ge=0, le=0.1)] = 0.0
-    lever_sigma_m: Annotated[Length, Field(ge=0, le=0.1)] = 0.0
+    led_sigma_m: Annotated[LengthError, Field(le=0.1)] = 0.0
+    lever_sigma_m: Annotated[LengthError, Field(le=0.1)] = 0.0
+    focal_length_sigma_m: LengthError = 0.0
+    instrument: TotalStationConfig | None = None
     seed: Annotated[int, Field(ge=0)] = 0
 
 
@@ -89,9 +122,11 @@ class TrackerConfig(ConfigModel):
     map: Annotated[str, AfterValidator(existing_file)] | None = None
 
     @model_validator(mode="after")
-    def check_lever(self) -> TrackerConfig:
+    def check_assumed(self) -> TrackerConfig:
         if self.assumed_camera_body_m is not None and self.survey.lever_sigma_m:
             raise ValueError("survey.lever_sigma: conflicts with assumed_camera_body; allowed: 0, or the survey alone")
+        if self.assumed_focal_length_m is not None and self.survey.focal_length_sigma_m:
+            raise ValueError("survey.focal_length_sigma: conflicts with assumed_focal_length; allowed: one of the two")
         return self
 
     @model_validator(mode="after")
@@ -102,6 +137,8 @@ class TrackerConfig(ConfigModel):
             "assumed_distortion": self.assumed_distortion,
             "survey.led_sigma": self.survey.led_sigma_m,
             "survey.lever_sigma": self.survey.lever_sigma_m,
+            "survey.focal_length_sigma": self.survey.focal_length_sigma_m,
+            "survey.instrument": self.survey.instrument,
         }
         conflicts = [key for key, value in values.items() if value]
         if self.map and conflicts:

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from skysim.core.tolerance import NumberError
 from skysim.core.units import (
     Angles,
     ConfigModel,
@@ -117,8 +118,8 @@ class GyroConfig(ConfigModel):
 
     arw_deg_sqrt_h     : angle random walk
     bias_deg_h         : bias instability: standard deviation of a Gauss-Markov process with bias_time
-    turn_on_bias_deg_h : constant part of the bias, standard deviation over units
-    scale_ppm, misalignment_arcsec : of each axis, standard deviations over units
+    turn_on_bias_deg_h : constant part of the bias, standard deviation over units, or a tolerance
+    scale_ppm, misalignment_arcsec : of each axis, standard deviations over units, or tolerances
     quantum_arcsec     : step of the angle counter
     rate_limit_deg_s   : the output saturates at this rate
     """
@@ -126,9 +127,9 @@ class GyroConfig(ConfigModel):
     arw_deg_sqrt_h: NotNegative = 0.07
     bias_deg_h: NotNegative = 1.0
     bias_time_s: Annotated[Time, Field(gt=0)] = 300.0
-    turn_on_bias_deg_h: NotNegative = 1.0  # assumed
-    scale_ppm: NotNegative = 100.0  # assumed
-    misalignment_arcsec: NotNegative = 20.0  # assumed
+    turn_on_bias_deg_h: NumberError = 1.0  # assumed
+    scale_ppm: NumberError = 100.0  # assumed
+    misalignment_arcsec: NumberError = 20.0  # assumed
     quantum_arcsec: NotNegative = 0.4  # assumed
     rate_limit_deg_s: Positive = 1000.0  # assumed
 
@@ -139,9 +140,9 @@ class AccelerometerConfig(ConfigModel):
     vrw_ug_sqrt_hz: NotNegative = 50.0
     bias_ug: NotNegative = 50.0
     bias_time_s: Annotated[Time, Field(gt=0)] = 60.0
-    turn_on_bias_ug: NotNegative = 300.0
-    scale_ppm: NotNegative = 300.0
-    misalignment_arcsec: NotNegative = 20.0
+    turn_on_bias_ug: NumberError = 300.0
+    scale_ppm: NumberError = 300.0
+    misalignment_arcsec: NumberError = 20.0
     quantum_um_s: NotNegative = 0.0
     limit_g: Positive = 40.0
 

@@ -18,6 +18,7 @@ from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT
 from skysim.camera.render import Window
 from skysim.core.random_streams import CAMERA_TIMING, random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Mount, Sources, Telemetry, Trajectory
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.controllers.adapter import ControllerSource
@@ -50,7 +51,8 @@ def exposure_window(scene: Scene, index: int, exposure_s: float | None = None) -
 
 def time_tag_error_s(scene: Scene, index: int) -> float:
     """The time that the camera gives to a frame minus the true time of mid-exposure."""
-    return scene.exposure.time_tag_offset_s + scene.exposure.time_tag_jitter_s * timing_draws(scene.seed, index)[1]
+    drawn = np.array(timing_draws(scene.seed, index)[1])
+    return scene.exposure.time_tag_offset_s + float(scaled_errors(scene.exposure.time_tag_jitter_s, drawn))
 
 
 @lru_cache(maxsize=64)

@@ -14,7 +14,8 @@ from skysim.core.types import Mount, Sources
 from skysim.scene.camera import CameraConfig
 from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
-from skysim.sources.dome import layout, surface, survey_errors
+from skysim.sources.dome import surface, survey_errors
+from skysim.sources.dome.layouts import registry
 from skysim.tracking import dome_map_file
 
 
@@ -22,9 +23,14 @@ def assumed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
     """The dome map that the tracker uses: the true LED positions and surface with the errors of the survey."""
     inside, survey = surface.build_surface(light.surface), scene.tracker.survey
     position_m = survey_errors.assumed_leds_m(inside, sources.place[:, :3], survey)
-    board = layout.board_of(light.layout, sources.id)
+    board = registry.board_of(light.layout, sources.id)
     ellipsoid = survey_errors.assumed_ellipsoid(inside, survey)
-    return LedMap(sources.id, position_m, *ellipsoid, board, survey.led_sigma_m)
+    covariance_m2 = survey_errors.led_covariance_m2(sources.place[:, :3], survey)
+    common_m = survey_errors.common_displacements_m(inside, sources.place[:, :3], survey)
+    sigma_m = float(survey.led_sigma_m)
+    if covariance_m2 is not None:
+        sigma_m = float(np.sqrt(np.mean(np.trace(covariance_m2, axis1=1, axis2=2)) / 3))
+    return LedMap(sources.id, position_m, *ellipsoid, board, sigma_m, covariance_m2, common_m)
 
 
 def assumed_lever(scene: Scene, mount: Mount) -> Lever:
@@ -36,7 +42,7 @@ def assumed_lever(scene: Scene, mount: Mount) -> Lever:
     lever_m = scene.tracker.assumed_camera_body_m or survey_errors.assumed_m(
         mount.camera_body_m, survey.lever_sigma_m, survey.seed, "lever"
     )
-    return Lever(np.array(lever_m), mount.cam_from_body, survey.lever_sigma_m)
+    return Lever(np.array(lever_m), mount.cam_from_body, float(survey.lever_sigma_m))
 
 
 def surveyed_dome(scene: Scene, path: str, leds: LedMap, lever: Lever) -> tuple[Camera, LedMap, Lever]:
@@ -60,6 +66,8 @@ def surveyed_dome(scene: Scene, path: str, leds: LedMap, lever: Lever) -> tuple[
         position_m=dome_map.position_m,
         board=board,
         sigma_m=float(np.median(dome_map.sigma_m)),
+        covariance_m2=None,
+        common_m=None,
     )
     camera = replace(
         calibration(scene.camera),
@@ -75,8 +83,9 @@ def assumed_camera(scene: Scene) -> Camera:
     config, camera = scene.tracker, calibration(scene.camera)
     if config.assumed_distortion is not None:
         camera = replace(camera, distortion=config.assumed_distortion)
-    assumed_m = config.assumed_focal_length_m
-    return camera.zoomed(assumed_m / scene.camera.focal_length_m if assumed_m else 1.0)
+    focal_m = scene.camera.focal_length_m
+    assumed_m = config.assumed_focal_length_m or survey_errors.assumed_focal_length_m(focal_m, config.survey)
+    return replace(camera.zoomed(assumed_m / focal_m), focal_sigma=float(config.survey.focal_length_sigma_m) / focal_m)
 
 
 def calibration(camera: CameraConfig) -> Camera:

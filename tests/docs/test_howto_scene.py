@@ -19,7 +19,7 @@ from skysim.scene import camera, motion, vehicle
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.sources.dome import led
-from skysim.sources.dome.layout import LAYOUTS
+from skysim.sources.dome.layouts.registry import LAYOUTS
 from skysim.sources.dome.surface import SURFACES
 
 PAGE = "docs/howto/scene.md"

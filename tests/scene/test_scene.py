@@ -17,14 +17,16 @@ from skysim.camera.optics import VIGNETTING
 from skysim.camera.psf.otf import PSFS
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
+from skysim.core.tolerance import ErrorSchema, ToleranceConfig
 from skysim.core.units import SI_SUFFIX, ConfigModel
 from skysim.dynamics.actuators import STEERING
 from skysim.dynamics.guidance import LEGS
 from skysim.dynamics.jitter import SPECTRA
 from skysim.scene import camera, leds, light, loader, motion, scene, vehicle
-from skysim.scene.leds import Layout, Lobe
+from skysim.scene.layouts import Layout
+from skysim.scene.leds import Lobe
 from skysim.scene.tracker import FilterConfig
-from skysim.sources.dome.layout import LAYOUTS
+from skysim.sources.dome.layouts.registry import LAYOUTS
 from skysim.sources.dome.led import DRIVES, LOBES
 from skysim.sources.dome.surface import SURFACES
 
@@ -146,12 +148,16 @@ def parts_of(annotation: object) -> set[type[ConfigModel]]:
 def is_quantity(annotation: object, metadata: Iterable[object]) -> bool:
     """Whether it, or each of it, is filled by a value such as "48 in"."""
     parsers = [one.func for one in metadata if isinstance(one, BeforeValidator)]
-    own = any(parser is camera.focus_distance or parser.__qualname__.startswith("quantity") for parser in parsers)
+    sizes = [one.quantity for one in metadata if isinstance(one, ErrorSchema)]
+    own = any(is_quantity(one, getattr(one, "__metadata__", ())) for one in sizes) or any(
+        parser is camera.focus_distance or parser.__qualname__.startswith("quantity") for parser in parsers
+    )
     return own or any(is_quantity(one, getattr(one, "__metadata__", ())) for one in get_args(annotation))
 
 
 SUFFIXES = ("_w_sr", "_nm_rad", "_kg_m2", "_kg_m", "_nms2", "_nms", "_nm", "_kg", "_cd", "_n", "_m", "_s")
-FIELDS = [(part, name) for part in sorted(parts_of(scene.Scene), key=str) for name in part.model_fields]
+TOLERANCES = set(ToleranceConfig.__subclasses__())
+FIELDS = [(part, name) for part in sorted(parts_of(scene.Scene) | TOLERANCES, key=str) for name in part.model_fields]
 
 
 @pytest.mark.parametrize(("part", "name"), FIELDS, ids=[f"{part.__name__}.{name}" for part, name in FIELDS])

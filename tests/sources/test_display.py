@@ -12,7 +12,7 @@ import pytest
 from skysim.camera import display_glow
 from skysim.core.errors import InputError
 from skysim.core.types import Sources
-from skysim.scene import leds, loader
+from skysim.scene import layouts, loader
 from skysim.scene.light import CollimatedDisplayConfig, DomeConfig
 from skysim.simulation import exposure
 from skysim.simulation.testbed import Testbed, build_testbed, exposure_window, light_sources
@@ -148,7 +148,7 @@ def test_rounding_to_pixels_is_an_even_error_over_a_pitch() -> None:
 def test_levels_are_the_nearest_grays(grays: int, gamma: float) -> None:
     """Against a search through all of them in the picture's own numbers."""
     level = (np.arange(1, 400) - 0.3) / 399
-    config = leds.LcdConfig.model_validate(PANEL | {"gray_levels": grays, "gamma": gamma})
+    config = layouts.LcdConfig.model_validate(PANEL | {"gray_levels": grays, "gamma": gamma})
     number = np.arange(grays) / (grays - 1)
     nearest = np.abs(level[:, None] ** (1 / gamma) - number).argmin(axis=1)
     np.testing.assert_allclose(display.gray_transmission(config, level), number[nearest] ** gamma, rtol=1e-12, atol=0)

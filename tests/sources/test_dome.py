@@ -13,7 +13,6 @@ from skysim.core.types import Sources
 from skysim.scene import light, loader
 from skysim.scene.light import DomeConfig
 from skysim.sources import dome
-from skysim.sources.dome import layout
 from skysim.sources.dome import surface as dome_surface
 from skysim.sources.dome.surface import SURFACES, Ellipsoid, Plane
 from skysim.sources.photometry import Band, led_strength_e_s_sr
@@ -213,7 +212,7 @@ def test_boards_are_as_dense_as_their_spacing_says(spacing_in: float) -> None:
 
 def test_boards_are_as_many_in_equal_areas() -> None:
     """Fibonacci's spiral is uniform in the cosine: each tenth of the cap's area has a tenth of the boards."""
-    z = layout.cap(1000, np.radians(27))[:, 2]
+    z = dome.cap(1000, np.radians(27))[:, 2]
     counts, _ = np.histogram(z, np.linspace(np.cos(np.radians(27)), 1, 11))
     np.testing.assert_array_equal(counts, 100)
 

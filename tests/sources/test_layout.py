@@ -18,7 +18,8 @@ from skysim.scene import light, loader
 from skysim.scene.light import DomeConfig
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
-from skysim.sources.dome import layout, surface
+from skysim.sources.dome import surface
+from skysim.sources.dome.layouts import boards, spreads
 from skysim.sources.dome.led import lit_moments_s
 from skysim.sources.photometry import Band, led_strength_e_s_sr
 
@@ -115,7 +116,7 @@ def test_poisson_disk_covers_as_random_sequential_adsorption_does(monkeypatch: p
     """
     cover = []
     for tries in (25, 100):
-        monkeypatch.setattr(layout, "DARTS_PER_SPACING2", tries)
+        monkeypatch.setattr(spreads, "DARTS_PER_SPACING2", tries)
         domes = [lit({"kind": "poisson_disk", "spacing": "1.3 in", "hardware_seed": s}) for s in range(3)]
         inner = np.mean([np.sum(unit(leds.place[:, :3])[:, 2] > np.cos(np.radians(37))) for leds in domes])
         cover.append(inner * 0.65**2 / (2 * 48**2 * (1 - np.cos(np.radians(37)))))
@@ -191,7 +192,7 @@ def listed_boards(*boards: dict[str, Any], **more: Any) -> Sources:
 
 def test_boards_on_a_grid_have_equal_areas_and_straight_rows() -> None:
     """On a sphere about the bearing: as many as spacings squared go into the cap, and a row's middles in one plane."""
-    made = layout.grid(0.04, np.radians(40))
+    made = boards.grid(0.04, np.radians(40))
     area_sr = 2 * np.pi * (1 - np.cos(np.radians(40)))
     # Gauss's circle: the count is wrong by its boundary's lattice points at the most, 2 sqrt(2) pi (radius + 1).
     radius = 2 * np.sin(np.radians(20)) / 0.04
@@ -205,7 +206,7 @@ def test_boards_on_a_grid_have_equal_areas_and_straight_rows() -> None:
 
 def test_grid_boards_lie_along_their_rows() -> None:
     leds = lit(GRID_BOARDS)
-    place = leds.place[np.argsort(leds.id), :3].reshape(-1, layout.HOLES, 3)
+    place = leds.place[np.argsort(leds.id), :3].reshape(-1, dome.HOLES, 3)
     step_m = place[:, 1] - place[:, 0]
     # Holes 0 and 1 are neighbors along the board's first axis, which has no part along the lab's x.
     np.testing.assert_allclose(np.linalg.norm(step_m, axis=1), 0.008, rtol=0, atol=1e-15)
@@ -519,12 +520,12 @@ def assert_refused(overrides: dict[str, str], says: str) -> None:
 def test_boards_can_be_told_apart_where_there_are_any() -> None:
     config = loader.load("afit_simsat").light
     leds = dome.sources(config, BAND)
-    boards = layout.board_of(config.layout, leds.id)
+    boards = dome.board_of(config.layout, leds.id)
     assert boards is not None
     middle = np.array([leds.place[boards == b, :3].mean(axis=0) for b in np.unique(boards)])
     assert np.linalg.norm(middle[boards] - leds.place[:, :3], axis=1).max() < 0.0227  # corner to corner
     spread = loader.load("afit_simsat", {"light.layout": "{kind: fibonacci, cap_deg: 9, count: 5}"}).light
-    assert layout.board_of(spread.layout, np.arange(5)) is None
+    assert dome.board_of(spread.layout, np.arange(5)) is None
 
 
 # Drives

@@ -13,7 +13,7 @@ from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.nearfield import rotation_only
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Sources
-from skysim.scene import leds as led_schema
+from skysim.scene import layouts
 from skysim.scene.light import DomeConfig
 from skysim.sources import catalog, dome
 from skysim.sources.dome.placement import fisher, optimize
@@ -90,7 +90,7 @@ def test_its_worst_attitudes_are_better_than_any_other_layout_s(best: Sources) -
 def sparse_is_not_worse(seed: int, **more: int) -> None:
     """Worst hundredth of 100,000 attitudes: the one in thousands that sees a single LED is not to be met by luck."""
     wanted = WANTED | SPARSE | {"hardware_seed": seed} | more
-    config = led_schema.OptimizedConfig.model_validate(wanted)
+    config = layouts.OptimizedConfig.model_validate(wanted)
     unseen = optimize.sample_attitudes(config, 100_000, np.random.default_rng(77))
 
     def worst(leds: Sources) -> float:
@@ -143,7 +143,7 @@ def test_the_seed_decides(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.long
 def test_its_information_is_the_estimator_s(best: Sources) -> None:
     """The same law in two pieces of code: sum J'J against the covariance of the exact solve at the truth, level."""
-    part, place_m = led_schema.OptimizedConfig.model_validate(WANTED), best.place[:, :3]
+    part, place_m = layouts.OptimizedConfig.model_validate(WANTED), best.place[:, :3]
     judged = [np.eye(3)[None], np.array(part.camera_m), optimize.tan_half(part)]
     seen = fisher.Visibility(*fisher.visible_from(place_m, *judged))
     total = fisher.total_information(place_m, *judged)[0]
@@ -192,9 +192,9 @@ def test_leds_that_are_off_by_more_than_the_tolerance_do_not_coincide() -> None:
 @pytest.mark.long
 def test_no_field_is_half_another_s_where_nearly_all_of_a_spiral_s_are_whole(best: Sources) -> None:
     """A Fibonacci spiral is itself again a step along: benchmarks/dome_identify.py refuses 89 frames of a hundred."""
-    config = led_schema.OptimizedConfig.model_validate(WANTED)
+    config = layouts.OptimizedConfig.model_validate(WANTED)
     assert optimize.layout_ambiguity(config, best.place[:, :3]).fraction.max() <= 0.5
-    afit = led_schema.OptimizedConfig.model_validate(WANTED | {"tilt_deg": 30, "cap_deg": 40, "count": 1400})
+    afit = layouts.OptimizedConfig.model_validate(WANTED | {"tilt_deg": 30, "cap_deg": 40, "count": 1400})
     spiral = optimize.layout_ambiguity(afit, spread("fibonacci", 1400, 40.0).place[:, :3])
     assert np.mean(spiral.fraction > 0.8) > 0.85
     darts = optimize.layout_ambiguity(afit, spread("poisson_disk", 1400, 40.0).place[:, :3])

@@ -122,12 +122,13 @@ class Range(KeyedFactor):
 
 class Distribution(KeyedFactor):
     """A random key: normal (mean, sigma), lognormal (median, sigma of the logarithm), triangular (low, mode, high),
-    integers (low to high, both included). For uniform and log-uniform use `from` and `to`.
+    truncated_normal (mean and sigma before it is truncated to low and high), integers (low to high, both included).
+    For uniform and log-uniform use `from` and `to`.
 
     All numbers have the same unit, except the sigma of a lognormal, which has none.
     """
 
-    distribution: Literal["normal", "lognormal", "triangular", "integers"]
+    distribution: Literal["normal", "lognormal", "triangular", "truncated_normal", "integers"]
     mean: Value = None
     median: Value = None
     sigma: Value = None
@@ -155,8 +156,10 @@ class Distribution(KeyedFactor):
         parameters = [number for number, _ in quantities]
         if self.sigma is not None and parameters[1] <= 0:
             raise ValueError(f"sigma is {self.sigma!r}; allowed: above 0")
-        if self.low is not None and not (parameters == sorted(parameters) and parameters[0] < parameters[-1]):
-            raise ValueError(f"{', '.join(PARAMETERS[self.distribution])} are not in ascending order")
+        ascending = [name for name in PARAMETERS[self.distribution] if name in ("low", "mode", "high")]
+        values = [parameters[PARAMETERS[self.distribution].index(name)] for name in ascending]
+        if values and not (values == sorted(values) and values[0] < values[-1]):
+            raise ValueError(f"{', '.join(ascending)} are not in ascending order")
         return parameters, units.pop()
 
     def options(self) -> list[tuple[Value, Settings]]:
@@ -175,12 +178,16 @@ PARAMETERS = {
     "normal": ("mean", "sigma"),
     "lognormal": ("median", "sigma"),
     "triangular": ("low", "mode", "high"),
+    "truncated_normal": ("mean", "sigma", "low", "high"),
     "integers": ("low", "high"),
 }
 QUANTILES: dict[str, Callable[..., Any]] = {
     "normal": lambda u, mean, sigma: scipy.stats.norm.ppf(u, mean, sigma),
     "lognormal": lambda u, median, sigma: median * np.exp(sigma * scipy.stats.norm.ppf(u)),
     "triangular": lambda u, low, mode, high: scipy.stats.triang.ppf(u, (mode - low) / (high - low), low, high - low),
+    "truncated_normal": lambda u, mean, sigma, low, high: scipy.stats.truncnorm.ppf(
+        u, (low - mean) / sigma, (high - mean) / sigma, mean, sigma
+    ),
     "integers": lambda u, low, high: min(np.floor(low + u * (high - low + 1)), high),
 }
 

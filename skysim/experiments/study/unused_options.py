@@ -24,7 +24,7 @@ from skysim.experiments.study.plan import (
 )
 from skysim.scene.keys import unused
 from skysim.scene.keys.unused import Rule
-from skysim.scene.leds import CelestialConfig, FibersConfig, LcdConfig
+from skysim.scene.layouts import CelestialConfig, FibersConfig, LcdConfig
 from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
 from skysim.tracking import settings

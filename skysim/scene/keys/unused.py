@@ -19,16 +19,15 @@ from skysim.core.errors import InputError
 from skysim.core.units import ConfigModel
 from skysim.core.yaml_reader import Files, location_of, parse_yaml
 from skysim.scene.camera import DetectorConfig
-from skysim.scene.leds import (
+from skysim.scene.layouts import (
     CelestialConfig,
-    DirectConfig,
     FibersConfig,
     FibonacciConfig,
     LcdConfig,
     ListedConfig,
     PatchBoardsConfig,
-    PwmConfig,
 )
+from skysim.scene.leds import DirectConfig, PwmConfig
 from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from skysim.scene.leds import FibersConfig, Layout, LcdConfig
+from skysim.scene.layouts import FibersConfig, Layout, LcdConfig
 from skysim.scene.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import (

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from skysim.core.types import Sources
 from skysim.scene import light
-from skysim.sources.dome.layout import HOLES as HOLES
-from skysim.sources.dome.layout import LAYOUTS as LAYOUTS
-from skysim.sources.dome.layout import board_of as board_of
-from skysim.sources.dome.layout import cap as cap
-from skysim.sources.dome.layout import patch_boards as patch_boards
+from skysim.scene.layouts import HOLES as HOLES
+from skysim.sources.dome.layouts.boards import patch_boards as patch_boards
+from skysim.sources.dome.layouts.placing import cap as cap
+from skysim.sources.dome.layouts.registry import LAYOUTS as LAYOUTS
+from skysim.sources.dome.layouts.registry import board_of as board_of
+from skysim.sources.dome.room import check_room
 from skysim.sources.dome.surface import SURFACES as SURFACES
 from skysim.sources.dome.surface import Ellipsoid as Ellipsoid
 from skysim.sources.dome.surface import Plane as Plane
@@ -18,5 +19,11 @@ from skysim.sources.photometry import Band
 
 
 def sources(config: light.DomeConfig, band: Band) -> Sources:
-    """All LEDs of the dome; strength is in photo-electrons s^-1 sr^-1 in the chip's band."""
-    return LAYOUTS[config.layout.kind](config.layout, build_surface(config.surface), config.led, band)
+    """All LEDs of the dome; strength is in photo-electrons s^-1 sr^-1 in the chip's band.
+
+    Raises InputError for LEDs off the surface, and for a dome that does not fit into its room.
+    """
+    surface = build_surface(config.surface)
+    if config.room is not None:
+        check_room(config.room, surface, config.layout.cap_deg)
+    return LAYOUTS[config.layout.kind](config.layout, surface, config.led, band)

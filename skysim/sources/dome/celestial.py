@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene import leds
+from skysim.scene import layouts, leds
 from skysim.sources import catalog
 from skysim.sources import stars as star_sources
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
@@ -35,7 +35,7 @@ class ProjectedStars(NamedTuple):
     place_m: Floats
 
 
-def project_stars(config: leds.CelestialConfig, surface: Surface, led: leds.LedConfig, band: Band) -> ProjectedStars:
+def project_stars(config: layouts.CelestialConfig, surface: Surface, led: leds.LedConfig, band: Band) -> ProjectedStars:
     """Stars as LED places: apparent directions at config.epoch, traced from the camera's nominal place to the surface.
 
     The lab's +z is the zenith at RA, Dec; roll is the position angle of the lab's -y there. Of the stars on the
@@ -110,7 +110,7 @@ def merge_close_stars(stars: ProjectedStars, count: int, separation_m: float) ->
         selected = merge_stars(selected, target)
 
 
-def select_brightest(stars: ProjectedStars, config: leds.CelestialConfig, separation_m: float) -> ProjectedStars:
+def select_brightest(stars: ProjectedStars, config: layouts.CelestialConfig, separation_m: float) -> ProjectedStars:
     """The brightest stars, merged into config.count LEDs, or all stars to config.limit_mag. Raises InputError."""
     if config.limit_mag is not None:
         count = int(np.sum(stars.v_mag <= config.limit_mag))
@@ -133,7 +133,7 @@ def select_brightest(stars: ProjectedStars, config: leds.CelestialConfig, separa
     return merged
 
 
-def led_levels(config: leds.CelestialConfig, stars: ProjectedStars, normal: Floats, led: leds.LedConfig) -> Floats:
+def led_levels(config: layouts.CelestialConfig, stars: ProjectedStars, normal: Floats, led: leds.LedConfig) -> Floats:
     """(N,) levels for which the irradiance at the camera's nominal place follows Pogson's law, 10^(-0.4 m).
 
     m is stars.shown_mag. All LEDs have one color, so the magnitudes hold for this chip only, where m should be its

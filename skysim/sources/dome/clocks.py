@@ -16,8 +16,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from skysim.core.random_streams import LED_CLOCKS, random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Sources
-from skysim.scene.leds import ClockConfig, DirectConfig, FibersConfig, Layout, LcdConfig
+from skysim.scene.layouts import FibersConfig, Layout, LcdConfig
+from skysim.scene.leds import ClockConfig, DirectConfig
 from skysim.scene.light import DomeConfig, Light
 
 LONGEST_ON_S = 3600.0  # a controller was switched on up to so long before the run; many times any period
@@ -40,10 +42,11 @@ class Clocks:
     @classmethod
     def draw(cls, config: ClockConfig, count: int, hardware_seed: int, seed: int) -> Clocks:
         """Draw the offsets from the hardware's seed, drifts and switch-on times from the run's."""
-        offset = config.offset_ppm * PPM * random_stream(hardware_seed, LED_CLOCKS).standard_normal(count)
+        offset_ppm = scaled_errors(config.offset_ppm, random_stream(hardware_seed, LED_CLOCKS).standard_normal(count))
         rng = random_stream(seed, LED_CLOCKS)
         on_s = rng.uniform(0, LONGEST_ON_S, count)
-        return cls(on_s, offset, config.drift_ppm_h * PPM / 3600 * rng.standard_normal(count))
+        drift_ppm_h = scaled_errors(config.drift_ppm_h, rng.standard_normal(count))
+        return cls(on_s, PPM * offset_ppm, PPM / 3600 * drift_ppm_h)
 
     def pulses_at(self, sources: Sources, t_s: float) -> Sources:
         """The sources with their pulse trains in the run's time, about t_s.

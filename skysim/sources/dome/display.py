@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
-from skysim.scene import leds, light
+from skysim.scene import layouts, leds, light
 from skysim.sources import stars as star_sources
 from skysim.sources.catalog import Catalog
-from skysim.sources.dome.led import DRIVES, DriveInput, full_strength_e_s_sr
+from skysim.sources.dome.led import DRIVES, DriveInput, full_strength_e_s_sr, strength_factors
 from skysim.sources.dome.surface import Plane
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
@@ -29,7 +29,7 @@ SHELL_STREAM = 2  # spawn key of the shell's own random stream, which leaves the
 Ints = NDArray[np.int64]
 
 
-def displace_ends(config: leds.FibersConfig, fibers: Sources) -> Sources:
+def displace_ends(config: layouts.FibersConfig, fibers: Sources) -> Sources:
     """Displace each fiber's end along the surface's normal by v R, the radius error of a stretched shell.
 
     v is uniform in +-config.radius_variation, R the end's distance from the bearing; positive is outward. A camera
@@ -59,7 +59,7 @@ class PixelBlocks(NamedTuple):
     level: Floats
 
 
-def draw_blocks(config: leds.PixelsConfig, position_m: Floats, level: Floats) -> PixelBlocks:
+def draw_blocks(config: layouts.PixelsConfig, position_m: Floats, level: Floats) -> PixelBlocks:
     """Draw stars as blocks of pixels: places rounded to the nearest block that fits, levels to the nearest gray.
 
     position_m : (N, 2) places on the display along its columns' and its rows' direction, from its center
@@ -81,12 +81,12 @@ def draw_blocks(config: leds.PixelsConfig, position_m: Floats, level: Floats) ->
     )
 
 
-def black_transmission(config: leds.PixelsConfig) -> float:
+def black_transmission(config: layouts.PixelsConfig) -> float:
     """Transmission of a black pixel, as a fraction of white."""
     return 1 / config.contrast if config.contrast else 0.0
 
 
-def gray_transmission(config: leds.PixelsConfig, level: Floats) -> Floats:
+def gray_transmission(config: layouts.PixelsConfig, level: Floats) -> Floats:
     """(N,) transmission of the nearest gray level: (g / (G - 1))^gamma, g rounded from (G - 1) level^(1 / gamma).
 
     Rounding is in g, as in a program that writes a picture, so steps are fine for faint stars.
@@ -95,12 +95,12 @@ def gray_transmission(config: leds.PixelsConfig, level: Floats) -> Floats:
     return np.asarray((np.rint(top * level ** (1 / config.gamma)) / top) ** config.gamma)
 
 
-def min_level(config: leds.PixelsConfig) -> float:
+def min_level(config: layouts.PixelsConfig) -> float:
     """Level below which a star is black: half a step of gray."""
     return float((0.5 / (config.gray_levels - 1)) ** config.gamma)
 
 
-def panel_surface(config: leds.LcdConfig, surface: Any) -> Plane:
+def panel_surface(config: layouts.LcdConfig, surface: Any) -> Plane:
     """The panel as a surface: the flat surface, cut to the extent of the pixels.
 
     Raises InputError if the pixels do not fit into the surface's width and height.
@@ -120,7 +120,7 @@ def ideal_led(led: leds.LedConfig) -> leds.LedConfig:
     return led.model_copy(update={"drive": leds.DirectConfig(kind="direct"), "scatter": 0.0})
 
 
-def panel_sources(config: leds.LcdConfig, panel: Plane, led: leds.LedConfig, band: Band, stars: Sources) -> Sources:
+def panel_sources(config: layouts.LcdConfig, panel: Plane, led: leds.LedConfig, band: Band, stars: Sources) -> Sources:
     """Stars on an LCD panel, each a block of n x n equal pixels: n^2 times a pixel's light from n times its width.
 
     stars : as LEDs that are always lit, on the panel or near it; they are projected onto it
@@ -137,8 +137,10 @@ def panel_sources(config: leds.LcdConfig, panel: Plane, led: leds.LedConfig, ban
         )
     rng = random_stream(config.points.hardware_seed)
     count = len(blocks.star)
-    # Pixels scatter independently: the mean of n^2 of them scatters by 1 / n as much.
-    scatter = np.exp(led.scatter / config.block * rng.standard_normal(count))
+    # Pixels scatter independently: the mean of n^2 of them scatters by 1 / n as much, and is nearly Gaussian.
+    scatter = strength_factors(
+        led.scatter if config.block == 1 else led.scatter / config.block, rng.standard_normal(count)
+    )
     row = blocks.corner_px[:, 1] / config.pixels[1]
     pulses = DRIVES[led.drive.kind](led, DriveInput(blocks.level, np.zeros(count, dtype=np.int64), row), rng)
     flat_m = np.column_stack([blocks.center_px * config.pitch_m, np.zeros(count)])

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.jit import jit
+from skysim.core.tolerance import Tolerance, scaled_errors
 from skysim.core.types import Floats
 from skysim.scene.leds import (
     CosineLobeConfig,
@@ -93,6 +94,15 @@ def full_strength_e_s_sr(led: LedConfig, band: Band) -> float:
     if led.intensity_cd is not None:
         return float(led_strength_e_s_sr(led.intensity_cd, led.spectrum, band))
     return float(radiant_strength_e_s_sr(led.radiant_intensity_w_sr or 0.0, led.spectrum, band))
+
+
+def strength_factors(scatter: float, normal: Floats) -> Floats:
+    """Strengths of LEDs over the nominal one, from standard normal numbers.
+
+    Lognormal with this standard deviation of the logarithm, for which AFIT's Table 2 gives .07 to .09; within a
+    tolerance, 1 plus an error as the tolerance says.
+    """
+    return 1 + scaled_errors(scatter, normal) if isinstance(scatter, Tolerance) else np.exp(scatter * normal)
 
 
 class DriveInput(NamedTuple):

@@ -6,15 +6,18 @@ and not noise of a frame. Each kind of error has its own random stream, so addin
 
 from __future__ import annotations
 
+import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
 from skysim.scene.tracker import SurveyErrorsConfig
+from skysim.sources.dome import total_station
 from skysim.sources.dome.surface import Surface
 
-STREAM = {"leds": 1, "lever": 2, "surface": 3}
+STREAM = {"leds": 1, "lever": 2, "surface": 3, "sights": 4, "setup": 5, "focal": 6}
 
 
 def standard_normals(seed: int, kind: str, shape: tuple[int, ...]) -> Floats:
@@ -23,8 +26,8 @@ def standard_normals(seed: int, kind: str, shape: tuple[int, ...]) -> Floats:
 
 
 def assumed_m(place_m: Floats, sigma_m: float, seed: int, kind: str) -> Floats:
-    """Surveyed places: the true ones (..., 3) plus a Gaussian error of sigma about each axis; unchanged for sigma 0."""
-    return place_m + sigma_m * standard_normals(seed, kind, place_m.shape) if sigma_m else place_m
+    """Surveyed places: the true ones (..., 3) plus an error of this size along each axis; unchanged for 0."""
+    return place_m + scaled_errors(sigma_m, standard_normals(seed, kind, place_m.shape)) if sigma_m else place_m
 
 
 def surface_seed(config: SurveyErrorsConfig) -> int:
@@ -40,19 +43,53 @@ def rotate_survey(places_m: Floats, config: SurveyErrorsConfig) -> Floats:
 
 
 def surface_offset_m(surface: Surface, seed: int) -> float:
-    """Offset of the surveyed surface, outward along the normal of the true one: N(0, light.surface.error).
+    """Offset of the surveyed surface, outward along the normal of the true one, of the size light.surface.error.
 
     One draw for the whole surface (the arm's zero, its probe's radius). Independent errors of a thousand points
     average out in a fitted ellipsoid.
     """
-    return float(surface.survey_sigma_m * standard_normals(seed, "surface", (1,))[0])
+    return float(scaled_errors(surface.survey_sigma_m, standard_normals(seed, "surface", (1,)))[0])
 
 
 def assumed_leds_m(surface: Surface, place_m: Floats, config: SurveyErrorsConfig) -> Floats:
-    """(N, 3) surveyed LED places: independent errors, the surface's common offset and the rotation of the axes."""
+    """(N, 3) surveyed LED places: independent errors, the surface's common offset and the rotation of the axes.
+
+    An instrument adds the errors of its sights and of its set-up.
+    """
     offset_m = surface_offset_m(surface, surface_seed(config))
     displaced_m = place_m - offset_m * surface.inward(place_m) if offset_m else place_m
+    if config.instrument is not None:
+        sights = standard_normals(config.seed, "sights", place_m.shape)
+        displaced_m = total_station.surveyed_m(config.instrument, displaced_m, sights, setup_errors(config))
     return rotate_survey(assumed_m(displaced_m, config.led_sigma_m, config.seed, "leds"), config)
+
+
+def setup_errors(config: SurveyErrorsConfig) -> Floats:
+    """(8,) errors of the instrument's set-up, drawn."""
+    assert config.instrument is not None
+    drawn = standard_normals(config.seed, "setup", (total_station.SETUP_ERRORS,))
+    return total_station.draw_setup(config.instrument, drawn)
+
+
+def led_covariance_m2(place_m: Floats, config: SurveyErrorsConfig) -> Floats | None:
+    """(N, 3, 3) covariance of each LED's own error; None if it is that of led_sigma alone."""
+    if config.instrument is None:
+        return None
+    return total_station.covariance_m2(config.instrument, place_m) + config.led_sigma_m**2 * np.eye(3)
+
+
+def common_displacements_m(surface: Surface, place_m: Floats, config: SurveyErrorsConfig) -> Floats | None:
+    """(M, N, 3) displacement of each LED by one standard deviation of each error that all share; None without any.
+
+    The survey error of the surface, along its normals, and the errors of the instrument's set-up.
+    """
+    fields = []
+    if surface.survey_sigma_m:
+        fields.append(-surface.survey_sigma_m * surface.inward(place_m)[None])
+    if config.instrument is not None:
+        fields.append(total_station.common_displacements_m(config.instrument, place_m))
+    joined = np.concatenate(fields) if fields else np.zeros((0, *place_m.shape))
+    return joined if len(joined) else None
 
 
 def assumed_ellipsoid(surface: Surface, config: SurveyErrorsConfig) -> tuple[Floats, Floats]:
@@ -60,7 +97,7 @@ def assumed_ellipsoid(surface: Surface, config: SurveyErrorsConfig) -> tuple[Flo
 
     That displaces an ellipsoid by sum(a_i n_i^2) / sqrt(sum(a_i^2 n_i^2)) of the offset where the normal is n: by all
     of it on the axes and on a sphere, and never by less than 2 sqrt(a b) / (a + b), a and b its longest and shortest
-    semi-axis. Raises InputError if a semi-axis is not positive.
+    semi-axis. An instrument's set-up moves it as a rigid body. Raises InputError if a semi-axis is not positive.
     """
     center_m, semi_axes_m = surface.as_ellipsoid()
     assumed_axes_m = semi_axes_m + surface_offset_m(surface, surface_seed(config))
@@ -69,4 +106,14 @@ def assumed_ellipsoid(surface: Surface, config: SurveyErrorsConfig) -> tuple[Flo
             f"light.surface.error: {surface.survey_sigma_m:g} m makes an ellipsoid of {assumed_axes_m.min():.3g} m;"
             " allowed: far less than the dome"
         )
+    if config.instrument is not None:
+        center_m = total_station.moved_m(config.instrument, center_m, setup_errors(config))
     return rotate_survey(center_m, config), assumed_axes_m
+
+
+def assumed_focal_length_m(focal_length_m: float, config: SurveyErrorsConfig) -> float:
+    """The focal length that the tracker assumes: the true one plus its survey error."""
+    if not config.focal_length_sigma_m:
+        return focal_length_m
+    drawn = standard_normals(config.seed, "focal", (1,))
+    return focal_length_m + float(scaled_errors(config.focal_length_sigma_m, drawn)[0])

@@ -148,7 +148,7 @@ def test_the_jacobian_is_the_projection_s_derivative(lever: Lever) -> None:
 
     slopes = [(tangents(step * e) - tangents(-step * e)) / (2 * step) for e in np.eye(3)]
     b = cam_from_body.apply(truth.apply(leds.position_m))
-    jacobian = nearfield._jacobian(b, b - cam_from_body.apply(lever.camera_body_m))
+    jacobian = nearfield.tangent_jacobian(b, b - cam_from_body.apply(lever.camera_body_m))
     # 1e-9: rounding of 1e-16 over a step of 1e-6, and the step's square.
     np.testing.assert_allclose(jacobian, np.transpose(slopes), rtol=0, atol=1e-9)
 

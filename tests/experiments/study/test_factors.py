@@ -44,6 +44,10 @@ def test_a_range_ends_at_its_ends_and_is_even_in_ratio_where_that_is_wanted():
         ({"distribution": "normal", "mean": 3.0, "sigma": 2.0}, stats.norm(3, 2)),
         ({"distribution": "lognormal", "median": 3.0, "sigma": 0.5}, stats.lognorm(0.5, scale=3)),
         ({"distribution": "triangular", "low": 0.0, "mode": 1.0, "high": 4.0}, stats.triang(0.25, 0, 4)),
+        (
+            {"distribution": "truncated_normal", "mean": 3.0, "sigma": 2.0, "low": 2.0, "high": 6.0},
+            stats.truncnorm(-0.5, 1.5, 3, 2),
+        ),
         ({"distribution": "integers", "low": 2, "high": 6}, stats.randint(2, 7)),
         ({"from": 2.0, "to": 5.0}, stats.uniform(2, 3)),
         ({"from": 2.0, "to": 50.0, "scale": "log"}, stats.loguniform(2, 50)),
@@ -69,6 +73,11 @@ def test_a_factor_drawn_is_distributed_as_told(told, law):
             {"key": "x", "distribution": "triangular", "low": 0, "mode": 5, "high": 4},
             "not in ascending order",
         ),
+        (
+            {"key": "x", "distribution": "truncated_normal", "mean": 1, "sigma": 1, "low": 3, "high": 2},
+            "low, high are not in ascending order",
+        ),
+        ({"key": "x", "distribution": "truncated_normal", "mean": 1, "sigma": 1}, "allowed: mean, sigma, low, high"),
         ({"key": "x", "from": "wide", "to": 2}, "is not a number"),
         ({"key": "X y", "values": [1]}, "pattern"),
         ({"levels": {}}, "at least 1"),
@@ -78,6 +87,14 @@ def test_a_factor_drawn_is_distributed_as_told(told, law):
 def test_a_factor_that_makes_no_sense_is_refused(told, complaint):
     with pytest.raises(ValidationError, match=complaint):
         READ(told)
+
+
+@pytest.mark.parametrize("u", [0.0, 1e-9, 0.3, 1.0])
+def test_a_truncated_normal_stays_within_its_bounds(u):
+    told = {"key": "x", "distribution": "truncated_normal", "mean": "1 mm", "sigma": "5 mm", "low": "0 mm"}
+    value, settings = READ(told | {"high": "3 mm"}).value_at(u)
+    assert settings == {"x": value}
+    assert 0 <= float(value.removesuffix(" mm")) <= 3
 
 
 THREE = {

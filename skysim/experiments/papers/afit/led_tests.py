@@ -31,7 +31,8 @@ from skysim.experiments.papers.published import published_values
 from skysim.results.metrics import Summary, exact, proportion
 from skysim.results.plots import INK
 from skysim.scene.camera import MoffatPsfConfig
-from skysim.scene.leds import CosineLobeConfig, DirectConfig, ListedConfig
+from skysim.scene.layouts import ListedConfig
+from skysim.scene.leds import CosineLobeConfig, DirectConfig
 from skysim.scene.light import FlatSurfaceConfig
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.scene import leds
+from skysim.scene import layouts
 from skysim.sources.dome.placement.ambiguity import Ambiguity, field_ambiguity
 from skysim.sources.dome.placement.fisher import (
     Visibility,
@@ -128,7 +128,7 @@ class PlacementScore(NamedTuple):
     reference : tail variance of the best even layout, the unit of `tail_variance`
     """
 
-    config: leds.OptimizedConfig
+    config: layouts.OptimizedConfig
     options: PlacementOptions
     R_body_from_lab: Floats
     reference: float = 1.0
@@ -161,7 +161,7 @@ class PlacementScore(NamedTuple):
 
 
 def optimize_places(
-    config: leds.OptimizedConfig,
+    config: layouts.OptimizedConfig,
     sites_m: Floats,
     starts_m: Sequence[Floats],
     rng: np.random.Generator,
@@ -240,7 +240,7 @@ def contract(place_m: Floats, sites_m: Floats, fraction: float) -> Floats:
 class Search(NamedTuple):
     """Local search: (K, 3) candidate sites, m, a k-d tree of them, the step sizes and the part of the field used."""
 
-    config: leds.OptimizedConfig
+    config: layouts.OptimizedConfig
     options: PlacementOptions
     sites_m: Floats
     tree: cKDTree
@@ -289,14 +289,14 @@ def descend(search: Search, place_m: Floats, attitude_count: int, rng: np.random
     return [*candidates, place_m]
 
 
-def visible_fraction(config: leds.OptimizedConfig, sites_m: Floats, rng: np.random.Generator) -> float:
+def visible_fraction(config: layouts.OptimizedConfig, sites_m: Floats, rng: np.random.Generator) -> float:
     """Mean fraction of the sites that an attitude sees; times the number of LEDs it is the mean number in a field."""
     total = total_information(sites_m, sample_attitudes(config, 200, rng), *camera_geometry(config))
     return float(total[:, 6].mean()) / len(sites_m)
 
 
 def hardest_attitudes(
-    config: leds.OptimizedConfig,
+    config: layouts.OptimizedConfig,
     options: PlacementOptions,
     place_m: Floats,
     field_fraction: float,
@@ -327,7 +327,7 @@ def hardest_attitudes(
     return hardest
 
 
-def sample_attitudes(config: leds.OptimizedConfig, count: int, rng: np.random.Generator) -> Floats:
+def sample_attitudes(config: layouts.OptimizedConfig, count: int, rng: np.random.Generator) -> Floats:
     """(A, 3, 3) R_body_from_lab: boresights uniform over the cap of the tilt, yaw uniform; a shifted R3 lattice."""
     # R3 sequence: the multiples of 1/g, 1/g^2 and 1/g^3 modulo 1 fill the unit cube evenly.
     unit = (rng.random(3) + np.arange(count)[:, None] / GOLDEN ** np.arange(1, 4)) % 1
@@ -336,17 +336,17 @@ def sample_attitudes(config: leds.OptimizedConfig, count: int, rng: np.random.Ge
     return Rotation.from_euler("ZYZ", angles).inv().as_matrix()
 
 
-def camera_geometry(config: leds.OptimizedConfig, field_fraction: float = 1.0) -> tuple[Floats, Floats]:
+def camera_geometry(config: layouts.OptimizedConfig, field_fraction: float = 1.0) -> tuple[Floats, Floats]:
     """(3,) entrance pupil on the body, m, and (2,) tangents of half the field, scaled by `field_fraction`."""
     return np.array(config.camera_m), field_fraction * tan_half(config)
 
 
-def tan_half(config: leds.OptimizedConfig) -> Floats:
+def tan_half(config: layouts.OptimizedConfig) -> Floats:
     """(2,) tangents of half the field's width and height."""
     return np.tan(np.radians(config.field_deg) / 2)
 
 
-def field_reach_rad(config: leds.OptimizedConfig, surface: Surface) -> float:
+def field_reach_rad(config: layouts.OptimizedConfig, surface: Surface) -> float:
     """Greatest angle from the zenith, at the bearing, that the field of any attitude reaches; at most the cap.
 
     Rays around the cone that encloses the field are intersected with the surface, for boresights at the greatest tilt
@@ -441,7 +441,7 @@ def thin(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
 # Reduce the ambiguity between fields of view.
 
 
-def layout_ambiguity(config: leds.OptimizedConfig, place_m: Floats) -> Ambiguity:
+def layout_ambiguity(config: layouts.OptimizedConfig, place_m: Floats) -> Ambiguity:
     """Ambiguity of the layout (`ambiguity`), for a round field of the same area as the camera's."""
     radius_rad = math.atan(math.sqrt(4 * float(np.prod(tan_half(config))) / math.pi))
     return field_ambiguity(place_m, config.camera_m[2], math.radians(config.tilt_deg), radius_rad, config.coincidence_m)

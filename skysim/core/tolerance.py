@@ -1,0 +1,194 @@
+"""Errors as a data sheet states them: the standard deviation of a Gaussian, or a tolerance.
+
+A key of a scene that is the size of an error takes a plain quantity, the standard deviation of a Gaussian, or a
+section with a tolerance, the bound that no error exceeds:
+
+    led_sigma: "0.2 mm"
+    led_sigma: {tolerance: "±0.5 mm"}
+    led_sigma: {tolerance: "±0.5 mm", distribution: truncated_normal, sigma: "0.2 mm"}
+
+In Python the value is the equivalent standard deviation, a float: what a covariance takes. A tolerance is a
+`Tolerance`, a float that knows its distribution too; `scaled_errors` draws from either.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import BeforeValidator, Field, GetCoreSchemaHandler, model_validator
+from pydantic_core import CoreSchema, core_schema
+
+from skysim.core.types import Floats
+from skysim.core.units import ConfigModel, Length, Number, Time
+
+SIGMAS_OF_TOLERANCE = 3.0  # of a truncated normal distribution whose sigma is not given: 99.73 % (GUM 4.3.9, note 2)
+
+
+class Tolerance(float):
+    """The standard deviation of an error within +-half_width, and the distribution that it has there.
+
+    half_width   : the tolerance, above 0
+    parent_sigma : standard deviation of the normal distribution before it is truncated at the tolerance; None: the
+        error is uniform
+
+    Uniform (GUM 4.3.7, JCGM 100:2008): half_width / sqrt(3). Truncated normal: with k = half_width / parent_sigma and
+    the standard normal density phi, parent_sigma sqrt(1 - 2 k phi(k) / erf(k / sqrt 2)) (Johnson, Kotz & Balakrishnan
+    1994, Continuous Univariate Distributions 1, ch. 13.10.1).
+    """
+
+    half_width: float
+    parent_sigma: float | None
+
+    def __new__(cls, half_width: float, parent_sigma: float | None = None) -> Self:
+        if parent_sigma is None:
+            sigma = half_width / math.sqrt(3)
+        else:
+            k = half_width / parent_sigma
+            density = math.exp(-(k**2) / 2) / math.sqrt(2 * math.pi)
+            sigma = parent_sigma * math.sqrt(1 - 2 * k * density / math.erf(k / math.sqrt(2)))
+        self = super().__new__(cls, sigma)
+        self.half_width, self.parent_sigma = half_width, parent_sigma
+        return self
+
+    def __reduce__(self) -> tuple[type[Tolerance], tuple[float, float | None]]:
+        return Tolerance, (self.half_width, self.parent_sigma)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Tolerance) and self.__reduce__() == other.__reduce__()
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
+    def __hash__(self) -> int:
+        return hash(self.__reduce__())
+
+    def from_normal(self, normal: Floats) -> Floats:
+        """Errors with this distribution from standard normal numbers, at equal probabilities (Gaussian copula)."""
+        from scipy.special import ndtr, ndtri
+
+        probability = ndtr(normal)
+        if self.parent_sigma is None:
+            return np.asarray(self.half_width * (2 * probability - 1))
+        lowest = ndtr(-self.half_width / self.parent_sigma)
+        return np.asarray(self.parent_sigma * ndtri(lowest + probability * (1 - 2 * lowest)))
+
+
+def scaled_errors(sigma: float, normal: Floats) -> Floats:
+    """Errors of this size from standard normal numbers: sigma times them, or as the tolerance is distributed.
+
+    A tolerance in place of a sigma leaves the random streams as they were.
+    """
+    return sigma.from_normal(normal) if isinstance(sigma, Tolerance) else np.asarray(sigma * normal)
+
+
+class ToleranceConfig(ConfigModel):
+    """Base of a tolerance's section; `tolerance` and `sigma` are quantities of the key's own kind.
+
+    tolerance    : greatest error, plus and minus, as a data sheet states it: "±0.5 mm", or without the sign
+    distribution : uniform (the usual reading of a data sheet, and the default), or a normal distribution truncated at
+        the tolerance; normal has no tolerance
+    sigma        : of the normal distribution before it is truncated; a third of the tolerance if left out
+    """
+
+    distribution: Literal["uniform", "truncated_normal", "normal"] | None = None
+
+    def numbers(self) -> tuple[float | None, float | None]:
+        """Tolerance and sigma in SI units, as given."""
+        half_width, sigma = (getattr(self, name) for name in list(type(self).model_fields)[1:])
+        return half_width, sigma
+
+    @model_validator(mode="after")
+    def check_distribution(self) -> Self:
+        half_width, sigma = self.numbers()
+        if half_width is None and (sigma is None or self.distribution not in (None, "normal")):
+            raise ValueError(f"{self.distribution or 'an error'} requires a tolerance; allowed: tolerance, or sigma")
+        if half_width is not None and self.distribution == "normal":
+            raise ValueError("tolerance: a normal distribution has none; allowed: uniform, truncated_normal")
+        if half_width is not None and sigma is not None and self.distribution != "truncated_normal":
+            raise ValueError("sigma: a uniform distribution has none; allowed: distribution: truncated_normal")
+        if half_width is not None and sigma is not None and not 0.01 <= half_width / sigma <= 100:
+            raise ValueError("sigma: allowed: a hundredth to a hundred times the tolerance")
+        return self
+
+    def error(self) -> float:
+        """The error's size: a plain standard deviation, or a `Tolerance`."""
+        half_width, sigma = self.numbers()
+        if half_width is None:
+            return float(sigma or 0.0)
+        truncated = self.distribution == "truncated_normal"
+        return Tolerance(half_width, (sigma or half_width / SIGMAS_OF_TOLERANCE) if truncated else None)
+
+
+def without_sign(value: Any) -> Any:
+    """A tolerance without the sign before it: "±0.5 mm" is "0.5 mm"."""
+    if not isinstance(value, str):
+        return value
+    return value.strip().removeprefix("±").removeprefix("+/-").removeprefix("+-").strip()
+
+
+SIGNED = r"^\s*(±|\+/-|\+-)?\s*[.]?\d"
+SIGNED_QUANTITY = BeforeValidator(
+    without_sign,
+    json_schema_input_type=Annotated[
+        str, Field(description='a quantity such as "±0.5 mm"', pattern=SIGNED + ".*[a-zA-Z]")
+    ],
+)
+SIGNED_NUMBER = BeforeValidator(
+    without_sign, json_schema_input_type=float | Annotated[str, Field(description="±0.1", pattern=SIGNED)]
+)
+
+
+class LengthToleranceConfig(ToleranceConfig):
+    """The tolerance of a length."""
+
+    tolerance_m: Annotated[Length, Field(gt=0), SIGNED_QUANTITY] | None = None
+    sigma_m: Annotated[Length, Field(gt=0)] | None = None
+
+
+class TimeToleranceConfig(ToleranceConfig):
+    """The tolerance of a time."""
+
+    tolerance_s: Annotated[Time, Field(gt=0), SIGNED_QUANTITY] | None = None
+    sigma_s: Annotated[Time, Field(gt=0)] | None = None
+
+
+class NumberToleranceConfig(ToleranceConfig):
+    """The tolerance of a bare number, in the unit of its key."""
+
+    tolerance: Annotated[Number, Field(gt=0), SIGNED_NUMBER] | None = None
+    sigma: Annotated[Number, Field(gt=0)] | None = None
+
+
+def error_of(value: Any) -> Any:
+    """The size of an error from a quantity or from a tolerance's section."""
+    return value.error() if isinstance(value, ToleranceConfig) else value
+
+
+def in_file(value: float) -> Any:
+    """For `model_dump`: a number for a Gaussian, and all that defines a tolerance for the rest."""
+    return {"tolerance": value.half_width, "sigma": value.parent_sigma} if isinstance(value, Tolerance) else value
+
+
+@dataclass(frozen=True)
+class ErrorSchema:
+    """Annotation of a key that is the size of an error: a quantity of some kind, or the section of its tolerance."""
+
+    quantity: Any
+    section: type[ToleranceConfig]
+
+    def __get_pydantic_core_schema__(self, _source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        tag = self.section.__name__  # an error names the keys of the section only if there is one
+        kinds = {"quantity": handler.generate_schema(self.quantity), tag: handler.generate_schema(self.section)}
+        chosen = core_schema.tagged_union_schema(
+            kinds, lambda value: tag if isinstance(value, dict | ToleranceConfig) else "quantity"
+        )
+        dumped = core_schema.plain_serializer_function_ser_schema(in_file)
+        return core_schema.no_info_after_validator_function(error_of, chosen, serialization=dumped)
+
+
+LengthError = Annotated[float, ErrorSchema(Length, LengthToleranceConfig), Field(ge=0)]
+TimeError = Annotated[float, ErrorSchema(Time, TimeToleranceConfig), Field(ge=0)]
+NumberError = Annotated[float, ErrorSchema(Number, NumberToleranceConfig), Field(ge=0)]

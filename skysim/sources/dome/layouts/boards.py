@@ -1,0 +1,151 @@
+"""Patch boards: 3x3 LED boards glued to the surface, spread evenly, on a grid, or listed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
+from skysim.core.tolerance import scaled_errors
+from skysim.core.types import Floats, Sources
+from skysim.scene.layouts import HOLES, PatchBoardsConfig
+from skysim.scene.leds import LedConfig
+from skysim.sources.dome.layouts.placing import (
+    Ints,
+    PlacedLeds,
+    cap,
+    check_cap,
+    directions_from_angles,
+    led_sources,
+    project_from_bearing,
+)
+from skysim.sources.dome.surface import Surface
+from skysim.sources.photometry import Band
+
+GLUE_STREAM = 1  # spawn key of the glue's own random stream, so that glue errors leave a board's pattern unchanged
+
+
+@dataclass(frozen=True, slots=True)
+class Boards:
+    """Patch boards, (B, 3) each: center in the lab, m, unit normal, and unit vectors of the two axes of the holes."""
+
+    center_m: Floats
+    normal: Floats
+    u: Floats
+    v: Floats
+
+
+def patch_boards(config: PatchBoardsConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+    """3x3 boards glued flat to the surface, listed or spread evenly, each with its own choice of LEDs and levels.
+
+    A board is a plane tangent at its center, so its outer LEDs are off the surface, as on the real dome. The glue
+    tilts the board, and each LED is displaced in the board's plane. Everything random here is hardware and is drawn
+    from config.hardware_seed: which LEDs are soldered, their levels and strengths, the phases of their pulses.
+    """
+    rng = random_stream(config.hardware_seed)
+    boards, holes, level = listed_boards(config, surface) if config.boards else spread_boards(config, surface, rng)
+    board = np.repeat(np.arange(len(holes)), [len(board_holes) for board_holes in holes])
+    hole = np.concatenate(holes)
+    if level is None:
+        level = rng.choice(config.pwm_levels, len(board))
+    glue = random_stream(config.hardware_seed, GLUE_STREAM)
+    if config.glue_tilt_deg:
+        boards = tilt_boards(boards, np.radians(config.glue_tilt_deg), glue)
+    displacement_m = scaled_errors(config.glue_scatter_m, glue.standard_normal((2, len(board))))
+    # Hole h is in column h % 3 and row h // 3; hole 4 is the center.
+    place = (
+        boards.center_m[board]
+        + ((hole % 3 - 1) * config.pitch_m + displacement_m[0])[:, None] * boards.u[board]
+        + ((hole // 3 - 1) * config.pitch_m + displacement_m[1])[:, None] * boards.v[board]
+    )
+    number = (board * HOLES + hole).astype(np.int64)
+    return led_sources(
+        PlacedLeds(number, place, boards.normal[board], level, np.full(len(board), np.nan)), led, band, rng
+    )
+
+
+def spread_boards(
+    config: PatchBoardsConfig, surface: Surface, rng: np.random.Generator
+) -> tuple[Boards, list[Ints], None]:
+    """Boards all over the cap as seen from the bearing, and the holes that each uses.
+
+    On a spiral each board has a random orientation; on a grid all are aligned with its rows.
+    """
+    half, spacing_m = np.radians(config.cap_deg), config.spacing_m or config.pitch_m
+    apex_m = project_from_bearing(surface, np.array([[0.0, 0.0, 1.0]]))[0, 2]
+    if config.spread == "grid":
+        directions = grid(spacing_m / apex_m, half)
+        rotation = np.zeros(len(directions))
+    else:
+        # The cap's area on a sphere of the apex's height, over one square of the spacing per board.
+        area_m2 = 2 * np.pi * apex_m**2 * (1 - np.cos(half))
+        directions = cap(max(1, round(area_m2 / spacing_m**2)), half)
+        rotation = rng.uniform(0, 2 * np.pi, len(directions))
+    boards = tangent_boards(surface, project_from_bearing(surface, directions), rotation)
+    holes = [rng.permutation(HOLES)[: rng.integers(config.lit[0], config.lit[1] + 1)] for _ in range(len(rotation))]
+    return boards, holes, None
+
+
+def grid(spacing_rad: float, half_angle_rad: float) -> Floats:
+    """(N, 3) unit vectors in rows and columns over a cap about +z, one of them at +z.
+
+    Equal steps on Lambert's equal-area map, where a direction at the angle t from the center is at radius 2 sin(t /
+    2).
+    """
+    steps = int(2 * np.sin(half_angle_rad / 2) / spacing_rad)
+    x, y = (axis.ravel() * spacing_rad for axis in np.meshgrid(*2 * [np.arange(-steps, steps + 1)]))
+    radius2 = x**2 + y**2
+    within = radius2 <= (2 * np.sin(half_angle_rad / 2)) ** 2
+    x, y, radius2 = x[within], y[within], radius2[within]
+    # Inverse of the map: at the radius rho, z = 1 - rho^2 / 2, at the distance rho sqrt(1 - rho^2 / 4) from the axis.
+    scale = np.sqrt(1 - radius2 / 4)
+    return np.column_stack([x * scale, y * scale, 1 - radius2 / 2])
+
+
+def listed_boards(config: PatchBoardsConfig, surface: Surface) -> tuple[Boards, list[Ints], Floats]:
+    """Boards at the listed places, their holes, and the level of every LED. Raises InputError if two boards overlap."""
+    listed = config.boards
+    directions = directions_from_angles([(board.azimuth_deg, board.tilt_deg) for board in listed])
+    check_cap("light.layout.boards", directions, config.cap_deg)
+    center_m = project_from_bearing(surface, directions)
+    close = cKDTree(center_m).query_pairs(3 * config.pitch_m * (1 - 1e-9))
+    if close:
+        first, second = min(close)
+        distance_m = np.linalg.norm(center_m[first] - center_m[second])
+        raise InputError(
+            f"light.layout.boards.{second}: overlaps board {first}, {distance_m:.3g} m away; allowed:"
+            f" {3 * config.pitch_m:.3g} m, three pitches"
+        )
+    boards = tangent_boards(surface, center_m, np.radians([board.rotation_deg for board in listed]))
+    level = np.concatenate([board.levels or np.ones(len(board.leds)) for board in listed])
+    return boards, [np.array(board.leds, dtype=np.int64) for board in listed], level
+
+
+def tangent_boards(surface: Surface, center_m: Floats, rotation_rad: Floats) -> Boards:
+    """Boards tangent to the surface. At turn 0 the holes' columns run along normal x (lab x)."""
+    normal = surface.inward(center_m)
+    across = np.cross(normal, [1.0, 0.0, 0.0])
+    edge_on = np.linalg.norm(across, axis=1) < 1e-9  # the normal is parallel to lab x
+    across[edge_on] = [0.0, 1.0, 0.0]
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    along = np.cross(normal, across)
+    rotation = rotation_rad[:, None]
+    u, v = (
+        across * np.cos(rotation) + along * np.sin(rotation),
+        along * np.cos(rotation) - across * np.sin(rotation),
+    )
+    return Boards(center_m, normal, u, v)
+
+
+def tilt_boards(boards: Boards, max_rad: float, rng: np.random.Generator) -> Boards:
+    """Boards tilted by the glue: normals uniform over a cap of most_rad about the surface's, centers unchanged."""
+    count = len(boards.normal)
+    angle = np.arccos(1 - rng.random(count) * (1 - np.cos(max_rad)))
+    azimuth = rng.uniform(0, 2 * np.pi, count)[:, None]
+    axis = boards.u * np.cos(azimuth) + boards.v * np.sin(azimuth)
+    rotation = Rotation.from_rotvec(angle[:, None] * axis)
+    return replace(boards, normal=rotation.apply(boards.normal), u=rotation.apply(boards.u), v=rotation.apply(boards.v))

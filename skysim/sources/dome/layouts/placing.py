@@ -1,0 +1,132 @@
+"""What all layouts share: directions from the bearing, their places on the surface, and LEDs as light sources."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
+from skysim.core.types import Floats, Sources
+from skysim.scene.layouts import HOLES, LitConfig
+from skysim.scene.leds import LedConfig
+from skysim.sources.dome.led import DRIVES, DriveInput, full_strength_e_s_sr, strength_factors
+from skysim.sources.dome.surface import Surface
+from skysim.sources.photometry import Band
+
+GOLDEN_ANGLE_RAD = np.pi * (3 - np.sqrt(5))
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedLeds:
+    """LED positions before drive and brightness are assigned.
+
+    id        : (N,) LED numbers
+    place_m   : (N, 3) in the lab;  normal : (N, 3) unit
+    level     : (N,) fraction of full brightness, 0 < level <= 1
+    magnitude : (N,) of the star that the LED represents; NaN if it represents none
+    """
+
+    id: Ints
+    place_m: Floats
+    normal: Floats
+    level: Floats
+    magnitude: Floats
+
+
+def led_sources(placed: PlacedLeds, led: LedConfig, band: Band, rng: np.random.Generator) -> Sources:
+    """Sources of placed LEDs: strength with its scatter from LED to LED, and the drive's pulse timing.
+
+    rng is the hardware's.
+    """
+    count = len(placed.id)
+    scatter = strength_factors(led.scatter, rng.standard_normal(count))
+    strength = full_strength_e_s_sr(led, band) * scatter
+    pulses = DRIVES[led.drive.kind](led, DriveInput(placed.level, placed.id // HOLES), rng)
+    return Sources(
+        id=placed.id,
+        place=np.column_stack([placed.place_m, np.ones(count)]),
+        normal=placed.normal,
+        radius_m=np.full(count, led.disk_diameter_m / 2),
+        strength=strength * pulses.strength,
+        period_s=pulses.period_s,
+        start_s=pulses.start_s,
+        on_s=pulses.on_s,
+        clock=pulses.clock,
+        magnitude=placed.magnitude,
+    )
+
+
+def on_surface(surface: Surface, place_m: Floats, level: Floats) -> PlacedLeds:
+    """LEDs at (N, 3) places with the surface's normals there, numbered from 0."""
+    number = np.arange(len(place_m), dtype=np.int64)
+    return PlacedLeds(number, place_m, surface.inward(place_m), level, np.full(len(place_m), np.nan))
+
+
+def dimmed_sources(
+    dimming: Sequence[float],
+    surface: Surface,
+    place_m: Floats,
+    led: LedConfig,
+    band: Band,
+    rng: np.random.Generator,
+) -> Sources:
+    """Sources of LEDs at (N, 3) places on the surface, each with a random level of `dimming`."""
+    level = rng.choice(dimming, len(place_m))
+    return led_sources(on_surface(surface, place_m, level), led, band, rng)
+
+
+def lit_sources(config: LitConfig, surface: Surface, place_m: Floats, led: LedConfig, band: Band) -> Sources:
+    """Sources of the drawn fraction of LEDs at (N, 3) places; each keeps its number among all places."""
+    rng = random_stream(config.hardware_seed)
+    number = np.sort(rng.permutation(len(place_m))[: max(round(config.lit_fraction * len(place_m)), 1)])
+    return replace(dimmed_sources(config.dimming, surface, place_m[number], led, band, rng), id=number)
+
+
+def cap(count: int, half_angle_rad: float) -> Floats:
+    """(count, 3) unit vectors spread evenly over a cap about +z: Fibonacci spiral, equal areas in z."""
+    n = np.arange(count) + 0.5
+    z = 1 - n / count * (1 - np.cos(half_angle_rad))
+    ring = np.sqrt(1 - z**2)
+    return np.column_stack([ring * np.cos(n * GOLDEN_ANGLE_RAD), ring * np.sin(n * GOLDEN_ANGLE_RAD), z])
+
+
+def scattered_cap(count: int, half_angle_rad: float, rng: np.random.Generator) -> Floats:
+    """(count, 3) independent unit vectors, uniform over a cap about +z: uniform in z and in azimuth."""
+    z = 1 - rng.random(count) * (1 - np.cos(half_angle_rad))
+    azimuth, ring = rng.uniform(0, 2 * np.pi, count), np.sqrt(1 - z**2)
+    return np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
+
+
+def directions_from_angles(directions_deg: Any) -> Floats:
+    """(N, 3) unit vectors from the bearing, for (N, 2) azimuth from +x toward +y and tilt from +z."""
+    azimuth, tilt = np.radians(np.asarray(directions_deg, dtype=float)).T
+    return np.column_stack([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
+
+
+def check_cap(key: str, directions: Floats, cap_deg: float) -> None:
+    """Raise InputError for the first of (N, 3) directions from the bearing that is outside the cap."""
+    length = np.linalg.norm(directions, axis=1)
+    tilt_deg = np.degrees(np.arctan2(np.hypot(*directions.T[:2]), directions[:, 2]))
+    beyond = np.flatnonzero(~((length > 0) & (tilt_deg <= cap_deg * (1 + 1e-12))))
+    if len(beyond):
+        raise InputError(
+            f"{key}.{beyond[0]}: {tilt_deg[beyond[0]]:.4g} deg from the zenith, seen from the bearing's center;"
+            f" allowed: light.layout.cap_deg, {cap_deg:g}"
+        )
+
+
+def project_from_bearing(surface: Surface, directions: Floats) -> Floats:
+    """(N, 3) points where rays from the bearing's center meet the surface. Raises InputError where they miss it."""
+    place_m = surface.meet(np.zeros(3), directions)
+    if np.isnan(place_m).any():
+        raise InputError(
+            "light.layout: exceeds the surface; allowed: a smaller cap_deg, a larger surface or rim, or kind listed"
+        )
+    return place_m

@@ -1,0 +1,73 @@
+"""All layouts of LEDs by name. LAYOUTS maps the scene's `light.layout.kind` to a function that returns all LEDs.
+
+The real sky, and two kinds that take the points of another layout, optical fibers and an LCD panel, are defined here;
+the others in their own modules.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from skysim.core.random_streams import random_stream
+from skysim.core.types import Sources
+from skysim.scene.layouts import HOLES, CelestialConfig, FibersConfig, Layout, LcdConfig, PatchBoardsConfig
+from skysim.scene.leds import LedConfig
+from skysim.sources.dome import celestial as celestial_dome
+from skysim.sources.dome import display
+from skysim.sources.dome.layouts.boards import patch_boards
+from skysim.sources.dome.layouts.geodesic import geodesic
+from skysim.sources.dome.layouts.listed import listed
+from skysim.sources.dome.layouts.placing import Ints, PlacedLeds, led_sources
+from skysim.sources.dome.layouts.spreads import fibonacci, optimized, poisson_disk, random_places
+from skysim.sources.dome.layouts.string import string
+from skysim.sources.dome.surface import Surface
+from skysim.sources.photometry import Band
+
+
+def celestial(config: CelestialConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+    """The real sky (JHU/APL's idea): an LED where the camera at its nominal place sees each of the brightest stars.
+
+    LED numbers are Hipparcos numbers. Places are from `celestial.project_stars`, levels from `celestial.led_levels`.
+    """
+    stars = celestial_dome.project_stars(config, surface, led, band)
+    normal = surface.inward(stars.place_m)
+    level = celestial_dome.led_levels(config, stars, normal, led)
+    placed = PlacedLeds(stars.hip, stars.place_m, normal, level, stars.v_mag)
+    return led_sources(placed, led, band, random_stream(config.hardware_seed))
+
+
+def fibers(config: FibersConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+    """Ends of optical fibers at another layout's points, with the shell's radius error: `display.displace_ends`."""
+    return display.displace_ends(config, LAYOUTS[config.points.kind](config.points, surface, led, band))
+
+
+def lcd(config: LcdConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+    """Another layout's LEDs drawn on the nearest pixels of a panel: `display.panel_sources`."""
+    panel = display.panel_surface(config, surface)
+    stars = LAYOUTS[config.points.kind](config.points, panel, display.ideal_led(led), band)
+    return display.panel_sources(config, panel, led, band, stars)
+
+
+# Arguments: its section of the scene, the surface, the LED type, the chip's band. Returns all LEDs.
+LAYOUTS: dict[str, Callable[[Any, Surface, LedConfig, Band], Sources]] = {
+    "patch_boards": patch_boards,
+    "fibonacci": fibonacci,
+    "poisson_disk": poisson_disk,
+    "random": random_places,
+    "geodesic": geodesic,
+    "string": string,
+    "optimized": optimized,
+    "celestial": celestial,
+    "listed": listed,
+    "fibers": fibers,
+    "lcd": lcd,
+}
+
+
+def board_of(config: Layout, led_ids: Ints) -> Ints | None:
+    """(N,) board of each of these LED numbers; None if no two boards can be distinguished: no boards, or only one."""
+    board = led_ids // HOLES
+    return board if isinstance(config, PatchBoardsConfig) and len(np.unique(board)) > 1 else None

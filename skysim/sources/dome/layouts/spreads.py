@@ -1,0 +1,83 @@
+"""Even and random spreads of single LEDs over the cap: Fibonacci spiral, random, Poisson disk, optimized."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
+from skysim.core.types import Sources
+from skysim.scene.layouts import FibonacciConfig, OptimizedConfig, PoissonDiskConfig, RandomPlacesConfig
+from skysim.scene.leds import LedConfig
+from skysim.sources.dome.layouts.placing import cap, dimmed_sources, project_from_bearing, scattered_cap
+from skysim.sources.dome.placement import optimize
+from skysim.sources.dome.surface import Surface
+from skysim.sources.photometry import Band
+
+DARTS_PER_SPACING2 = 100  # random points per spacing^2: a gap of .03 of that area is found with probability .95
+MAX_DARTS = 3_000_000
+DARTS_PER_LED = 30  # random points per LED, if a count is given
+BISECTIONS = 14  # bisection steps from the dome's width: to some tenths of a millimeter
+
+
+def fibonacci(config: FibonacciConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+    """LEDs on a Fibonacci spiral: equal solid angles about the bearing hold equal numbers, to within a few."""
+    rng = random_stream(config.hardware_seed)
+    place_m = project_from_bearing(surface, cap(config.count, np.radians(config.cap_deg)))
+    return dimmed_sources(config.dimming, surface, place_m, led, band, rng)
+
+
+def random_places(config: RandomPlacesConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+    """Independent LEDs, uniform in solid angle about the bearing: a Poisson field, like that of real stars."""
+    rng = random_stream(config.hardware_seed)
+    place_m = project_from_bearing(surface, scattered_cap(config.count, np.radians(config.cap_deg), rng))
+    return dimmed_sources(config.dimming, surface, place_m, led, band, rng)
+
+
+def poisson_disk(config: PoissonDiskConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+    """LEDs at random with a least spacing, as many as fit: random sequential adsorption.
+
+    Random points, uniform over the cap, are taken in turn; each is accepted if no accepted one is within the spacing.
+    Disks of that diameter would jam at a coverage of .547 (Feder 1980, J. theor. Biol. 87, 237; assumed).
+    DARTS_PER_SPACING2 points per square of the spacing reach .52, that is .66 LEDs per square of the spacing, and a
+    higher density along the rim.
+    If a count is given instead, the result is the first `count` points accepted at the widest spacing that has room
+    for them. Raises InputError for a spacing that makes more LEDs than fit into memory.
+    """
+    rng = random_stream(config.hardware_seed)
+    half = np.radians(config.cap_deg)
+    if config.spacing_m is None:
+        count = config.count or 1
+        darts_m = project_from_bearing(surface, scattered_cap(DARTS_PER_LED * count, half, rng))
+        place_m = darts_m[optimize.spread(darts_m, 0.0, count, BISECTIONS)]
+        return dimmed_sources(config.dimming, surface, place_m, led, band, rng)
+    directions = cap(1000, half)
+    points = project_from_bearing(surface, directions)
+    # Surface area per steradian seen from the bearing, r^2 / cos(incidence). Where it is greatest, points uniform in
+    # solid angle are sparsest on the surface, so this maximum sets how many are needed.
+    slant = -np.einsum("nj,nj->n", surface.inward(points), directions)
+    meters2_sr = np.sum(points**2, axis=1) / slant
+    dart_count = DARTS_PER_SPACING2 * 2 * np.pi * (1 - np.cos(half)) * meters2_sr.max() / config.spacing_m**2
+    if not 0 < dart_count <= MAX_DARTS:
+        min_spacing_m = config.spacing_m * np.sqrt(dart_count / MAX_DARTS) if dart_count > 0 else np.inf
+        raise InputError(
+            f"light.layout.spacing: {config.spacing_m:g} m gives too many LEDs; allowed: {min_spacing_m:.3g} m or more"
+        )
+    darts_m = project_from_bearing(surface, scattered_cap(max(int(dart_count), 1), half, rng))
+    place_m = darts_m[optimize.thin(darts_m, config.spacing_m)]
+    return dimmed_sources(config.dimming, surface, place_m, led, band, rng)
+
+
+def optimized(config: OptimizedConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+    """LEDs at the places that make the camera's worst attitudes most accurate: see `optimize.optimize_places`.
+
+    No LED is placed where no attitude's field reaches. In the mean of the worst attitudes the layout is not worse
+    than a Fibonacci spiral.
+    """
+    rng = random_stream(config.hardware_seed)
+    options = optimize.OPTIONS
+    reach = optimize.field_reach_rad(config, surface)
+    sites = project_from_bearing(surface, scattered_cap(options.sites_per_led * config.count, reach, rng))
+    spirals = [project_from_bearing(surface, cap(config.count, half)) for half in (np.radians(config.cap_deg), reach)]
+    place_m = optimize.optimize_places(config, sites, spirals, rng, options)
+    return dimmed_sources(config.dimming, surface, place_m, led, band, rng)
