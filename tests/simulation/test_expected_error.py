@@ -199,6 +199,40 @@ def test_a_neighbor_moves_a_fitted_star(stars: Testbed) -> None:
     assert near == pytest.approx(1e-3 / 3, rel=0.02)
 
 
+# A total station
+
+
+INSTRUMENT = '{kind: total_station, position: ["3 m", "1 m", "0.2 m"], angle_sigma_arcsec: 0, distance_sigma: "0 mm"'
+
+
+def variances_of(survey: dict[str, str]) -> dict[str, Floats]:
+    """(2,) cross and roll variances by cause at the frames of AFIT's dome, with only these errors of the survey."""
+    none = {"led_sigma": "0 mm", "lever_sigma": "0 mm"}
+    testbed = build_testbed(loader.load("afit_simsat", keyed(none | survey)))
+    context = detection.context_of(testbed)
+    found = plan.sampled(attitudes.of_frames(testbed), context).error
+    return {name: np.array([found.cross_rad2[name].mean(), found.roll_rad2[name].mean()]) for name in found.cross_rad2}
+
+
+def keyed(survey: dict[str, str]) -> dict[str, str]:
+    return {f"tracker.survey.{key}": value for key, value in survey.items()}
+
+
+def test_a_station_off_its_point_is_a_lever_off_its_place() -> None:
+    """All LEDs move together by the centering's error, as they do against a camera that is elsewhere."""
+    station = variances_of({"instrument": f'{INSTRUMENT}, centering: "0.4 mm"}}'})
+    lever = variances_of({"lever_sigma": "0.4 mm"})
+    np.testing.assert_allclose(station["survey set-up"], lever["lever survey"], rtol=1e-9)
+    assert not station["LED survey"].any()
+
+
+def test_a_station_s_sights_err_by_angle_times_distance() -> None:
+    """Angles of 10″ at some 3.3 m, and distances of 0.16 mm, err by 0.16 mm along each axis."""
+    sight = INSTRUMENT.replace("arcsec: 0", "arcsec: 10").replace('"0 mm"', '"0.16 mm"')
+    station, leds = variances_of({"instrument": f"{sight}}}"}), variances_of({"led_sigma": "0.16 mm"})
+    np.testing.assert_allclose(station["LED survey"], leds["LED survey"], rtol=0.2)
+
+
 # Against solved frames
 
 

@@ -159,7 +159,8 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
         raise InputError(f"trial.kind: {trial.kind} with a collimated display; allowed: flight")
     survey, dome = scene.tracker.survey, scene.light if isinstance(scene.light, DomeConfig) else None
     error_m = dome.surface.error_m if dome else 0.0
-    if "tracker.survey.seed" in plan.spec.hardware and not (survey.led_sigma_m or survey.lever_sigma_m or error_m):
+    drawn = (survey.led_sigma_m, survey.lever_sigma_m, survey.focal_length_sigma_m, survey.instrument, error_m)
+    if "tracker.survey.seed" in plan.spec.hardware and not any(drawn):
         raise InputError(
             "hardware: tracker.survey.seed has no effect without errors of the survey; allowed: with"
             " tracker.survey.led_sigma, lever_sigma or light.surface.error"

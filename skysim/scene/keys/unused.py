@@ -77,7 +77,8 @@ def survey_draws_nothing(scene: Scene) -> bool:
     """Whether no survey error is drawn from `tracker.survey.seed`."""
     survey = scene.tracker.survey
     surface_m = scene.light.surface.error_m if isinstance(scene.light, DomeConfig) else 0.0
-    return not (survey.led_sigma_m or survey.lever_sigma_m or (surface_m and survey.surface_seed is None))
+    drawn = (survey.led_sigma_m, survey.lever_sigma_m, survey.focal_length_sigma_m, survey.instrument)
+    return not (any(drawn) or (surface_m and survey.surface_seed is None))
 
 
 def listed_boards(scene: Scene) -> bool:

@@ -28,6 +28,7 @@ from skysim.scene.scene import Scene
 from skysim.simulation.checks.views import CameraModel
 from skysim.simulation.testbed import Testbed
 from skysim.sources.dome import display
+from skysim.sources.dome.survey_errors import led_covariance_m2
 from skysim.tracking import dome_map_file
 from skysim.tracking.factory import onboard_catalog
 from skysim.tracking.onboard_model import assumed_camera
@@ -44,7 +45,7 @@ class Beliefs:
     lights         : the sources that it knows, N of them
     direction_error : (N, 3) measured minus believed direction of each star, from the catalog's error and from
         neighbors, in lab axes; zeros for LEDs
-    led_sigma_m, lever_sigma_m : of the surveyed places, about each axis
+    led_sigma_m, lever_sigma_m : of the surveyed places, about each axis (rms of LEDs measured by an instrument)
     surface_sigma_m : of the surveyed surface, along its normal, common to all LEDs
     rotation_rad   : (3,) rotation of the survey's axes, in lab axes
     lever_error_m  : (3,) believed minus true place of the camera, in body axes
@@ -95,16 +96,17 @@ def of(testbed: Testbed, camera: CameraModel) -> Beliefs:
         )
     survey = tracker.survey
     surface_m = scene.light.surface.error_m if isinstance(scene.light, DomeConfig) else 0.0
+    own_m2 = led_covariance_m2(lights.place[:, :3], survey)
     return Beliefs(
         lights,
         direction_error,
-        survey.led_sigma_m,
+        survey.led_sigma_m if own_m2 is None else float(np.sqrt(np.trace(own_m2, axis1=1, axis2=2).mean() / 3)),
         survey.lever_sigma_m,
         surface_m,
         np.radians(survey.rotation_deg),
         lever_error_m,
-        focal_error,
-        0.0,
+        0.0 if survey.focal_length_sigma_m else focal_error,
+        survey.focal_length_sigma_m / scene.camera.focal_length_m,
         config,
         faintest_mag,
         epoch_jyear,
@@ -204,7 +206,9 @@ def describe(beliefs: Beliefs, scene: Scene) -> list[str]:
     known = [f"{what} to {1e3 * sigma_m:.3g} mm" for what, sigma_m in sigmas.items() if sigma_m]
     if known:
         lines.append(f"{', '.join(known)} about each axis ({source})")
-    elif isinstance(scene.light, DomeConfig):
+    if instrument := scene.tracker.survey.instrument:
+        lines.append(f"LEDs measured by a {instrument.kind.replace('_', ' ')} (tracker.survey.instrument)")
+    elif not known and isinstance(scene.light, DomeConfig):
         lines.append("every LED and the lever exactly (tracker.survey)")
     if beliefs.rotation_rad.any():
         lines.append(f"the survey's axes rotated by {np.degrees(np.linalg.norm(beliefs.rotation_rad)) * 3600:.3g}″")

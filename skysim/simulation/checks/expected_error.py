@@ -45,6 +45,7 @@ from skysim.scene.camera import RollingShutterConfig
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.views import View
+from skysim.sources.dome import survey_errors, total_station
 
 
 class Independent(NamedTuple):
@@ -88,8 +89,23 @@ def mean_root(variance_rad2: Floats) -> float:
 
 
 def led_survey(view: View, lab_from_cam: Rotation, context: Context) -> Independent | None:
-    sigma_m = context.beliefs.led_sigma_m
+    sigma_m, survey = context.beliefs.led_sigma_m, context.testbed.scene.tracker.survey
+    place_m = context.beliefs.lights.place[view.row, :3]
+    own_m2 = survey_errors.led_covariance_m2(place_m, survey)
+    if own_m2 is not None:
+        gradient_lab = view.gradient @ lab_from_cam.inv().as_matrix()  # of the image with respect to a place in the lab
+        return Independent(gradient_lab @ own_m2 @ np.swapaxes(gradient_lab, 1, 2))
     return Independent(sigma_m**2 * view.gradient @ np.swapaxes(view.gradient, 1, 2)) if sigma_m else None
+
+
+def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    """Errors of the instrument's set-up, common to all LEDs."""
+    instrument = context.testbed.scene.tracker.survey.instrument
+    if instrument is None:
+        return None
+    shifts_m = total_station.common_displacements_m(instrument, context.beliefs.lights.place[view.row, :3])
+    parts = [displacement(view, shift_m, lab_from_cam).displacement_px for shift_m in shifts_m]
+    return Common(np.concatenate(parts, axis=2)) if parts else None
 
 
 def lever_survey(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
@@ -154,6 +170,7 @@ def displacement(view: View, shift_lab: Floats, lab_from_cam: Rotation) -> Commo
 
 CAUSES: dict[str, Callable[[View, Rotation, Context], Independent | Common | None]] = {
     "LED survey": led_survey,
+    "survey set-up": survey_setup,
     "lever survey": lever_survey,
     "surface survey": surface_survey,
     "survey rotation": survey_rotation,
