@@ -1,0 +1,22 @@
+"""Compiled functions run by the Python interpreter: NumPy refuses an index beyond an array, and nothing is compiled."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from types import ModuleType
+
+import numba
+import pytest
+
+
+def interpreted(name: str) -> ModuleType:
+    """Import a second copy of a module of the estimator, and of all that it imports, without numba's compiler."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in [one for one in sys.modules if one.split(".")[0] == "estimator"]:
+            patch.delitem(sys.modules, module)
+        patch.setattr(numba.config, "DISABLE_JIT", True)
+        module = importlib.import_module(name)
+        for own in [one for one in sys.modules if one.split(".")[0] == "estimator"]:
+            sys.modules.pop(own)
+    return module
