@@ -82,3 +82,23 @@ def test_the_information_is_that_of_the_projection_s_slopes() -> None:
     slopes = np.array([(tangents(step * e) - tangents(-step * e)) / (2 * step) for e in np.eye(3)])
     info = evidence._fit(detections, dome, R_cam_from_lab.copy(), rows, rows)
     np.testing.assert_allclose(info, slopes @ slopes.T / 0.01**2, rtol=0, atol=1e-7 * np.abs(info).max())
+
+
+@pytest.mark.parametrize(("sigmas", "matched"), [(3.0, 6), (-3.0, 6), (8.0, 0)])
+def test_leds_are_matched_within_the_error_of_their_pair_s_direction(sigmas: float, matched: int) -> None:
+    """Two detections of error sigma, s apart, give the roll about their middle to sqrt(2) sigma / s.
+
+    At 3 standard deviations of the roll all LEDs are within 3.5 of their own places. At 8 the pair itself is not:
+    each is 0.5 s from the middle, 5.7 sigma from its place, where the gate is 3.5 sqrt(1 + 1 / 2 + 1 / 2) sigma.
+    """
+    place_m = np.array([[0.015, 0], [-0.015, 0], [0.04, 0.03], [-0.03, 0.045], [-0.045, -0.03], [0.03, -0.04]])
+    place_m = np.column_stack([place_m, np.full(6, 1.2192)])
+    leds = LedMap(np.arange(6), place_m, np.zeros(3), np.array([np.inf, np.inf, 1.2192]))
+    dome, sigma = build_dome_index(leds, LEVER, CAMERA), 0.2 / CAMERA.focal_px
+    rays = CAMERA.rays(project(Rotation.identity(), place_m, LEVER, CAMERA))
+    detections = search.build_detections(rays, np.full(6, sigma), dome)._replace(sigma=np.full(6, sigma))
+    apart = 0.03 / (1.2192 - 0.381)
+    rolled = Rotation.from_euler("z", sigmas * np.sqrt(2) * sigma / apart).as_matrix()
+    hypothesis = evidence.evaluate(detections, dome, rolled, 0, 0, 1)
+    assert len(hypothesis.star) == matched
+    assert np.isfinite(hypothesis.dex) == (matched > 0)

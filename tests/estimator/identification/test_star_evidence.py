@@ -93,3 +93,13 @@ def test_bright_strays_cost_half_a_power_of_ten_each_beyond_the_matches() -> Non
         total = strays + 4
         dex.append(hypothesis.dex + sum(np.log10(total - k) for k in range(4)))
     np.testing.assert_allclose(np.diff(dex), [-0.5, -1.0], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("ratio", [0.98, 0.991, 1.0, 1.009, 1.02])
+def test_the_focal_length_is_measured_within_its_uncertainty(ratio: float) -> None:
+    """All tangents are `ratio` times those of the assumed focal length, known to 0.01; twice that is no solution."""
+    detections = seen(ratio * TANGENT[:7])._replace(focal_uncertainty=0.01)
+    hypothesis = evidence.evaluate(detections, SKY, TRUTH.as_matrix(), 1.0, np.full(7, 0.01), -np.inf)
+    solved = abs(ratio - 1) < 0.01
+    assert hypothesis.star.tolist() == list(range(7) if solved else [])
+    assert hypothesis.focal_ratio == pytest.approx(ratio if solved else 1.0, abs=1e-6)  # of two Gauss-Newton steps
