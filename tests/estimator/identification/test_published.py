@@ -17,16 +17,23 @@ from estimator.catalog import pair_index
 from estimator.catalog.catalog import unit
 from estimator.core.arrays import Floats
 from estimator.identification.published import pyramid
-from estimator.identification.published.saa_search import Gates, Primary, SearchInput
-from estimator.identification.published.shefex import SearchOptions
+from estimator.identification.published.saa_search import UNMATCHED_COST, Gates, Primary, SearchInput
+from estimator.identification.published.shefex import FOURTH_STAR, SearchOptions
 from estimator.identification.registry import IDENTIFIERS
 
 PLAIN = interpreted("estimator.identification.registry").IDENTIFIERS
-PYRAMID, SHEFEX, SAA, DIRECT = (
+PYRAMID, SHEFEX, SAA, SEARCH, DIRECT = (
     interpreted(f"estimator.identification.{name}")
-    for name in ("published.pyramid", "published.shefex", "published.saa", "direct_match")
+    for name in (
+        "published.pyramid",
+        "published.shefex",
+        "published.saa",
+        "published.saa_search",
+        "direct_match",
+    )
 )
 TOLERANCE_RAD = 1e-4
+EDGES = (-0.05, 0.08, -0.07, 0.06)  # tangents of a field off its center
 CAP_RAD, FIELD_RAD, MAX_ANGLE_RAD = 0.3, 0.12, 0.24
 
 
@@ -76,9 +83,6 @@ def test_no_method_takes_a_mirror_image(name: str) -> None:
     rays, magnitude, _, index, _ = field(0)
     match = PLAIN[name](rays * [-1, 1, 1], index, TOLERANCE_RAD, magnitude=magnitude, epsilon_mag=0.1)
     assert match is None
-
-
-EDGES = (-0.05, 0.08, -0.07, 0.06)  # tangents of a field off its center
 
 
 @pytest.mark.parametrize("name", ["pyramid", "saa"])
@@ -155,6 +159,63 @@ def test_a_triangle_s_sides_must_agree_on_one_focal_length(
     assert tried[1] == hypotheses
 
 
+@pytest.mark.parametrize(("share", "hypotheses"), [(0.9, 1), (1.1, 0)])
+@pytest.mark.parametrize("side", range(3))
+@pytest.mark.parametrize("unknown", [False, True])
+def test_a_side_may_be_off_by_both_directions_errors_and_its_stretch(
+    unknown: bool, side: int, share: float, hypotheses: int
+) -> None:
+    """sqrt(2) tolerances beyond the stretch; a third of the stretch after one factor for the whole perimeter."""
+    sides, tolerance, stretch = np.array([0.1, 0.12, 0.14]), 1e-4, 0.002
+    part = 1 - sides[side] / sides.sum() if unknown else 1.0  # of a side's error that the perimeter's factor leaves
+    own_stretch = (stretch / 3 if unknown else stretch) * sides[side]
+    longer = sides + np.eye(3)[side] * (share * np.sqrt(2) * tolerance + own_stretch) / part
+    index = pair_index.build(triangle(longer), 0.2)
+    options, tried = pyramid.SearchOptions(tolerance, stretch, unknown, 10, 1000, 3, 0.0, *EDGES), np.zeros(3, np.int64)
+    PYRAMID._triangle(triangle(sides), index, np.arange(3), options, tried)
+    assert tried[1] == hypotheses
+
+
+def test_a_fourth_star_has_its_angles_to_all_three_corners() -> None:
+    """Beyond the three corners' tries, the direct match's effort shows that a fourth star was taken."""
+    rng, tolerance, taken = np.random.default_rng(8), 1e-4, 0
+    corners = unit(np.array([[0.1, 0.02, 1], [-0.06, 0.08, 1], [-0.03, -0.09, 1]]))
+    options = pyramid.SearchOptions(tolerance, 0.0, False, 10, 1000, 4, 0.0, *EDGES)
+    for _ in range(100):
+        fourth = unit(np.array([[0.03, 0.05, 1]]))
+        moved = unit(fourth + rng.normal(0, 1.5 * tolerance, 3))
+        rays, index = np.vstack([corners, fourth]), pair_index.build(np.vstack([corners, moved]), 0.4)
+        errors = np.abs(np.arccos(corners @ fourth[0]) - np.arccos(corners @ moved[0]))
+        tried = np.array([0, 1, 0])
+        PYRAMID._pyramid(rays, index, np.arange(3), np.arange(3), options, 0.0, tried)
+        fits = errors.max() <= np.sqrt(2) * tolerance
+        assert tried[2] == 4 + fits * 4 * 3  # four tries; four rays against the corner's three neighbors
+        taken += fits
+    assert 20 < taken < 80
+
+
+@pytest.mark.parametrize("name", ["pyramid", "shefex"])
+def test_as_many_triangles_are_tried_as_allowed(name: str) -> None:
+    """The first three of four triangles have a false star; the first that has none is the last in order."""
+    stars = unit(np.array([[-0.1, -0.02, 1], [0.06, 0.07, 1], [0.09, -0.08, 1], [-0.05, 0.06, 1], [0.01, 0.03, 1]]))
+    false = unit(np.array([[0.04, -0.05, 1]]))
+    index, seen = pair_index.build(stars, 0.4), np.vstack([false, stars])
+    limits = {"base_stars": 6, "max_checks": 10**6}
+    least = next(n for n in range(1, 21) if PLAIN[name](seen, index, 1e-5, max_triangles=n, **limits) is not None)
+    # Six stars in the order of pyramid: (0 1 2) (1 2 3); of shefex: ten triangles with the false star first.
+    assert least == {"pyramid": 2, "shefex": 11}[name]
+
+
+def test_a_pyramid_s_chance_counts_the_hypotheses_tried() -> None:
+    rays, _, rows, index, _ = field(4)
+    options, tried = pyramid.SearchOptions(TOLERANCE_RAD, 0.0, False, 10, 10**6, 12, 0.0, *EDGES), np.array([0, 40, 0])
+    match = PYRAMID._triangle(rays, index, np.arange(3), options, tried)
+    np.testing.assert_array_equal(match.star, rows[match.observed])
+    assert tried[1] >= 41
+    once = DIRECT.match_field(rays, index, np.arange(3), rows[:3], TOLERANCE_RAD, 0.0, 1)
+    assert match.log10_chance - once.log10_chance == pytest.approx(np.log10(tried[1]), abs=1e-9)
+
+
 # ---- the areas of gates -----------------------------------------------------------------------------------------------
 
 
@@ -207,6 +268,37 @@ def test_a_star_and_its_mirror_image_in_the_base_are_on_different_sides() -> Non
         corners = np.arange(3)
         assert SHEFEX._same_side(rays, index, corners, corners, 3, 3)
         assert not SHEFEX._same_side(rays, index, corners, corners, 3, 4)
+
+
+def test_shefex_takes_the_star_whose_three_angles_fit_best() -> None:
+    """Among many stars and with wide gates, by all of them: angles, side of the base, least sum of differences."""
+    rng, found = np.random.default_rng(9), 0
+    for _ in range(20):
+        rays, strays = cap(rng, 4, 0.15), cap(rng, 300, 0.17)
+        index = pair_index.build(np.vstack([rays[:3], strays]), 0.4)
+        gates = SHEFEX._angle_gates(rays, np.arange(3), SearchOptions(1e-3, 1e-6, 1, 1, 4))
+        cosines, tried = rays[:3] @ index.vectors.T, np.zeros(3, np.int64)
+        angles = np.arccos(np.clip(cosines, -1, 1))
+        fits = ((angles >= gates[3, :3, None]) & (angles <= gates[3, 3:6, None])).all(axis=0)
+        volumes = [np.linalg.det(rays[[m, (m + 1) % 3, 3]]) for m in range(3)]
+        far = int(np.argmax(np.abs(volumes)))
+        fits &= index.vectors @ np.cross(rays[far], rays[(far + 1) % 3]) * volumes[far] > 0
+        fits[:3] = False
+        difference = np.where(fits, np.abs(cosines - (rays[:3] @ rays[3])[:, None]).sum(axis=0), np.inf)
+        wanted = int(np.argmin(difference)) if fits.any() else -1
+        assert SHEFEX._partner(rays, index, np.arange(3), np.arange(3), 3, gates[3], tried) == wanted
+        found += np.count_nonzero(fits) > 1
+    assert found > 5
+
+
+def test_four_stars_are_the_least_of_shefex_s_match() -> None:
+    """The paper's own rule takes any fourth star."""
+    rays, _, rows, index, _ = field(2)
+    options = SearchOptions(2e-6, TOLERANCE_RAD, 10, 10**6, 12, accept=FOURTH_STAR)
+    match = SHEFEX.search(rays[:4], index, options._replace(base=4), np.zeros(3, np.int64))
+    np.testing.assert_array_equal(match.star, rows[:4])
+    strays = np.vstack([rays[:3], unit(np.array([[0.012, 0.034, 1.0]]))])
+    assert len(SHEFEX.search(strays, index, options._replace(base=4), np.zeros(3, np.int64)).star) == 0
 
 
 # ---- SAA ----------------------------------------------------------------------------------------------------------------
@@ -272,3 +364,56 @@ def test_saa_s_chance_is_that_of_the_stars_within_its_reach() -> None:
     p, missing = SAA._chance_statistics(stars, primary, np.array([0, 1, 2, -1]), (-0.3, 0.08, -0.1, 0.07))
     assert p == pytest.approx(np.mean(-np.expm1(-similar * share)), rel=1e-9)
     assert missing == np.count_nonzero(in_field) - 3
+
+
+@pytest.mark.parametrize("base", [5, 9])
+def test_saa_tries_every_pair_that_gives_the_roll_the_brightest_first(base: int) -> None:
+    rays = cap(np.random.default_rng(10), 9, 0.01)
+    gates = Gates(SEPARATION_RAD, 1e-3, np.inf, 0.0)
+    unknown, max_rad = np.full(9, np.nan), 0.012
+    pairs = list(SAA._primary_pairs(SearchInput(rays, unknown, rays, unknown, None, gates), base, max_rad))
+    angle = np.arccos(np.clip(rays @ rays.T, -1, 1))
+    fitting = (angle > 12 * SEPARATION_RAD) & (angle <= max_rad + 3 * SEPARATION_RAD)
+    wanted = {(a, b) for a, b in np.argwhere(fitting) if a < b < base}
+    assert 0 < len(wanted) < base * (base - 1) // 2
+    assert {(a, b) for a, b, _ in pairs} == wanted
+    assert len(pairs) == len(wanted)
+    assert (np.diff([a + b for a, b, _ in pairs]) >= 0).all()
+    np.testing.assert_allclose([size for _, _, size in pairs], [angle[a, b] for a, b, _ in pairs], rtol=1e-6)
+
+
+def test_saa_s_partner_meets_the_four_conditions_at_the_least_cost() -> None:
+    """Needelman's: magnitude, position, and the angles to A and to B; by all stars of a crowded field."""
+    rng, gates = np.random.default_rng(11), Gates(2e-3, 3e-3, 0.3, 0.0)
+    several = 0
+    for _ in range(20):
+        seen, crowd = cap(rng, 5, 0.1), cap(rng, 300, 0.12)
+        index = pair_index.build(np.vstack([seen[[0, 2]], crowd]), 0.3)
+        magnitude = np.concatenate([[1, 1], rng.uniform(0, 3, 300)])
+        seen_mag = np.array([1, 1.5, 1, 1.5, np.nan])
+        stars = SearchInput(seen, seen_mag, index.vectors, magnitude, index.cells, gates)
+        primary, nearby = SAA.build_primary(stars, 0, 2), np.empty(302, np.int64)
+        partner, cost = np.empty(3, np.int64), np.empty(3)
+        SEARCH._partners(stars, primary, 0, 1, nearby, partner, cost)
+        for k, n in enumerate((1, 3, 4)):
+            distance = np.linalg.norm(index.vectors - seen[n], axis=1)  # the reference's axes are the camera's
+            off = np.arccos(index.vectors @ seen[[0, 2]].T) - np.arccos(seen[n] @ seen[[0, 2]].T)
+            unlike = np.nan_to_num((magnitude - seen_mag[n]) / 0.3)
+            fits = (np.abs(unlike) <= 3) & (2 * np.arcsin(distance / 2) <= primary.radius_rad[k])
+            fits &= (np.abs(off) <= 6e-3).all(axis=1) & (np.arange(302) > 1)
+            own_cost = unlike**2 + np.sum(off**2, axis=1) / 2e-3**2
+            total = np.where(fits, own_cost + (distance / primary.sigma_rad[k]) ** 2, np.inf)
+            best = int(total.argmin()) if fits.any() else -1
+            assert partner[k] == best
+            assert cost[k] == pytest.approx(own_cost[best] if best >= 0 else UNMATCHED_COST, rel=1e-6)
+            several += np.count_nonzero(fits) > 1
+    assert several > 15
+
+
+def test_two_stars_of_one_partner_leave_it_to_the_cheaper() -> None:
+    for costs, kept in (([1.0, 2.0], 0), ([2.0, 1.0], 2)):
+        partner, cost = np.array([7, 3, 7, -1]), np.array([costs[0], 5.0, costs[1], UNMATCHED_COST])
+        assert SEARCH._remove_duplicates(partner, cost) == 2
+        assert partner.tolist() == [7 if kept == 0 else -1, 3, 7 if kept == 2 else -1, -1]
+        assert cost[2 - kept] == UNMATCHED_COST
+        assert cost[kept] == 1
