@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from interpreted import interpreted
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -249,3 +250,32 @@ def test_the_covariance_holds_a_lever_s_error():
         nees.append(error[:2] @ np.linalg.inv(answer.covariance_rad2[:2, :2]) @ error[:2])
     # Chi-square of two: mean 2, deviation sqrt(4 / 60).
     assert np.mean(nees) == pytest.approx(2, abs=3 * np.sqrt(4 / 60))
+
+
+# ---- steps of the search, by the interpreter ---------------------------------------------------------------------------
+
+PLAIN = interpreted("estimator.identification.leds.search")
+
+
+def test_an_led_near_a_direction_is_found_as_by_brute_force() -> None:
+    """Directions over the dome and beyond its rim, gates from a tenth of a grid's cell to three cells."""
+    dome = build_dome_index(spread(150, OVAL, seed=1), LEVER, CAMERA)
+    rng, found = np.random.default_rng(2), 0
+    for _ in range(500):
+        x, y = rng.uniform(-0.8, 0.8, 2)
+        direction, gate = np.array([x, y, np.sqrt(max(1 - x * x - y * y, 0.0))]), dome.grid.cell * rng.uniform(0.1, 3)
+        near = np.linalg.norm(dome.grid.direction - direction, axis=1).min() < gate
+        assert PLAIN._has_led_near(dome.grid, tuple(direction), gate) == near
+        found += near
+    assert 100 < found < 400
+
+
+def test_a_ray_meets_the_sphere_of_an_led_s_radius() -> None:
+    """From the pupil along the ray: the point is `radius_m` from the bearing, and its direction is returned."""
+    dome = build_dome_index(spread(60, OVAL, seed=1), LEVER, CAMERA)
+    for ray in CAMERA.rays(np.array([[0.0, 0.0], [1599.0, 300.0], [799.5, 599.5]])):
+        for radius_m in (0.9, 1.3):
+            point_m = radius_m * np.array(PLAIN._direction_from_bearing(ray, dome, radius_m))
+            assert np.linalg.norm(point_m) == pytest.approx(radius_m, rel=1e-14)
+            seen = point_m - dome.pupil_m
+            np.testing.assert_allclose(seen / np.linalg.norm(seen), ray, rtol=0, atol=1e-14)
