@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from interpreted import interpreted
 from scipy import ndimage, stats
 from scipy.special import erf
 
@@ -262,3 +263,30 @@ def test_streaks_too_faint_to_be_seen_are_found_by_their_direction() -> None:
 def test_noise_alone_has_no_direction() -> None:
     frames = np.random.default_rng(32).normal(100, 10, (20, 300, 300))
     assert sum(len(detect.default(frame)) for frame in frames) <= 2
+
+
+def test_the_fit_s_model_is_the_integral_of_a_moving_gaussian() -> None:
+    """Flux and brightness of a line of light, summed over a fine lattice of its way; slopes by central differences."""
+    plain = interpreted("estimator.centroiding.streak_fit")
+    y, x = (grid.ravel().astype(float) for grid in np.mgrid[:31, :41])
+    p = np.array([20.3, 14.8, 500.0, 9.0, 0.4, 0.8, 7.0])
+
+    def model(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rows, weight = np.ones((8, x.size)), np.empty(x.size)
+        plain._rows(np.vstack([x, y, np.zeros(x.size)]), 3.0, 2.0, at, rows, weight)
+        np.testing.assert_allclose(weight, 1 / (9 + (-rows[7] - at[plain.SKY]) / 2), rtol=1e-9)
+        return -rows[7], rows  # the pixels are zero: the residual is minus the model
+
+    light, rows = model(p)
+    assert (light - 7).sum() == pytest.approx(500, rel=1e-6)
+    t = (np.arange(2000) + 0.5) / 2000 - 0.5
+    way = p[:2] + 9.0 * t[:, None] * [np.cos(0.4), np.sin(0.4)]
+    distance2 = (x[:, None] - way[:, 0]) ** 2 + (y[:, None] - way[:, 1]) ** 2
+    drawn = 500 * np.mean(np.exp(-distance2 / 2 / 0.8**2), axis=1) / (2 * np.pi * 0.8**2)
+    np.testing.assert_allclose(light - 7, drawn, rtol=0, atol=1e-4 * drawn.max())
+    for n in range(7):
+        step = np.zeros(7)
+        step[n] = 1e-5
+        slope = (model(p + step)[0] - model(p - step)[0]) / 2e-5
+        # Beyond five widths from an end the integral is cut off, at 3e-7 of the light.
+        np.testing.assert_allclose(rows[n], slope, rtol=0, atol=1e-4 * np.abs(slope).max())
