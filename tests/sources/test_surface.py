@@ -566,3 +566,15 @@ def test_points_that_tell_no_smooth_dome_are_refused(tmp_path: Path) -> None:
 def test_every_kind_of_part_has_its_surface() -> None:
     assert set(light.SURFACE_CONFIGS) == set(SURFACES)
     assert all(part.model_fields["kind"].annotation.__args__ == (kind,) for kind, part in light.SURFACE_CONFIGS.items())
+
+
+@pytest.mark.parametrize(("rim_deg", "mean_z"), [(None, 1 / 2), (80.0, (1 + np.cos(np.radians(80))) / 2), (40.0, None)])
+def test_samples_are_even_over_the_solid_angle_down_to_the_rim_or_the_horizon(
+    rim_deg: float | None, mean_z: float | None
+) -> None:
+    """On a sphere about the bearing; z is then uniform, from the lowest direction's to 1 (Archimedes)."""
+    ball = {"kind": "sphere", "apex": "1 m", "radius": "1 m"}
+    z = made(ball, **({} if rim_deg is None else {"rim_deg": rim_deg})).samples_m()[:, 2]
+    wanted = (1 + np.cos(np.radians(40))) / 2 if mean_z is None else mean_z
+    assert z.mean() == pytest.approx(wanted, abs=1e-9)
+    assert np.var(z) == pytest.approx((2 * (1 - wanted)) ** 2 / 12, rel=1e-3)  # of 60 rings
