@@ -249,3 +249,24 @@ def test_doubles_within_a_disk_are_one_led_of_their_light() -> None:
     assert cKDTree(wide.place[:, :3]).query(wide.place[:, :3], k=2)[0][:, 1].min() > 2e-3 * (1 - 1e-6)
     lights = [np.sum(10 ** (-0.4 * leds.magnitude)) for leds in (wide, fine)]
     assert lights[0] == pytest.approx(lights[1], rel=1e-12)
+
+
+# The steps, on a few sites
+
+
+def test_a_contracted_layout_covers_a_fraction_of_each_led_s_solid_angle() -> None:
+    """1 - z is scaled by the fraction, the azimuth is kept: to the spacing of the sites, 5 mm."""
+    sites_m, layout_m = (spread("fibonacci", count, 30.0).place[:, :3] for count in (40_000, 50))
+    for fraction in (1.0, 0.5):
+        placed = optimize.contract(layout_m, sites_m, fraction)
+        wanted, found = (place / np.linalg.norm(place, axis=1, keepdims=True) for place in (layout_m, placed))
+        np.testing.assert_allclose(1 - found[:, 2], fraction * (1 - wanted[:, 2]), rtol=0, atol=3e-3)
+        across = wanted[:, 0] * found[:, 1] - wanted[:, 1] * found[:, 0]
+        np.testing.assert_allclose(across, 0, rtol=0, atol=3e-3)
+        assert cKDTree(sites_m).query(placed)[0].max() == 0
+
+
+def test_the_spacing_is_the_least_distance_of_two_leds() -> None:
+    place_m = np.array([[0.0, 0, 1], [0.03, 0, 1], [0.03, 0.02, 1]])
+    assert optimize.spacing_ok(place_m, 0.0199)
+    assert not optimize.spacing_ok(place_m, 0.0201)
