@@ -80,3 +80,17 @@ def test_counts_and_the_numbers_that_follow_are_independent() -> None:
 def test_a_seed_is_a_stream() -> None:
     np.testing.assert_array_equal(drawn_normals(5), drawn_normals(5))
     assert np.mean(drawn_normals(5) == drawn_normals(6)) < 1e-3
+
+
+def test_a_guide_is_certain_exactly_where_every_mean_of_its_row_gives_one_count() -> None:
+    """n is certain where F(n - 1) of the least mean is below the bucket, and F(n) of the greatest mean above it."""
+    guide, bucket = noise.tables().guide, np.arange(noise.BUCKETS) / noise.BUCKETS
+    counts = np.arange(80)
+    for k in (0, 1, 37, 128, 500, 1777, len(guide) - 1):
+        low, high = k / noise.GUIDES_PER_E, (k + 1) / noise.GUIDES_PER_E
+        below = stats.poisson.cdf(counts - 1, low)[:, None] <= bucket + 1e-12
+        above = stats.poisson.cdf(counts, high)[:, None] >= bucket + 1 / noise.BUCKETS - 1e-12
+        certain = below & above
+        assert certain.sum(axis=0).max() == 1
+        wanted = np.where(certain.any(axis=0), certain.argmax(axis=0), noise.AMBIGUOUS)
+        np.testing.assert_array_equal(guide[k], wanted)
