@@ -266,6 +266,41 @@ def test_the_lab_s_camera_has_all_of_the_dome_and_of_the_vehicle_in_view(surface
     assert np.ptp(seen, axis=0).max() > 0.5 * SIZE_PX[1]
 
 
+def test_the_viewer_starts_where_the_lab_s_camera_looks() -> None:
+    """MuJoCo's free camera looks along (cos el cos az, cos el sin az, sin el), its own cameras along -z."""
+    scene, vehicle, sources = dome_lab()
+    star_scene, star_vehicle, stars, lab_from_body = star_lab()
+    for text in (
+        mjcf_export.mjcf(vehicle, scene, sources, LEVEL),
+        mjcf_export.mjcf(star_vehicle, star_scene, stars, lab_from_body),
+    ):
+        model, data = loaded(text)
+        azimuth, elevation = np.radians([model.vis.global_.azimuth, model.vis.global_.elevation])
+        ring = np.cos(elevation)
+        forward = [ring * np.cos(azimuth), ring * np.sin(azimuth), np.sin(elevation)]
+        camera = data.camera("lab")
+        np.testing.assert_allclose(forward, -camera.xmat.reshape(3, 3)[:, 2], rtol=0, atol=1e-6)
+        sight = model.stat.center - camera.xpos
+        np.testing.assert_allclose(sight / np.linalg.norm(sight), forward, rtol=0, atol=1e-6)
+
+
+def test_the_edges_of_the_camera_s_field_are_thin_lines_along_it() -> None:
+    """Each ray from the camera to a corner, and each edge between corners: under a hundredth of its length thick."""
+    scene, vehicle, sources = dome_lab()
+    model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
+    tip_m = multibody.camera_mount(vehicle).camera_body_m
+    corner_m = vertices_m(model, data, "stage_field")
+    corner_m = corner_m[np.linalg.norm(corner_m - tip_m, axis=1) > 0.1]
+    ends = [(data.geom(f"stage_ray_{k}"), model.geom(f"stage_ray_{k}").size) for k in range(4)]
+    for ray, (radius, half_m, _) in ends:
+        middle, along = ray.xpos, ray.xmat.reshape(3, 3)[:, 2]
+        reached = np.array([middle + half_m * along, middle - half_m * along])
+        assert np.linalg.norm(reached - tip_m, axis=1).min() < 1e-6
+        corners_off_m = np.linalg.norm(reached[:, None] - corner_m, axis=2)
+        assert corners_off_m.min() < 1e-5  # vertices are rounded to a micrometer
+        assert 0 < radius < 0.01 * half_m
+
+
 # Pictures
 
 SIZE_PX = (640, 480)
