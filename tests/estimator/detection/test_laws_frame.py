@@ -384,3 +384,25 @@ def test_right_ascension_declination_and_roll_are_the_attitude(rng: np.random.Ge
     assert (built * truth.inv()).magnitude() < 1e-9
     np.testing.assert_array_equal(Attitude("solved", truth).ra_dec_roll_deg, np.degrees([ra, dec, roll]))
     assert np.isnan(Attitude("lost").ra_dec_roll_deg).all()
+
+
+BLEMISHES = {  # flags, a bad pixel, and the variance added
+    "none": (0, [30, 30], 0.0),
+    "saturated": (int(Flag.SATURATED), [30, 30], pipeline.SATURATED_SIGMA_PX**2),
+    "bad pixel beside it": (0, [9, 13], pipeline.BAD_PIXEL_SIGMA_PX**2),
+    "bad pixel two away": (0, [8, 11], 0.0),
+    "both": (int(Flag.SATURATED), [11, 11], pipeline.SATURATED_SIGMA_PX**2 + pipeline.BAD_PIXEL_SIGMA_PX**2),
+}
+
+
+@pytest.mark.parametrize(("flag", "bad_px", "variance"), BLEMISHES.values(), ids=BLEMISHES)
+def test_a_blemish_adds_the_same_variance_in_every_direction(flag: int, bad_px: list[int], variance: float) -> None:
+    """A saturated center and a bad pixel are independent errors; the ellipse of the rest keeps its axes."""
+    one = np.ones(1)
+    blob = Blobs(np.array([[10, 10, 12, 12]]), np.array([[11.0, 11.0]]), one, one, one, None, np.array([flag]))
+    ellipse = np.array([[[4e-4, 1e-4], [1e-4, 2e-4]]])
+    lights = Centroids(np.array([[11.0, 11.0]]), np.array([0.02]), np.array([99.0]), ellipse)
+    settings = Settings(bad_px=np.array([bad_px, [40, 40]]))
+    found = pipeline.inflate_uncertainty(lights, blob, settings)
+    np.testing.assert_allclose(found.covariance_px2, ellipse + variance * np.eye(2), rtol=1e-12)
+    assert found.sigma_px[0] == pytest.approx(np.hypot(0.02, np.sqrt(variance)), rel=1e-12)
