@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from estimator.core.camera import Camera, check_shape
+from estimator.core.camera import Camera, check_shape, distorted, undistorted
 from estimator.core.errors import ImageError
 
 LENS = (-0.12, 0.05, 0.001, -0.002, -0.01)
@@ -76,6 +76,21 @@ def test_rays_and_pixels_are_each_other_s_inverse(lens: tuple[float, ...]) -> No
     np.testing.assert_allclose(camera.pixels(rays), pixels, rtol=0, atol=2000 * 1e-12)
     np.testing.assert_allclose(camera.rays(camera.pixels(rays)), rays, rtol=0, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1, rtol=0, atol=1e-15)
+
+
+def test_without_distortion_tangents_are_linear_however_far_off() -> None:
+    """Also where the square of a tangent overflows, so that a distortion of zero would give NaN."""
+    xy_px = np.array([[10.0, 20.0], [1e200, -1e200], [810.5, 590.25]])
+    found = undistorted(xy_px, 2000.0, 810.5, 590.25, (0.0, 0.0, 0.0, 0.0, 0.0))
+    np.testing.assert_allclose(found, (xy_px - [810.5, 590.25]) / 2000, rtol=1e-15)
+
+
+@pytest.mark.parametrize("coefficient", range(5))
+def test_each_coefficient_alone_is_undone(coefficient: int) -> None:
+    lens = tuple(0.05 * (n == coefficient) for n in range(5))
+    tangent = np.array([[0.2, -0.1], [-0.3, 0.25], [0.0, 0.1]])
+    xy_px = 2000 * distorted(tangent, lens) + [810.5, 590.25]
+    np.testing.assert_allclose(undistorted(xy_px, 2000.0, 810.5, 590.25, lens), tangent, rtol=0, atol=1e-14)
 
 
 def test_the_field_is_the_angle_between_the_edge_columns_middles() -> None:
