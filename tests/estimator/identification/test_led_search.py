@@ -252,7 +252,7 @@ def test_the_covariance_holds_a_lever_s_error():
     assert np.mean(nees) == pytest.approx(2, abs=3 * np.sqrt(4 / 60))
 
 
-# ---- steps of the search, by the interpreter ---------------------------------------------------------------------------
+# ---- steps of the search, by the interpreter
 
 PLAIN = interpreted("estimator.identification.leds.search")
 

@@ -216,7 +216,7 @@ def test_a_pyramid_s_chance_counts_the_hypotheses_tried() -> None:
     assert match.log10_chance - once.log10_chance == pytest.approx(np.log10(tried[1]), abs=1e-9)
 
 
-# ---- the areas of gates -----------------------------------------------------------------------------------------------
+# ---- the areas of gates
 
 
 def crossing_area_sr(center: Floats, rings: list[tuple[Floats, float]], step: float = 2e-5) -> float:
@@ -301,7 +301,7 @@ def test_four_stars_are_the_least_of_shefex_s_match() -> None:
     assert len(SHEFEX.search(strays, index, options._replace(base=4), np.zeros(3, np.int64)).star) == 0
 
 
-# ---- SAA ----------------------------------------------------------------------------------------------------------------
+# ---- SAA
 
 SEPARATION_RAD, POSITION_RAD, STRETCH = 1e-4, 1e-2, 1e-4
 FIVE = unit(np.array([[0.1, 0.02, 1], [-0.06, 0.08, 1], [-0.03, -0.09, 1], [0.02, 0.03, 1], [0.15, -0.12, 1]]))
