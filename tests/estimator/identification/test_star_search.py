@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from interpreted import interpreted
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -238,3 +239,126 @@ def test_a_matrix_is_its_quaternion(seed: int, axis) -> None:
     rotation = Rotation.random(rng=seed) if axis is None else Rotation.from_rotvec(np.pi * np.array(axis))
     again = Rotation.from_quat(quaternion_xyzw(rotation.as_matrix()))
     assert (again * rotation.inv()).magnitude() < 1e-14 * 10
+
+
+# ---- steps of the search, by the interpreter
+
+PLAIN = interpreted("estimator.identification.stars.search")
+PLACES = np.array([[0.01, 0.02], [-0.05, 0.03], [0.06, -0.04], [-0.02, -0.06], [0.03, 0.0], [0.012, 0.018]])
+UNEQUAL = np.array([1, 2, 3, 1.5, 1, 1]) * SIGMA
+
+
+def unequal(zoom: float = 0.0) -> evidence.Detections:
+    """Six detections of magnitudes 3, 4, ..., the last one's unknown, of unequal errors."""
+    mag = np.array([3.0, 4.0, 5.0, 5.5, 6.0, np.nan])
+    return detections_of(PLACES, mag, zoom=zoom)._replace(sigma=UNEQUAL)
+
+
+def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
+    """3.5 standard deviations along the worst axis: the pair's middle and direction are fitted, all have noise."""
+    rng, a, b = np.random.default_rng(80), 0, 4  # of equal errors: others' are correlated with the middle's
+    seen = PLACES[:, 0] + 1j * PLACES[:, 1]
+    noisy = seen + UNEQUAL * (rng.standard_normal((20_000, 6)) + 1j * rng.standard_normal((20_000, 6)))
+    turn = (
+        (noisy[:, b] - noisy[:, a]) / np.abs(noisy[:, b] - noisy[:, a]) / (seen[b] - seen[a]) * abs(seen[b] - seen[a])
+    )
+    middle = (noisy[:, [a]] + noisy[:, [b]]) / 2
+    errors = middle + turn[:, None] * (seen - (seen[a] + seen[b]) / 2) - noisy
+    gates = PLAIN._pair_gates(unequal(), a, b)
+    for n in (1, 2, 3):
+        worst2 = np.linalg.eigvalsh(np.cov(errors[:, n].real, errors[:, n].imag)).max()
+        assert gates[n] == pytest.approx(3.5 * np.sqrt(worst2), rel=0.02)  # 4 deviations of a variance of 20,000
+
+
+@pytest.mark.parametrize("zoom", [0.0, 0.02])
+def test_every_catalog_pair_that_two_detections_may_be_is_in_their_range(zoom: float) -> None:
+    """Angles within 3.5 errors of a separation, or of any that the focal length allows; few others."""
+    one, other = VECTORS[SKY.pair].transpose(1, 0, 2)
+    angle = np.arctan2(np.linalg.norm(np.cross(one, other), axis=1), np.sum(one * other, axis=1))
+    for a, b in ((0, 1), (1, 2), (2, 3)):
+        begin, end, chord, gate = PLAIN._pair_range(unequal(zoom), SKY, a, b)
+        rays = np.column_stack([PLACES[[a, b]], np.ones(2)])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        seen = np.arccos(rays[0] @ rays[1])
+        assert chord == pytest.approx(2 * np.sin(seen / 2), rel=1e-9)
+        assert gate == pytest.approx(3.5 * np.hypot(UNEQUAL[a], UNEQUAL[b]), rel=1e-9)
+        possible = np.flatnonzero((angle > seen / (1 + zoom) - gate) & (angle < seen / (1 - zoom) + gate))
+        assert begin <= possible.min()
+        assert possible.max() < end
+        outside = angle[begin:end] - np.clip(angle[begin:end], seen / (1 + zoom) - gate, seen / (1 - zoom) + gate)
+        assert np.abs(outside).max() <= SKY.bin_rad
+
+
+def test_a_pair_s_focal_ratio_makes_its_angle_the_catalog_s() -> None:
+    for ratio in (0.97, 1.0, 1.03):
+        target = PLAIN.vectors.chord(PLAIN.ray(PLACES, 1, ratio), PLAIN.ray(PLACES, 2, ratio))
+        seen = PLAIN.vectors.chord(PLAIN.ray(PLACES, 1, 1.0), PLAIN.ray(PLACES, 2, 1.0))
+        # The fixed point contracts by about the square of a tangent, 5e-3, each time.
+        assert PLAIN._fit_focal_ratio(PLACES, 1, 2, seen, target) == pytest.approx(ratio, abs=1e-6)
+
+
+def test_pairs_come_by_length_and_rarity_and_none_twice() -> None:
+    detections = unequal()
+    length, rarity = PLAIN._pair_lengths(detections), PLAIN._rarity(detections, SKY)
+    least = 0.2 * np.sqrt((FIELD[1] - FIELD[0]) * (FIELD[3] - FIELD[2]))
+    a, b = np.triu_indices(6, 1)
+    distance = np.linalg.norm(PLACES[a] - PLACES[b], axis=1)
+    np.testing.assert_allclose(length[a, b][distance >= least], distance[distance >= least], rtol=1e-12)
+    short = np.flatnonzero(distance < least)
+    assert len(short) > 1
+    assert (length[a, b][short] > 100 * least).all()
+    assert (np.argsort(length[a, b][short]) == np.argsort(-distance[short])).all()  # the shorter, the later
+    for n in range(5):  # within four deviations of the magnitude
+        share = np.mean(np.abs(MAG - detections.mag[n]) < 4 * 0.25)
+        assert rarity[n] == pytest.approx(share, rel=0.35)  # the density at the middle, over a range of two magnitudes
+    assert rarity[5] == 1
+    tried, costs = np.zeros((6, 6), bool), []
+    for _ in range(15):
+        pair = PLAIN._next_pair(length, tried, rarity)
+        assert not tried[pair]
+        tried[pair] = True
+        costs.append(length[pair] * rarity[pair[0]] * rarity[pair[1]])
+    assert (np.diff(costs) >= 0).all()
+
+
+@pytest.mark.parametrize("zoom", [0.0, 0.01])
+def test_a_pair_s_attitude_counts_as_laplace_s_integral(zoom: float) -> None:
+    """sqrt(2 pi)^n / sqrt(det info) over the prior volume, info that of two exact matches near the boresight."""
+    near = np.array([[0.01, 0.004], [-0.008, -0.002]])
+    detections = detections_of(near, [np.nan, np.nan], zoom=zoom)
+    rays = np.column_stack([near, np.ones(2)])
+    sky = sky_index.build_without_pairs(rays / np.linalg.norm(rays, axis=1, keepdims=True), np.array([1.0, 2.0]))
+    info, both = np.zeros((4, 4)), np.arange(2)
+    evidence._fit(detections, sky, np.eye(3), 1.0, both, both, info)
+    count = 4 if zoom else 3
+    volume = 8 * np.pi**2 * (2 * zoom if zoom else 1)
+    wanted = np.log10(np.sqrt(2 * np.pi) ** count / np.sqrt(np.linalg.det(info[:count, :count])) / volume)
+    assert PLAIN._attitude_dex(detections, 0, 1) == pytest.approx(wanted, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("true", "required", "max_misses", "lookups", "fits"),
+    [
+        ("TTTT", 6, 9, 4, True),
+        ("TTTT", 4, 9, 2, True),
+        ("FFTT", 4, 9, 4, True),
+        ("FFTT", 4, 2, 2, False),  # two misses at first
+        ("TFFT", 5, 9, 3, False),  # out of reach
+        ("FFFF", 3, 9, 4, False),
+    ],
+)
+def test_the_quick_check_stops_as_soon_as_it_knows(
+    true: str, required: int, max_misses: int, lookups: int, fits: bool
+) -> None:
+    """Four detections beside the pair, with (T) and without (F) a star at their place."""
+    places = np.vstack([PLACES[:2], [[0.03, 0.03], [-0.03, 0.01], [0.02, -0.05], [-0.06, -0.03]]])
+    rays = np.column_stack([places, np.ones(6)])
+    there = [0, 1] + [2 + n for n, letter in enumerate(true) if letter == "T"]
+    sky = sky_index.build_without_pairs(
+        (rays / np.linalg.norm(rays, axis=1, keepdims=True))[there], np.ones(len(there))
+    )
+    order = PLAIN._other_detections(6, 0, 1)
+    assert order.tolist() == [2, 3, 4, 5]
+    tables = sky.vectors, sky.cell_first, sky.cell_star, sky.side
+    found = PLAIN._quick_check(places, *tables, np.eye(3), 1.0, np.full(6, 1e-4), order, required, max_misses)
+    assert found == (lookups, fits)
