@@ -279,3 +279,41 @@ def test_a_ray_meets_the_sphere_of_an_led_s_radius() -> None:
             assert np.linalg.norm(point_m) == pytest.approx(radius_m, rel=1e-14)
             seen = point_m - dome.pupil_m
             np.testing.assert_allclose(seen / np.linalg.norm(seen), ray, rtol=0, atol=1e-14)
+
+
+def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
+    """3.5 standard deviations along the worst axis, as an angle about the bearing: (R - M) / R of the camera's."""
+    dome = build_dome_index(spread(60, OVAL, seed=1), LEVER, CAMERA)
+    sigma, rng, a, b = 1e-5, np.random.default_rng(3), 0, 2
+    places = np.array([[0.05, 0.02], [0.0, 0.03], [-0.04, 0.01], [0.07, -0.05]])
+    rays = np.column_stack([places, np.ones(4)])
+    detections = search.build_detections(rays / np.linalg.norm(rays, axis=1, keepdims=True), np.full(4, sigma), dome)
+    seen = places[:, 0] + 1j * places[:, 1]
+    noisy = seen + sigma * (rng.standard_normal((20_000, 4)) + 1j * rng.standard_normal((20_000, 4)))
+    turn = (
+        (noisy[:, b] - noisy[:, a]) / np.abs(noisy[:, b] - noisy[:, a]) / (seen[b] - seen[a]) * abs(seen[b] - seen[a])
+    )
+    middle = (noisy[:, [a]] + noisy[:, [b]]) / 2
+    errors = middle + turn[:, None] * (seen - (seen[a] + seen[b]) / 2) - noisy
+    gates = PLAIN._pair_gates(detections._replace(sigma=np.full(4, sigma)), dome, a, b)
+    ratio = 1 - np.linalg.norm(LEVER.camera_body_m) / dome.median_radius_m
+    for n in (1, 3):
+        worst2 = np.linalg.eigvalsh(np.cov(errors[:, n].real, errors[:, n].imag)).max()
+        angle = gates[n] - dome.scaling_error_rad
+        assert angle == pytest.approx(3.5 * np.sqrt(worst2) * ratio, rel=0.02)  # 4 deviations of a variance
+
+
+@pytest.mark.parametrize(("dead", "required", "found"), [([], 4, 4), ([], 5, 5), ([4], 5, 4), ([2], 4, 4), ([2], 5, 2)])
+def test_the_quick_check_counts_until_it_knows(dead: list[int], required: int, found: int) -> None:
+    """Five exact detections; without the LEDs of some it ends where the rest cannot reach what is required."""
+    places = np.array([[0, 0], [0.03, 0.01], [-0.02, 0.03], [0.04, -0.03], [-0.05, -0.02]])
+    position_m = np.column_stack([places, np.full(5, 1.2192)])
+    camera, lever = Camera(1600, 1200, 8698.0, (799.5, 599.5)), Lever(np.array([0, 0, 0.381]), Rotation.identity())
+    leds = LedMap(np.arange(5), position_m, *FLAT)
+    whole = build_dome_index(leds, lever, camera)
+    kept = np.setdiff1d(np.arange(5), dead)
+    dome = build_dome_index(LedMap(kept, position_m[kept], *FLAT), lever, camera) if dead else whole
+    rays = camera.rays(project(Rotation.identity(), position_m, lever, camera))
+    detections = search.build_detections(rays, np.full(5, 1e-5), dome)
+    gates, R_grid_from_cam = np.full(5, 1e-4), dome.grid.R_grid_from_lab
+    assert PLAIN._quick_check(detections, dome, R_grid_from_cam, dome.median_radius_m, 0, 1, gates, required) == found
