@@ -184,12 +184,14 @@ def test_a_fourth_star_has_its_angles_to_all_three_corners() -> None:
     for _ in range(100):
         fourth = unit(np.array([[0.03, 0.05, 1]]))
         moved = unit(fourth + rng.normal(0, 1.5 * tolerance, 3))
-        rays, index = np.vstack([corners, fourth]), pair_index.build(np.vstack([corners, moved]), 0.4)
+        # As far from the first corner as the fourth star, in another direction.
+        decoy = Rotation.from_rotvec(corners[0]).apply(fourth)
+        rays, index = np.vstack([corners, fourth]), pair_index.build(np.vstack([corners, moved, decoy]), 0.4)
         errors = np.abs(np.arccos(corners @ fourth[0]) - np.arccos(corners @ moved[0]))
         tried = np.array([0, 1, 0])
         PYRAMID._pyramid(rays, index, np.arange(3), np.arange(3), options, 0.0, tried)
         fits = errors.max() <= np.sqrt(2) * tolerance
-        assert tried[2] == 4 + fits * 4 * 3  # four tries; four rays against the corner's three neighbors
+        assert tried[2] == 4 + fits * 4 * 4  # four tries; four rays against the corner's four neighbors
         taken += fits
     assert 20 < taken < 80
 
@@ -299,6 +301,12 @@ def test_four_stars_are_the_least_of_shefex_s_match() -> None:
     np.testing.assert_array_equal(match.star, rows[:4])
     strays = np.vstack([rays[:3], unit(np.array([[0.012, 0.034, 1.0]]))])
     assert len(SHEFEX.search(strays, index, options._replace(base=4), np.zeros(3, np.int64)).star) == 0
+    # Within wide gates of the angles, but 30 tolerances from its place.
+    moved, wide = (
+        unit(rays[:4] + np.outer([0, 0, 0, 1], [3e-4, 0, 0])),
+        options._replace(cos_error=1e-4, tolerance_rad=1e-5),
+    )
+    assert len(SHEFEX.search(moved, index, wide._replace(base=4), np.zeros(3, np.int64)).star) == 0
 
 
 # ---- SAA
