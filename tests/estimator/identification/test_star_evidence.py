@@ -7,6 +7,7 @@ import pytest
 from interpreted import interpreted
 from scipy.spatial.transform import Rotation
 from scipy.special import betaln
+from scipy.stats import norm
 
 from estimator.catalog import sky_index
 from estimator.identification.stars import evidence
@@ -114,6 +115,19 @@ def test_a_match_is_within_three_and_a_half_standard_deviations(sigmas: float, m
     detections.sigma[6], detections.weight[6, :2] = wide, wide**-2
     hypothesis = evidence.evaluate(detections, SKY, TRUTH.as_matrix(), 1.0, np.full(7, 0.01), -np.inf)
     assert len(hypothesis.star) == matched
+
+
+def test_the_magnitudes_density_is_that_of_the_smoothed_catalog() -> None:
+    """A normal law of the smoothing about each star's magnitude; below and above all stars, that of the end."""
+    rng = np.random.default_rng(2)
+    vectors, mag = rng.normal(size=(2000, 3)), np.sort(6 + 2 * np.log10(rng.uniform(1e-3, 1, 2000)))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    sky = sky_index.build_without_pairs(vectors, mag)
+    for value in (3.0, 4.0, 5.0, 5.5):
+        wanted = np.mean(norm.pdf(value, mag, sky_index.MAG_SMOOTHING))
+        assert evidence.magnitude_density(sky, value) == pytest.approx(wanted, rel=0.1)  # of bins of MAG_STEP
+    assert evidence.magnitude_density(sky, -9.0) == evidence.magnitude_density(sky, mag[0])
+    assert evidence.magnitude_density(sky, 30.0) == evidence.magnitude_density(sky, mag[-1] + 2)
 
 
 @pytest.mark.parametrize("star", [0, 20, 59])
