@@ -166,6 +166,8 @@ def test_stars_that_are_one_in_the_camera_or_one_in_the_catalog_are_refused(solv
         (np.eye(3), np.eye(3), np.array([1.0, np.nan, 1.0]), "sigma_rad is not usable"),
         (np.eye(3), np.eye(3), np.array([1.0, -1.0, 1.0]), "sigma_rad is not usable"),
         (np.diag([1.0, np.nan, 1.0]), np.eye(3), np.ones(3), "a direction is NaN"),
+        (np.diag([1.0, 1.02, 1.0]), np.eye(3), np.ones(3), "a direction is not of unit length"),
+        (np.eye(3), np.diag([1.0, 1.0, 0.98]), np.ones(3), "a direction is not of unit length"),
         (np.eye(3), np.eye(3)[:2], np.ones(3), r"shapes .* allowed: \(N, 3\)"),
         (np.eye(3), np.eye(3), np.ones(2), r"shapes .* allowed: \(N, 3\)"),
         (np.ones(3), np.ones(3), np.ones(3), r"shapes .* allowed: \(N, 3\)"),

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from interpreted import interpreted
 from scipy.spatial.transform import Rotation
+from scipy.special import betaln
 
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.core.arrays import Floats
@@ -102,3 +104,25 @@ def test_leds_are_matched_within_the_error_of_their_pair_s_direction(sigmas: flo
     hypothesis = evidence.evaluate(detections, dome, rolled, 0, 0, 1)
     assert len(hypothesis.star) == matched
     assert np.isfinite(hypothesis.dex) == (matched > 0)
+
+
+@pytest.mark.parametrize("dead", [[], [1], [1, 4], [0, 2, 5]])
+def test_dead_leds_cost_the_beta_function_of_the_counts(dead: list[int]) -> None:
+    """Against the same frame on a dome without these LEDs, by the interpreter; the rest are matched all the same."""
+    plain = interpreted("estimator.identification.leds.evidence")
+    place_m = np.column_stack([np.vstack([PLACES_M, [[0.02, 0.045], [0.06, 0.02]]]), np.full(8, 1.2192)])
+    kept = np.setdiff1d(np.arange(8), dead)
+    dex, surface = [], (np.zeros(3), np.array([np.inf, np.inf, 1.2192]))
+    rays = CAMERA.rays(project(Rotation.identity(), place_m[kept], LEVER, CAMERA))
+    for rows in (np.arange(8), kept):
+        dome = build_dome_index(LedMap(rows, place_m[rows], *surface), LEVER, CAMERA)
+        dome = dome._replace(prior_volume=1.0)
+        sigma = np.full(len(kept), 0.2 / CAMERA.focal_px)
+        detections = search.build_detections(rays, sigma, dome)._replace(sigma=sigma)
+        center = int(np.flatnonzero(rows == 3)[0])
+        hypothesis = plain.evaluate(detections, dome, np.eye(3), center, 0, len(kept) - 1)
+        assert sorted(hypothesis.observed) == list(range(len(kept)))
+        np.testing.assert_array_equal(rows[hypothesis.star], kept[hypothesis.observed])
+        dex.append(hypothesis.dex)
+    toll = (betaln(len(kept) + 1, len(dead) + 1) - betaln(len(kept) + 1, 1)) / np.log(10)
+    assert dex[0] - dex[1] == pytest.approx(toll, abs=1e-9)

@@ -16,17 +16,19 @@ from scipy.spatial.transform import Rotation
 from estimator.catalog import pair_index
 from estimator.catalog.catalog import unit
 from estimator.core.arrays import Floats
+from estimator.identification.options import Options
 from estimator.identification.published import pyramid
 from estimator.identification.published.saa_search import UNMATCHED_COST, Gates, Primary, SearchInput
 from estimator.identification.published.shefex import FOURTH_STAR, SearchOptions
 from estimator.identification.registry import IDENTIFIERS
 
 PLAIN = interpreted("estimator.identification.registry").IDENTIFIERS
-PYRAMID, SHEFEX, SAA, SEARCH, DIRECT = (
+PYRAMID, SHEFEX, FIALHO, SAA, SEARCH, DIRECT = (
     interpreted(f"estimator.identification.{name}")
     for name in (
         "published.pyramid",
         "published.shefex",
+        "published.fialho",
         "published.saa",
         "published.saa_search",
         "direct_match",
@@ -425,3 +427,27 @@ def test_two_stars_of_one_partner_leave_it_to_the_cheaper() -> None:
         assert partner.tolist() == [7 if kept == 0 else -1, 3, 7 if kept == 2 else -1, -1]
         assert cost[2 - kept] == UNMATCHED_COST
         assert cost[kept] == 1
+
+
+@pytest.mark.parametrize(("ratio", "accepted"), [(0.9e5, False), (1.1e5, True)])
+def test_saa_s_best_must_be_1e5_times_as_likely_as_what_contradicts_it(ratio: float, accepted: bool) -> None:
+    """A cost is a squared number of standard deviations: the likelihood is exp(-cost / 2)."""
+    rays, _, rows, index, _ = field(0)
+    unknown = np.full(len(rays), np.nan)
+    stars = SearchInput(rays, unknown, index.vectors, np.full(60, np.nan), index.cells, Gates(1e-4, 1e-4, np.inf, 0.0))
+    pool, primary = SAA.AssumptionPool(stars, (-1.0, 1.0, -1.0, 1.0), 0.0), SAA.build_primary(stars, 0, 1)
+    best, rival = rows.astype(np.int32), np.full(len(rows), -1, np.int32)
+    rival[:4] = np.roll(best[:4], 1)
+    costs = np.array([3.0, 3.0 + 2 * np.log(ratio)])
+    pool.add(primary, (np.array([best, rival]), costs, np.array([len(rows) - 2, 0])))
+    assert (pool.best_match() is not None) == accepted
+
+
+@pytest.mark.parametrize(("share", "matched"), [(0.5, False), (0.49, True)])
+def test_fialho_s_match_has_more_than_its_share_of_the_observed_stars(share: float, matched: bool) -> None:
+    """Of twice as many lights as there are stars, all stars match."""
+    rays, _, rows, index, _ = field(1)
+    strays = unit(rays + np.array([0.004, 0.003, 0]))  # 50 tolerances beside each star
+    options = FIALHO.search_options(TOLERANCE_RAD, Options(epsilon_mag=0.1), share, True, False)
+    match = FIALHO._direct_match(np.vstack([rays, strays]), index, np.arange(3), rows[:3], options, 1)
+    assert len(match.observed) == (len(rays) if matched else 0)

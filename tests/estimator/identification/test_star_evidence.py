@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from interpreted import interpreted
 from scipy.spatial.transform import Rotation
 from scipy.special import betaln
+from scipy.stats import norm
 
 from estimator.catalog import sky_index
 from estimator.identification.stars import evidence
@@ -103,3 +105,63 @@ def test_the_focal_length_is_measured_within_its_uncertainty(ratio: float) -> No
     solved = abs(ratio - 1) < 0.01
     assert hypothesis.star.tolist() == list(range(7) if solved else [])
     assert hypothesis.focal_ratio == pytest.approx(ratio if solved else 1.0, abs=1e-6)  # of two Gauss-Newton steps
+
+
+@pytest.mark.parametrize(("sigmas", "matched"), [(3.4, 7), (3.6, 6)])
+def test_a_match_is_within_three_and_a_half_standard_deviations(sigmas: float, matched: int) -> None:
+    """Of the fitted place. The seventh star's error ellipse is wide and weighs a hundredth in the fit."""
+    wide, detections = 10 * SIGMA, seen(TANGENT[:7])
+    detections.tangent[6] += sigmas * wide * np.array([0.6, 0.8])
+    detections.sigma[6], detections.weight[6, :2] = wide, wide**-2
+    hypothesis = evidence.evaluate(detections, SKY, TRUTH.as_matrix(), 1.0, np.full(7, 0.01), -np.inf)
+    assert len(hypothesis.star) == matched
+
+
+def test_the_magnitudes_density_is_that_of_the_smoothed_catalog() -> None:
+    """A normal law of the smoothing about each star's magnitude; below and above all stars, that of the end."""
+    rng = np.random.default_rng(2)
+    vectors, mag = rng.normal(size=(2000, 3)), np.sort(6 + 2 * np.log10(rng.uniform(1e-3, 1, 2000)))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    sky = sky_index.build_without_pairs(vectors, mag)
+    for value in (3.0, 4.0, 5.0, 5.5):
+        wanted = np.mean(norm.pdf(value, mag, sky_index.MAG_SMOOTHING))
+        assert evidence.magnitude_density(sky, value) == pytest.approx(wanted, rel=0.1)  # of bins of MAG_STEP
+    assert evidence.magnitude_density(sky, -9.0) == evidence.magnitude_density(sky, mag[0])
+    assert evidence.magnitude_density(sky, 30.0) == evidence.magnitude_density(sky, mag[-1] + 2)
+
+
+@pytest.mark.parametrize("star", [0, 20, 59])
+def test_a_magnitude_s_likelihoods_of_one_star_add_up_to_one(star: int) -> None:
+    """The ratio is p(mag | star) / p(mag): times the density of the stars seen it is a density of magnitudes."""
+    vectors = np.random.default_rng(1).normal(size=(60, 3))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    sky = sky_index.build_without_pairs(vectors, np.linspace(2, 6, 60))
+    mag, share = np.arange(-2, 10, 1e-3), 0.8
+    detections = seen(np.zeros((len(mag), 2)))._replace(mag=mag)
+    ratio = [10 ** evidence._magnitude_dex(detections, sky, n, star, share) for n in range(len(mag))]
+    density = [evidence.magnitude_density(sky, value) / share for value in mag]
+    # Of 5 stars in 100, variable ones and the like, the magnitude is any of those seen.
+    assert np.dot(ratio, density) * 1e-3 == pytest.approx(0.95 + 0.05 * np.sum(density) * 1e-3, rel=2e-3)
+
+
+@pytest.mark.parametrize("uncertain", [0.0, 0.01])
+def test_the_information_is_that_of_the_projection_s_slopes(uncertain: float) -> None:
+    """J' W J of the tangents' derivatives by rotation and log focal length, by differences; in the interpreter."""
+    plain = interpreted("estimator.identification.stars.evidence")
+    detections, rows, R = seen(1.01 * TANGENT[:7]), np.arange(7), TRUTH.as_matrix()
+    detections.weight[:, 1] *= 0.25
+    detections.weight[:, 2] = 0.2 / SIGMA**2
+
+    def tangents(p: np.ndarray) -> np.ndarray:
+        x, y, z = (Rotation.from_rotvec(p[:3]) * TRUTH).apply(SKY.vectors[:7]).T
+        return np.exp(p[3]) * np.column_stack([x / z, y / z])
+
+    slopes = np.array([(tangents(1e-6 * e) - tangents(-1e-6 * e)) / 2e-6 for e in np.eye(4)])
+    xx, yy, xy = detections.weight.T
+    weights = np.moveaxis(np.array([[xx, xy], [xy, yy]]), 2, 0)
+    wanted = np.einsum("ink,nkl,jnl->ij", slopes, weights, slopes)
+    count, info = 4 if uncertain else 3, np.zeros((4, 4))
+    ratio = plain._fit(detections._replace(focal_uncertainty=uncertain), SKY, R, 1.0, rows, rows, info)
+    np.testing.assert_allclose(info[:count, :count], wanted[:count, :count], rtol=0, atol=1e-6 * np.abs(wanted).max())
+    assert (info[count:] == 0).all()
+    assert ratio == pytest.approx(1.01 if uncertain else 1.0, abs=1e-4)
