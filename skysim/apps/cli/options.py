@@ -61,6 +61,7 @@ Programs = Annotated[
     list[str] | None,
     typer.Option("--program", metavar="NAME=COMMAND", help="External tracker or controller: a program; repeatable."),
 ]
+OpenReport = Annotated[bool, typer.Option("--open", help="Open the report when it is written.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 

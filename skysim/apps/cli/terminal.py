@@ -86,7 +86,10 @@ def terminal_width() -> int:
 
 
 def print_rows(rows: list[FrameRow], names: tuple[str, str, str], exposures_ms: list[float]) -> None:
-    """Print one line per frame of a run. exposures_ms : exposure time of each frame;  names : of the three angles."""
+    """Print one line per frame of a run; a narrow terminal gets fewer columns, and their names.
+
+    exposures_ms : exposure time of each frame;  names : of the three angles
+    """
     triple = "/".join(names)
     headers = ["frame", "t s", "exp ms", "deg/s", f"true {triple}", f"estimate {triple}"]
     headers += ["cross ″", "roll ″", "used", "ms", "status"]
@@ -106,7 +109,20 @@ def print_rows(rows: list[FrameRow], names: tuple[str, str, str], exposures_ms: 
         ]
         for row, exposure_ms in zip(rows, exposures_ms, strict=True)
     ]
+    left_out: list[str] = []
+    for name in (f"estimate {triple}", "exp ms", "ms", "deg/s"):  # in the order in which they are left out
+        if table_width(headers, lines) > terminal_width():
+            column = headers.index(name)
+            left_out.append(headers.pop(column))
+            lines = [line[:column] + line[column + 1 :] for line in lines]
     print_table("", headers, lines)
+    if left_out:
+        print(f"in the report, or in a wider terminal: {', '.join(left_out)}")
+
+
+def table_width(headers: Sequence[str], lines: Sequence[Sequence[str | Text]]) -> int:
+    """Characters in a line of a table whose columns are two characters apart."""
+    return sum(max(map(len, column)) for column in zip(headers, *lines, strict=True)) + 2 * (len(headers) - 1)
 
 
 def format_angles(angles_deg: tuple[float, float, float] | None) -> str:
@@ -186,13 +202,20 @@ def print_check(facts: Sequence[Fact], findings: Sequence[str]) -> None:
     import textwrap
 
     for fact in facts:
-        lines = [part for line in fact.lines for part in textwrap.wrap(line, MAX_WIDTH - FACT_COLUMN)]
-        for name, line in zip([fact.name, *[""] * (len(lines) - 1)], lines, strict=True):
-            print(f"{name:{FACT_COLUMN}}{line}")
+        print_fact(fact)
     for finding in findings:
         print(textwrap.fill(f"warning: {printable(finding)}", MAX_WIDTH, subsequent_indent="  "))
     if not findings:
         print("no warnings")
+
+
+def print_fact(fact: Fact) -> None:
+    """Print one fact of a plan, its name at the left."""
+    import textwrap
+
+    lines = [part for line in fact.lines for part in textwrap.wrap(line, MAX_WIDTH - FACT_COLUMN)]
+    for name, line in zip([fact.name, *[""] * (len(lines) - 1)], lines, strict=True):
+        print(f"{name:{FACT_COLUMN}}{line}")
 
 
 def print_scores(lines: list[TrackerScore], folder: Path) -> None:

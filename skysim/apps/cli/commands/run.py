@@ -18,6 +18,7 @@ from skysim.apps.cli.options import (
     Frames,
     Identifier,
     Json,
+    OpenReport,
     Out,
     Overrides,
     Programs,
@@ -49,6 +50,7 @@ def run(
     scene_3d: Annotated[
         bool, typer.Option("--scene-3d", help="Write 3-D views of the laboratory: scene_3d.png and scene_3d.gif.")
     ] = False,
+    open_: OpenReport = False,
     json: Json = False,
 ) -> None:
     """Simulate a scene: motion, frames, attitude solutions and their scores."""
@@ -82,6 +84,11 @@ def run(
     else:
         terminal.print_rows(recorder.rows, scoring.angle_names(loaded), statistics["exposures_ms"])
         terminal.print_summary(statistics)
+        for fact in plan.facts:
+            if fact.name == "tracker knows":
+                terminal.print_fact(fact)
+    if open_:
+        typer.launch(statistics["report"])
 
 
 def render(
