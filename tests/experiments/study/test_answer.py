@@ -127,7 +127,7 @@ def test_the_scene_is_in_a_table(tmp_path: Path) -> None:
 def test_the_checks_are_made_at_every_level_and_say_where_they_found_something(tmp_path: Path) -> None:
     """The image of a disk of 10 mm at 0.8 m is 110 px wide, which the detector takes for background."""
     levels = {"small": {}, "large": {"light.led.disk_diameter": "10 mm"}}
-    told = overview.overview(loaded(tmp_path, factors={"disk": {"levels": levels}}))
+    told = overview.overview(loaded(tmp_path, trial={"kind": "frames"}, factors={"disk": {"levels": levels}}))
     wide = [one for one in told.findings if "px wide; local treats" in one]
     assert len(wide) == 1
     assert wide[0].endswith("[disk = large]")
