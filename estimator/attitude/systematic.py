@@ -62,6 +62,19 @@ def response(view: Geometry, sigma_rad: Floats) -> Floats:
     return np.asarray(np.linalg.solve(information, np.moveaxis(weighted, 2, 1)))
 
 
+def residual_products(view: Geometry, sigma_rad: Floats, error_rad: Floats) -> Floats:
+    """(M, M) inner products of the weighted residuals that M common errors (M, K, 2) leave after the solution.
+
+    With z standard normal and unit noise in every weighted tangent, the sum of squares has the mean 2 K - 3 + tr Q and
+    the variance 2 (2 K - 3) + 4 tr Q + 2 tr Q^2, Q these products.
+    """
+    weighted = (error_rad / sigma_rad[:, None]).reshape(len(error_rad), -1)
+    jacobian = (view.jacobian / sigma_rad[:, None, None]).reshape(-1, 3)
+    absorbed, _, _, _ = np.linalg.lstsq(jacobian, weighted.T, rcond=None)
+    left = weighted.T - jacobian @ absorbed
+    return np.asarray(left.T @ left)
+
+
 def isotropic(sigma_rad: Floats) -> Floats:
     """(K, 2, 2) covariances of errors equal in all directions."""
     return sigma_rad[:, None, None] ** 2 * np.eye(2)

@@ -207,19 +207,27 @@ class DomeTracker:
         if self.leds.covariance_m2 is None and self.leds.common_m is None and not self.camera.focal_sigma:
             # The LEDs' share of the error variance of a ray: of the covariance too, if it is the same for all rays.
             return misfit * covariance, float(np.mean(led_rad**2 / sigma_rad**2)) * misfit * covariance
-        place_cam = cam_from_lab.apply(self.leds.position_m[star])
-        view = systematic.geometry(place_cam, place_cam - self.lever.cam_from_body.apply(self.lever.camera_body_m))
-        by_place = view.gradient @ cam_from_lab.as_matrix()
+        view, common_rad = self._common_rad(cam_from_lab, star)
         own_rad2 = systematic.isotropic(led_rad)
         if self.leds.covariance_m2 is not None:
+            by_place = view.gradient @ cam_from_lab.as_matrix()
             own_rad2 = by_place @ self.leds.covariance_m2[star] @ np.moveaxis(by_place, 1, 2)
         noise_rad2 = systematic.isotropic(np.sqrt(np.maximum(sigma_rad**2 - led_rad**2 - focal_rad**2, 0)))
-        common_rad = [self.camera.focal_sigma * view.tangent[None]]
+        return systematic.with_survey(covariance, view, sigma_rad, misfit * noise_rad2, misfit * own_rad2, common_rad)
+
+    def _common_rad(self, cam_from_lab: Rotation, star: NDArray) -> tuple[systematic.Geometry, Floats]:
+        """K LEDs as the camera sees them, and the (M, K, 2) change of their tangents by the errors that all share.
+
+        Each is changed by one standard deviation: of the focal length first, then of the map's common errors.
+        """
+        place_cam = cam_from_lab.apply(self.leds.position_m[star])
+        view = systematic.geometry(place_cam, place_cam - self.lever.cam_from_body.apply(self.lever.camera_body_m))
+        common_rad = self.camera.focal_sigma * view.tangent[None]
         if self.leds.common_m is not None:
-            common_rad.append(np.einsum("kij,mkj->mki", by_place, self.leds.common_m[:, star]))
-        return systematic.with_survey(
-            covariance, view, sigma_rad, misfit * noise_rad2, misfit * own_rad2, np.concatenate(common_rad)
-        )
+            by_place = view.gradient @ cam_from_lab.as_matrix()
+            moved = np.einsum("kij,mkj->mki", by_place, self.leds.common_m[:, star])
+            common_rad = np.concatenate([common_rad, moved])
+        return view, common_rad
 
     def _residual_px(self, centroids: Centroids, observed: NDArray, star: NDArray, body_from_lab: Rotation) -> Floats:
         """(K, 2) predicted minus observed pixels."""
@@ -238,7 +246,8 @@ class DomeTracker:
 
         Two LEDs whose images touch form one blob at neither's position. Residual lengths are divided by their sigmas;
         those above 5 times the median (above 5 if the median is below 1) are rejected. The rest has 2 K - 3 degrees of
-        freedom; if its reduced chi-square exceeds 1 by more than 3 standard deviations, it is the factor, else 1.
+        freedom; its chi-square has that mean, and more by what the attitude cannot absorb of the common errors. If it
+        exceeds its mean by more than 3 standard deviations, their ratio is the factor, else 1.
         """
         residual = self._residual_px(centroids, observed, star, body_from_lab)
         length = np.linalg.norm(residual, axis=1) / (sigma_rad * self.camera.focal_px)
@@ -246,9 +255,17 @@ class DomeTracker:
         if inlier.sum() < max(MIN_EVIDENCE_MATCHES, len(inlier) / 2):
             inlier[:] = True
         dof = 2 * int(inlier.sum()) - 3
-        reduced_chi2 = float(np.sum(length[inlier] ** 2)) / dof
-        threshold = 1 + 3 * np.sqrt(2 / dof)
-        return observed[inlier], star[inlier], reduced_chi2 if reduced_chi2 > threshold else 1.0
+        mean, spread = float(dof), np.sqrt(2 * dof)
+        if self.leds.common_m is not None or self.camera.focal_sigma:
+            view, common_rad = self._common_rad(self.lever.cam_from_body * body_from_lab, star[inlier])
+            left = systematic.residual_products(view, sigma_rad[inlier], common_rad)
+            # The focal length's error is in the sigmas too, as if it were independent.
+            focal_rad = self.camera.focal_sigma * np.linalg.norm(view.tangent, axis=1) / np.sqrt(2)
+            noise = 1 - float(np.mean(focal_rad**2 / sigma_rad[inlier] ** 2))
+            mean = noise * dof + float(np.trace(left))
+            spread = np.sqrt(2 * noise**2 * dof + 4 * noise * np.trace(left) + 2 * np.trace(left @ left))
+        chi2 = float(np.sum(length[inlier] ** 2))
+        return observed[inlier], star[inlier], chi2 / mean if chi2 > mean + 3 * spread else 1.0
 
     def _lever_covariance(self, cam_from_lab: Rotation, star: NDArray) -> Floats:
         """(3, 3) covariance in camera axes from the error of the pupil's position, which is common to all frames.

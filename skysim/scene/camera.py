@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, field_validator, model_validator
 
 from skysim.core.errors import unknown_name
 from skysim.core.paths import DATA
@@ -164,10 +164,42 @@ class ParticlesConfig(ConfigModel):
     diffusion_px: Annotated[Number, Field(ge=0, le=5)] = 0.3
 
 
+class EfficiencyConfig(ConfigModel):
+    """A curve of quantum efficiency, scaled to the peak that a data sheet states.
+
+    curve : in data/qe, or a file;  peak : electrons per photon at its highest point
+    """
+
+    curve: str
+    peak: Annotated[Number, Field(gt=0, le=1)]
+
+    @field_validator("curve")
+    @classmethod
+    def check_curve(cls, value: str) -> str:
+        curve_file(value)
+        return value
+
+
+def efficiency_tag(value: Any) -> str:
+    """Tag of the kind of quantum efficiency, so that an error names its keys only where it is a section."""
+    if isinstance(value, dict | EfficiencyConfig):
+        return "EfficiencyConfig"
+    return "name" if isinstance(value, str) else "number"
+
+
+Efficiency = Annotated[
+    Annotated[Annotated[float, Field(gt=0, le=1)], Tag("number")]
+    | Annotated[str, Tag("name")]
+    | Annotated[EfficiencyConfig, Tag("EfficiencyConfig")],
+    Discriminator(efficiency_tag),
+]
+
+
 class DetectorConfig(ConfigModel):
     """The chip and its electronics, in the order of the signal path. Each effect's parameter can switch it off.
 
-    quantum_efficiency : one number for 400-1000 nm, or the name of a curve in data/qe (or a file)
+    quantum_efficiency : one number for 400-1000 nm, the name of a curve in data/qe (or a file), or a curve with its
+                         peak: {curve: cmos, peak: 0.6}
     hardware_seed      : this chip's fixed pattern: PRNU, DSNU, hot pixels, column offsets
     prnu               : standard deviation of the pixels' relative sensitivity
     dark_e_s           : mean dark current at dark_temperature_c; it doubles every dark_doubling_c
@@ -182,7 +214,7 @@ class DetectorConfig(ConfigModel):
                          without particles, full-well limit, nonlinearity and converter range
     """
 
-    quantum_efficiency: Annotated[Number, Field(gt=0, le=1)] | str
+    quantum_efficiency: Efficiency
     hardware_seed: Annotated[int, Field(ge=0)] = 0
     prnu: Annotated[Number, Field(ge=0, le=0.2)] = 0.0
     dark_e_s: Electrons = 0.0
@@ -209,7 +241,7 @@ class DetectorConfig(ConfigModel):
 
     @field_validator("quantum_efficiency")
     @classmethod
-    def check_curve(cls, value: float | str) -> float | str:
+    def check_efficiency(cls, value: float | str | EfficiencyConfig) -> float | str | EfficiencyConfig:
         if isinstance(value, str):
             curve_file(value)
         return value

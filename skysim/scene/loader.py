@@ -30,13 +30,20 @@ from skysim.scene.scene import NAME_ALIAS, Scene
 PRESETS = DATA / "cameras"
 
 
+def list_cameras() -> list[str]:
+    """Names of the camera presets in data/cameras."""
+    return sorted(path.stem for path in PRESETS.glob("*.yaml"))
+
+
 def preset(name: str, where: str) -> dict[str, Any]:
-    """The `camera` section of data/cameras/NAME.yaml. Raises InputError for an unknown name."""
-    allowed = sorted(path.stem for path in PRESETS.glob("*.yaml"))
-    if name not in allowed:
-        raise InputError(f"{where}: {unknown_name('preset', name, allowed)}")
-    tree: dict[str, Any] = read_yaml(Path(PRESETS / f"{name}.yaml"))[0]["camera"]
-    return tree
+    """The `camera` section of data/cameras/NAME.yaml, or of a file. Raises InputError for an unknown name."""
+    path = PRESETS / f"{name}.yaml" if name in list_cameras() else Path(name)
+    if path.suffix not in (".yaml", ".yml") or not is_file(path):
+        raise InputError(f"{where}: {unknown_name('preset', name, list_cameras())}, or a .yaml file with a camera")
+    camera = resolve_files(path, read_yaml(path)[0]).get("camera")
+    if not isinstance(camera, dict) or "preset" in camera:
+        raise InputError(f"{where}: {path} is not a camera; allowed: a section camera without a preset")
+    return camera
 
 
 def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
@@ -233,6 +240,7 @@ def apply_preset(tree: dict[str, Any], files: Files, overrides: Mapping[str, str
 FILE_KEYS = (
     ("vehicle", "model"),
     ("motion", "maneuver", "*", "file"),
+    ("camera", "preset"),
     ("camera", "psf", "file"),
     ("camera", "calibration"),
     ("light", "catalog"),
@@ -280,16 +288,20 @@ def file_names(tree: Any) -> Iterator[tuple[str, str]]:
         yield from below(tree, keys, ())
 
 
-def load_camera(path: Path, lens: Mapping[str, Any] | None = None) -> CameraConfig:
+def load_camera(
+    path: Path, lens: Mapping[str, Any] | None = None, overrides: Mapping[str, str] | None = None
+) -> CameraConfig:
     """The `camera` section of a scene, or of a file with a camera only. Raises InputError with one line.
 
     lens : values for keys that a preset leaves to its scene; keys of the file override them
     """
     tree, files = read(path)
+    for key, value in (overrides or {}).items():
+        set_key(tree, key, value)
     if isinstance(tree.get("camera"), dict):
         tree = tree | {"camera": {**(lens or {}), **tree["camera"]}}
     try:
         own = resolve_files(path, {key: tree[key] for key in tree if key == "camera"})
-        return CameraFileConfig.model_validate(apply_preset(own, files, {})).camera
+        return CameraFileConfig.model_validate(apply_preset(own, files, overrides or {})).camera
     except ValidationError as error:
-        raise InputError(explain(error, CameraFileConfig, tree, files, {})) from None
+        raise InputError(explain(error, CameraFileConfig, tree, files, overrides or {})) from None

@@ -20,7 +20,7 @@ import numpy as np
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.types import Floats
-from skysim.scene.camera import curve_file
+from skysim.scene.camera import EfficiencyConfig, curve_file
 
 HC_J_M = 6.62607015e-34 * 299792458.0  # energy of a photon times its wavelength
 HC_K_M = HC_J_M / 1.380649e-23
@@ -50,14 +50,18 @@ class Band:
     response: Floats
 
     @classmethod
-    def from_efficiency(cls, quantum_efficiency: float | str) -> Band:
+    def from_efficiency(cls, quantum_efficiency: float | str | EfficiencyConfig) -> Band:
         """The band of one number (flat over 400-1000 nm) or of a named curve; cached, so the same object every time.
+
+        A curve with a peak is scaled to it.
 
         Raises ValueError for an unknown name, InputError for a file that is not a curve.
         """
         if isinstance(quantum_efficiency, str):
             path = curve_file(quantum_efficiency)
             return _read_curve(path, path.stat().st_mtime_ns)
+        if isinstance(quantum_efficiency, EfficiencyConfig):
+            return _scaled(cls.from_efficiency(quantum_efficiency.curve), quantum_efficiency.peak)
         return _flat(float(quantum_efficiency))
 
     def response_at(self, wavelength_m: Floats | float) -> Floats:
@@ -79,6 +83,11 @@ class Band:
 @lru_cache(maxsize=64)
 def _flat(quantum_efficiency: float) -> Band:
     return Band(np.array(FLAT_M), np.full(2, quantum_efficiency))
+
+
+@lru_cache(maxsize=64)
+def _scaled(band: Band, peak: float) -> Band:
+    return Band(band.wavelength_m, band.response * (peak / band.response.max()))
 
 
 @lru_cache(maxsize=64)
