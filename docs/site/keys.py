@@ -74,6 +74,7 @@ TEXTS = {
     "light.surface.file": "a file of points",
     "camera.psf.file": "a table of numbers",
     "camera.detector.quantum_efficiency": f"a number to 1, or {stems(CURVE_FOLDER, 'csv')}, or a CSV file",
+    "camera.detector.quantum_efficiency.curve": f"{stems(CURVE_FOLDER, 'csv')}, or a CSV file",
     "vehicle.model": "an MJCF file",
     "motion.control.law": "`pid`, `pd`, or a controller of an entry point or of `--program`",
     "motion.maneuver.file": "a CSV, ECSV, CCSDS AEM or STK `.a` file",

@@ -80,12 +80,12 @@ def test_the_converter_ends_a_little_above_the_full_well(name: str) -> None:
     assert 0.95 * (2**detector.bits - 1) < full_dn <= 2**detector.bits - 1
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_rows_are_read_at_a_camera_s_pace(name: str) -> None:
+def test_rows_are_read_at_a_camera_s_pace() -> None:
     """The slowest, lu205c, does 10 frames a second, the fastest, EC655, 90 (reference §2)."""
-    made = camera(name)
-    readout_s = made.height_px * made.shutter.row_time_s
-    assert 0.011 < readout_s <= 0.1
+    made = {name: camera(name) for name in NAMES}
+    read = {name: one.height_px * one.shutter.row_time_s for name, one in made.items() if one.shutter.kind != "global"}
+    assert {"lu205c", "ec655", "imx178", "imx477"} <= set(read)
+    assert {name: time_s for name, time_s in read.items() if not 0.011 < time_s <= 0.1} == {}
 
 
 def test_what_the_scene_says_goes_over_the_preset() -> None:
@@ -104,7 +104,10 @@ def test_another_kind_of_shutter_replaces_the_preset_s() -> None:
 def test_an_unknown_preset_is_answered_with_the_known_ones_in_one_line() -> None:
     with pytest.raises(InputError) as caught:
         tree("lu250c")
-    assert str(caught.value) == f"camera.preset: unknown preset 'lu250c'; allowed: {', '.join(NAMES)}"
+    assert (
+        str(caught.value)
+        == f"camera.preset: unknown preset 'lu250c'; allowed: {', '.join(NAMES)}, or a .yaml file with a camera"
+    )
 
 
 def test_a_preset_of_the_base_is_switched_off_by_null() -> None:

@@ -165,7 +165,7 @@ def test_a_key_has_a_unit_in_its_name_unless_its_value_has_one(part: type[Config
     """A quantity's key is its Python name less the SI suffix; every other key is the name itself."""
     field = part.model_fields[name]
     suffix = next((one for one in SUFFIXES if name.endswith(one)), "")
-    bare = name.removesuffix(suffix if is_quantity(field.annotation, field.metadata) else "")
+    bare = name.removesuffix(suffix if is_quantity(field.annotation, field.metadata) else "").rstrip("_")  # class_
     own = {"schema_version": "schema", "name": scene.NAME_ALIAS} if part is scene.Scene else {}
     assert field.alias == own.get(name, bare)
 
@@ -430,7 +430,7 @@ UNIONS = [
         "preset: lu205c",
         "preset: lu206c",
         "camera.preset",
-        "aps, ec655, lu205c, wat902h2",
+        r"aps, cmv4000, ec655, [\w, ]+, wat902h2, or a \.yaml file with a camera",
     ),
 ]
 
