@@ -14,7 +14,7 @@ $(READY): pyproject.toml
 	$(PIP) -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: reference bench demo test test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
+.PHONY: reference bench demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -22,11 +22,17 @@ demo: $(READY)
 	$(BIN)/skysim run afit_simsat_ideal --frames 20 --out out/afit_simsat_ideal
 	$(BIN)/skysim run shefex2 --out out/shefex2
 
+PYTEST = NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
+
 test: $(READY)
-	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -m "not long and not browser"
+	$(PYTEST) -m "not slow and not long and not browser"
+
+# The tests that CI runs beside those of `make test`.
+test-slow: $(READY)
+	$(PYTEST) -m slow
 
 test-long: $(READY)
-	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -m long
+	$(PYTEST) -m long
 
 # Other people's instruments. astrometry.net is no Python package: docs/findings/oracles.md tells how to get it.
 oracle: $(READY)

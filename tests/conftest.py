@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
+import ast
+import math
 import subprocess
 import sys
 import tempfile
+from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -16,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Remove numba's cached code of a package that is older than any of the package's sources.
+    """Remove numba's cached code of a module that is older than the module, or than any that it imports.
 
     Numba notices a change in the file where a cached function stands, but not in the functions and constants that
     it took from other files: stale machine code answers wrongly, or crashes where a tuple's fields have moved. The
@@ -25,11 +27,38 @@ def pytest_configure(config: pytest.Config) -> None:
     if hasattr(config, "workerinput"):
         return
     for package in (ROOT / "skysim", ROOT / "estimator"):
-        changed_s = max(path.stat().st_mtime for path in package.rglob("*.py"))
-        for path in package.rglob("__pycache__/*.nb[ic]"):
-            with contextlib.suppress(FileNotFoundError):  # another run of the tests was quicker
-                if path.stat().st_mtime < changed_s:
-                    path.unlink()
+        changed_s = {path: path.stat().st_mtime for path in package.rglob("*.py")}
+        caches = {path: path.stat().st_mtime for path in package.rglob("__pycache__/*.nb[ic]")}
+        if min(caches.values(), default=math.inf) >= max(changed_s.values()):
+            continue
+        uses = {path: imported(path, changed_s.keys()) for path in changed_s}
+        for path, compiled_s in caches.items():
+            source = path.parents[1] / f"{path.name.partition('.')[0]}.py"
+            if compiled_s < max(changed_s[one] for one in with_imports(source, uses)):
+                path.unlink(missing_ok=True)  # another run of the tests may be quicker
+
+
+def imported(path: Path, files: Collection[Path]) -> set[Path]:
+    """The files among `files` whose names a file's compiled functions can use: those that its top level imports."""
+    names = set()
+    for node in ast.parse(path.read_bytes()).body:
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    stems = (ROOT / name.replace(".", "/") for name in names)
+    return {one for stem in stems for one in (stem.with_suffix(".py"), stem / "__init__.py") if one in files}
+
+
+def with_imports(source: Path, uses: Mapping[Path, set[Path]]) -> set[Path]:
+    """A file and all that it imports, directly or not; every file if it is no longer there."""
+    if source not in uses:
+        return set(uses)
+    found, new = {source}, uses[source]
+    while new := new - found:
+        found |= new
+        new = set().union(*(uses[path] for path in new))
+    return found
 
 
 # Modules run as commands, one group per process: the trackers, and the renderer. They share no compiled function.

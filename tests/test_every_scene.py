@@ -58,6 +58,7 @@ def test_there_are_scenes() -> None:
     assert flown | lit <= set(NAMES)
 
 
+@pytest.mark.slow
 def test_it_says_what_it_is(testbed: Testbed) -> None:
     assert testbed.scene.name in NAMES
     assert 10 < len(testbed.scene.title) < 80
@@ -73,6 +74,7 @@ def test_its_first_frame_shows_at_least_five_sources_or_what_was_published(testb
     assert np.mean(frame.image_dn >= frame.saturation_dn) < 1e-3
 
 
+@pytest.mark.slow
 def test_its_light_is_on_the_frame(testbed: Testbed) -> None:
     """Sum above offset, dark and the chip's own pattern, against the truth's electrons, to five sigmas.
 
@@ -102,6 +104,7 @@ def test_its_light_is_on_the_frame(testbed: Testbed) -> None:
     assert abs(found_e - light_e.sum()) < 5 * np.sqrt(read + shot + uneven) + clipped_e
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(testbed: Testbed) -> None:
     name, image = testbed.scene.name, exposure.render_frame(testbed, 0)[0].image_dn
     again = exposure.render_frame(prepared(name, 2), 0)[0].image_dn
@@ -134,6 +137,7 @@ def test_its_first_frames_are_solved_and_right(testbed: Testbed) -> None:
         assert not metrics.is_wrong(error_rad, nees)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", IDEAL)
 def test_an_ideal_scene_s_tracker_knows_its_dome(name: str) -> None:
     """It differs from its base in the tracker alone, whose map and lever are the true ones."""

@@ -105,6 +105,7 @@ def called() -> set[str]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_every_reader_is_fuzzed_or_has_a_reason() -> None:
     every = set(readers())

@@ -60,6 +60,7 @@ def test_an_index_outside_of_the_scene_is_refused(run, index: int) -> None:
         skysim.render(run.scene, index=index)
 
 
+@pytest.mark.slow
 def test_a_saved_run_is_what_the_command_writes(run, tmp_path) -> None:
     ours = run.save(tmp_path / "ours")
     words = ["run", "shefex2", "--frames", "3", "--set", "motion.rate_deg_s=[0,0,0]"]
@@ -73,6 +74,7 @@ def test_a_saved_run_is_what_the_command_writes(run, tmp_path) -> None:
             assert (ours / name).read_bytes() == (tmp_path / "theirs" / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_only_a_report_of_several_frames_has_plots_against_time(run, tmp_path) -> None:
     one = dataclasses.replace(run, frames=run.frames[:1]).save(tmp_path / "one")
     three = run.save(tmp_path / "three")

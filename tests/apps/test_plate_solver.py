@@ -130,6 +130,7 @@ def photographed(focal: str) -> Testbed:
     return run.prepare(loader.load("shefex2", still | {"camera.focal_length": focal}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("focal", "fov_deg"), [("10 mm", 36.12), ("25 mm", 14.84), ("45 mm", 8.28)])
 def test_a_rendered_field_is_solved_with_nothing_told(blind: plate_solver.Solver, focal: str, fov_deg: float) -> None:
     """2 atan(658 x 9.9 um / 2 f) between the middles of the edge columns, to half a per cent; three arc-minutes."""
@@ -142,6 +143,7 @@ def test_a_rendered_field_is_solved_with_nothing_told(blind: plate_solver.Solver
     assert solution["fov_deg"] == pytest.approx(fov_deg, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_smeared_frames_of_a_known_camera_are_placed_by_their_streaks() -> None:
     """14 px of unmodeled smear: error below 100" and consistent with the covariance; round-star fits roll 400" off."""
     fast = {"exposure.frames": "16", "motion.rate_deg_s": "[4.8, 6.4, 0]"}

@@ -108,6 +108,7 @@ def test_an_even_sky_falls_as_the_fourth_power_of_the_cosine() -> None:
     assert cosine.min() ** 4 < 0.8  # the field is wide enough to tell
 
 
+@pytest.mark.slow
 def test_a_pixel_gets_the_light_of_a_star_for_every_square_arcsecond() -> None:
     lens = optics()
     pixel_arcsec = np.degrees(1 / lens.camera.focal_px) * 3600
@@ -255,6 +256,7 @@ def test_the_cusp_of_two_stops_is_rounded_off_within_a_node_of_the_axis() -> Non
     assert error[np.hypot(3 * x - 400, 3 * y - 300) > 200].max() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 @pytest.mark.parametrize(("shape", "nodes"), [((601, 801), (20, 27)), ((97, 33), (2, 3)), ((50, 64), (50, 64))])
 def test_fill_is_bilinear_interpolation(kind: type, shape: tuple[int, int], nodes: tuple[int, int]) -> None:

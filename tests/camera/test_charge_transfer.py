@@ -33,6 +33,7 @@ def halve_till_it_fits(column: np.ndarray) -> np.ndarray:
     return charge[1:-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_blooming_ends_where_endless_halving_does(seed: int) -> None:
     """Random sky with one to four saturated sources, near each other and near the ends."""
@@ -184,6 +185,7 @@ def clocked_under_light(rate_e_s: np.ndarray, exposure_s: float, row_time_s: flo
     return np.array(store)
 
 
+@pytest.mark.slow
 def test_smear_is_that_of_a_column_clocked_under_light() -> None:
     exposure_s, row_time_s = 0.05, 2e-6
     rate = np.random.default_rng(7).uniform(0, 1e5, (90, 130))

@@ -87,6 +87,7 @@ def test_most_probable_charge_is_that_of_the_length() -> None:
     assert ratio.min() > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("diffusion_px", [0.0, 0.3, 2.0])
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 def test_every_electron_of_a_track_within_the_frame_is_in_it(diffusion_px: float, kind: type) -> None:
@@ -118,6 +119,7 @@ def test_diffusion_widens_the_cloud() -> None:
     np.testing.assert_allclose(spots, [0.49 + 1 / 12, 2.25 + 1 / 12], rtol=1e-3)  # Sheppard: the pixel's own 1/12
 
 
+@pytest.mark.slow
 def test_tracks_come_in_from_beside_the_frame_and_run_off_it() -> None:
     thick = protons(depth="100 um", per_cm2_s=1e5)
     image = np.zeros((50, 50))

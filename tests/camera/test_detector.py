@@ -54,6 +54,7 @@ def law(mean_e: float, read_e: float, gain: float, offset: float, bits: int, wel
     return np.diff(np.concatenate([[0], below, [1]]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mean_e", "read_e", "gain", "offset", "bits", "well_e"),
     [

@@ -215,6 +215,7 @@ def traced(field_rad: float, cutoff_rad: float) -> float:
     return float(np.mean(second[first]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cutoff_deg", [8.0, 30.0, 75.0])
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
 def test_two_stops_pass_the_rays_that_fit_through_both(share: float, cutoff_deg: float) -> None:

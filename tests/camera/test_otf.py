@@ -194,6 +194,7 @@ def covered_disk(radius: float, size: int, fine: int) -> Floats:
     return np.asarray(sum(np.hypot(x + u, y + v) <= radius for u in dots for v in dots)) / 64
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radii", [(4.3, 2.6), (3.0, 0.0), (6.0, 1.37)])
 @pytest.mark.parametrize("sigma_px", [0.25, 0.7])
 def test_disks_against_brute_force(radii: tuple[float, float], sigma_px: float) -> None:

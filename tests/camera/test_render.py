@@ -371,6 +371,7 @@ def test_a_star_that_sweeps_through_from_outside_the_field_is_not_missed() -> No
     assert len(seen.id) == 1
 
 
+@pytest.mark.slow
 def test_stars_that_cross_the_field_between_two_looks_are_not_missed() -> None:
     """A whole turn in a second, looked at nine times: every star of the equator gives the same."""
     around = np.radians(np.arange(0, 360, 7.5))
@@ -671,6 +672,7 @@ def fitted(frames: Floats, x_px: float, y_px: float, electrons: float, read_nois
     return np.column_stack([x, y])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("read_noise_e", "electrons", "bound_px"),
     [

@@ -54,6 +54,7 @@ def test_a_wrong_size_of_a_compressed_image_is_one_line(tmp_path: Path, key: str
     assert len(str(refusal.value).splitlines()) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "told"),
     [

@@ -115,6 +115,7 @@ def test_every_study_that_comes_along_has_its_page_and_its_command() -> None:
         assert (verb == "optimize") == (loader.load(name).study.optimize is not None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted((ROOT / "docs/findings/studies").glob("*.md")), ids=lambda path: path.stem)
 def test_a_study_s_page_is_of_its_study_and_shows_what_is_there(path: Path) -> None:
     text, told = path.read_text(encoding="utf-8"), loader.load(path.stem)

@@ -100,6 +100,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
         yield tmp_path
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # a reader sees them too
 @pytest.mark.parametrize("name", walked())
 def test_a_page_s_blocks_run_in_their_order(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

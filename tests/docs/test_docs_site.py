@@ -41,6 +41,7 @@ def helped(*words: str) -> str:
     return re.sub(r"\x1b\[[0-9;]*m", "", told.output)
 
 
+@pytest.mark.slow
 def test_every_command_that_help_names_has_its_section() -> None:
     shown = {name: re.findall(r"^│ ([a-z]+)  ", helped(*name.split()), re.MULTILINE) for name in SECTIONS}
     assert len(shown[""]) >= 15
@@ -48,6 +49,7 @@ def test_every_command_that_help_names_has_its_section() -> None:
     assert told | {""} == set(SECTIONS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SECTIONS)
 def test_a_section_has_the_options_that_help_shows(name: str) -> None:
     """And each of them, and every argument, with a word on what it is for."""

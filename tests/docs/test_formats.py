@@ -42,6 +42,7 @@ def test_the_commands_leave_what_the_table_says(folder: Path) -> None:
     assert named == set(EXPORTS)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*datfix")
 def test_the_code_blocks_run(folder: Path) -> None:
     """In one session, as a reader would type them; the one with ccsds-ndm-py is run by `make oracle`."""

@@ -33,6 +33,7 @@ def test_the_commands_leave_a_report_and_a_solution(folder):
     assert {"report.html", "annotated.png", "frame_0004.fits"} <= left
 
 
+@pytest.mark.slow
 def test_the_python_block_solves_the_frame_that_it_saves(folder):
     (block,) = pages.blocks(README, "python")
     done = subprocess.run([sys.executable, "-c", block], cwd=folder, capture_output=True, text=True)

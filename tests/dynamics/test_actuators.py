@@ -246,6 +246,7 @@ def test_manipulability_is_one_at_best_and_nothing_at_a_singularity():
 # ---- the torque of gyros ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [[0, 0, 0], [0.3, -0.2, 0.4]])
 def test_gyros_push_with_gimbal_rate_times_momentum(rate):
     """On a body of its own: ask for T + rate x (all momentum), and BUS d(rate)/dt = T to 1e-6."""
@@ -360,6 +361,7 @@ def singular_angles(set_: CmgSet, along: np.ndarray) -> np.ndarray:
     return np.arctan2(along @ across, along @ set_.spin_axes)
 
 
+@pytest.mark.slow
 def test_rotors_deliver_what_singular_gimbals_cannot():
     set_, along = variable(), np.array([2.0, 1.0, -2.0]) / 3
     angles = singular_angles(set_, along)

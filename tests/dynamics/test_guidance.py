@@ -112,6 +112,7 @@ def test_euler_angles_are_yaw_then_pitch_then_roll() -> None:
         np.testing.assert_allclose(attitude(given).as_matrix(), expected, rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVERY)
 def test_rate_and_acceleration_are_the_derivatives_of_the_attitude(name: str) -> None:
     """Five-point differences at random times within the last element: off by 1e-15 / h, that is 1e-11, by rounding.

@@ -167,6 +167,7 @@ def test_earth_turns_about_its_pole(latitude: float, azimuth: float) -> None:
 ATTITUDES = [Rotation.identity(), TILTED, Rotation.from_rotvec([1.0, 2.0, -0.5])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("attitude", ATTITUDES)
 def test_uncompensated_earth_turns_a_still_vehicles_navigator(attitude: Rotation) -> None:
     """An hour: 15.04 deg about the Earth's own axis, whatever the vehicle's attitude."""

@@ -369,6 +369,7 @@ def test_the_field_of_the_camera_is_seen_and_tilts_with_the_vehicle(drawn: Drawn
     assert max(there[0, 1], there[1, 0]) < 40
 
 
+@pytest.mark.slow
 def test_the_picture_changes_where_the_vehicle_tilts(drawn: Drawn) -> None:
     _, _, model, data, lit, _ = drawn
     moved = np.abs(lit[1] - lit[0]).sum(axis=2) > 30

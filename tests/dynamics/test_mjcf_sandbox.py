@@ -201,6 +201,7 @@ def flexcomp(count: str) -> str:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "told"),
     [

@@ -343,6 +343,7 @@ def built(folder: Path, bodies: str, more: str = "", **changes: object) -> multi
     return multibody.build(VehicleConfig.model_validate({"model": str(file)} | changes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("bodies", "message"),
     [
@@ -366,6 +367,7 @@ def test_bad_vehicle_is_answered_in_one_line(tmp_path: Path, bodies: str, messag
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("part", "bodies", "message"),
     [
@@ -397,6 +399,7 @@ def test_actuators_that_a_file_lacks_are_answered_in_one_line(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["torque_x", "wheel_a", "gimbal_1", "rotor_1", "fan_1"])
 def test_actuator_of_a_reserved_name_is_refused(tmp_path: Path, name: str) -> None:
     motor = f'<actuator><motor name="{name}" site="center" gear="0 0 0 1 0 0"/></actuator>'
@@ -511,6 +514,7 @@ def spoilt(folder: Path, right: str, wrong: str, **changes: object) -> multibody
     return multibody.build(vehicle_config(model=str(file), **changes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("right", "wrong", "says"),
     [

@@ -70,6 +70,7 @@ def picture(testbed: Testbed) -> tuple[bytes, set[int], Any]:
     return frame.image_dn.tobytes(), set(truth.sources.id.tolist()), truth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", STARTS)
 def test_a_mast_on_the_vehicle_hides_just_the_leds_behind_it(start: str, tmp_path: Path) -> None:
     testbed = furnished(tmp_path, on_bus(mast(MAST_M)), motion__start=start)
@@ -105,6 +106,7 @@ def test_a_beam_of_the_lab_stays_while_the_vehicle_turns(tmp_path: Path) -> None
     assert min(counts) >= 4
 
 
+@pytest.mark.slow
 def test_where_nothing_is_in_the_way_the_frame_is_the_same_bit_for_bit(tmp_path: Path) -> None:
     """With the switch on and off; and switched off a mast is as good as none."""
     on, off = (picture(furnished(tmp_path, SIMSAT, light__occlusion=word)) for word in ("true", "false"))
@@ -125,6 +127,7 @@ def test_it_is_on_unless_the_scene_says_otherwise() -> None:
 LENS = '<geom type="cylinder" size="0.022 0.015" pos="0 0 0.065" mass="0.2" rgba="0.05 0.05 0.06 1"/>'
 
 
+@pytest.mark.slow
 def test_the_camera_s_own_housing_does_not_blind_it(tmp_path: Path) -> None:
     """Neither a cap before the lens on the camera's own body, nor a box on bus that it sits in; a cap on bus does."""
     assert SIMSAT.count(LENS) == 1

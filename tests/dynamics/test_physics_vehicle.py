@@ -84,6 +84,7 @@ def test_angular_momentum_is_kept_for_a_minute_while_wheels_and_gimbals_are_driv
     assert np.linalg.norm(momentum[0]) > 5
 
 
+@pytest.mark.slow
 def test_energy_and_momentum_are_kept_for_a_minute_where_nobody_drives() -> None:
     """The bars, 1e-8 J (of 1112) and 1e-8 N m s (of 5.6): every wheel, rotor and gimbal swings freely."""
     vehicle = multibody.build(vehicle_config(**SPINNING))
@@ -169,6 +170,7 @@ def asymmetric_top(inertia: Floats, first: float, third: float, t_s: Floats) -> 
     return rate, momentum_from_body[0].inv() * momentum_from_body
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("inertia", "first", "third"),
     [((6.0, 6.5, 9.0), 0.3, 0.8), ((9.0, 6.5, 6.0), 0.2, 1.0), ((6.0, 6.5, 9.0), 0.9, 0.33)],

@@ -114,6 +114,7 @@ def test_lens_and_lever_are_the_true_ones_within_their_errors_and_better_than_be
         assert abs(row["found"] - row["truth"]) < abs(row["believed"] - row["truth"]) / 2, row
 
 
+@pytest.mark.slow
 def test_the_leds_are_off_by_what_their_sigmas_say(statistics: dict[str, Any], folder: Path) -> None:
     """The moves that all LEDs share keep the mean square from settling at 1: a factor of 2 either way."""
     table = Table.read(folder / "leds.ecsv", format="ascii.ecsv")
@@ -347,6 +348,7 @@ def test_a_map_that_is_not_there_or_not_alone_is_one_line(
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "says"),
     [

@@ -113,6 +113,7 @@ def middles(pictures: np.ndarray) -> np.ndarray:
     return np.array([[x[one].mean(), y[one].mean()] for one in bright])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pose", POSES)
 def test_mujoco_draws_the_ball_where_our_optics_project_it(pose: str, tmp_path: Path) -> None:
     quaternion_wxyz, place_m = POSES[pose]

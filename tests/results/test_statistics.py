@@ -76,6 +76,7 @@ def test_a_quantile_has_an_interval_from_as_many_values_as_wilks_asks_for(probab
     assert metrics.quantile(values[:5], probability).needs == fewest - 5
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 400), st.sampled_from([0.05, 0.5, 0.9, 0.95, 0.99]))
 def test_no_pair_of_ranks_with_the_confidence_is_closer(count: int, probability: float) -> None:

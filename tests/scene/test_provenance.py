@@ -24,6 +24,7 @@ def line_in(path: Path, words: str) -> int:
     return line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", loader.list_scenes())
 def test_what_is_shown_is_the_scene(name: str, tmp_path: Path) -> None:
     """Read back, it is equal: nothing is left out, and quantities keep their unit."""

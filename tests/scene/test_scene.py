@@ -250,6 +250,7 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
 # Slips in a file
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("right", "wrong", "says"),
     [

@@ -45,6 +45,7 @@ def faults(kind: str, tree: Any) -> list[str]:
     return [error.message for error in validator.iter_errors(tree)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SHIPPED)
 def test_the_published_schema_is_the_newest_and_takes_every_file_that_ships(kind: str) -> None:
     published = json.loads((DATA / "schema" / f"{kind}.json").read_text())
@@ -56,6 +57,7 @@ def test_the_published_schema_is_the_newest_and_takes_every_file_that_ships(kind
         assert faults(kind, tree) == [], path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "wrong",
     [

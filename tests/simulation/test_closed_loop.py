@@ -154,6 +154,7 @@ def test_what_was_solved_in_flight_is_what_the_frames_say_afterwards(bumped: Tes
         assert np.linalg.norm((one.cam_from_ref * other.cam_from_ref.inv()).as_rotvec()) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("latency_s", [0.0, 0.2])
 def test_a_solution_comes_after_its_latency(latency_s: float) -> None:
     """The filter is sure of itself at the first tick after the exposure's end and the latency, and right."""
@@ -203,6 +204,7 @@ def test_under_the_stars_the_filter_s_lab_is_the_sky() -> None:
 # --- once more ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_same_seed_flies_the_same_flight_bit_for_bit() -> None:
     short = EARLY | {"exposure": '{time: "10 ms", rate_hz: 1, frames: 2, first: "1.4 s"}'}
     short["motion.maneuver"] = short["motion.maneuver"].replace("1.5 s", "1.6 s")

@@ -14,6 +14,7 @@ SYMMETRIC = {"afit_test1", "afit_test2", "afit_test3"}  # too few or too regular
 NAMES = {path.stem.removesuffix("_ideal") for path in SCENES.glob("*.yaml")} - SYMMETRIC
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(NAMES))
 def test_the_synthetic_frame_is_solved(name: str) -> None:
     """A frame that is refused earlier would leave the later stages to be compiled in the first process."""

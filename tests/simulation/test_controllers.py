@@ -106,6 +106,7 @@ def command(folder: Path, text: str) -> dict[str, str]:
 # --- the same motion by every route -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_pd_law_of_the_user_s_flies_as_the_built_in_one(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On wheels that turn, with drag and disturbances: by a function, an entry point and a program, to 1e-12."""
     from mypd import pd  # type: ignore[import-not-found]
@@ -247,6 +248,7 @@ READY = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "told"),
     [
@@ -329,6 +331,7 @@ responses: [identified]
 """
 
 
+@pytest.mark.slow
 def test_a_study_s_factor_is_a_controller(installed: Path, tmp_path: Path) -> None:
     path = tmp_path / "which.yaml"
     path.write_text(STUDY.replace("mine", "other"))

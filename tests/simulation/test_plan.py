@@ -205,6 +205,7 @@ def test_a_solver_s_own_error_is_a_cause() -> None:
 # Findings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "changes", "key", "words"),
     [
@@ -271,6 +272,7 @@ def test_half_of_the_stars_at_the_limit_are_detected() -> None:
     assert np.mean(faint) < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["afit_simsat", "nps_tas2", "shefex2", "scoreboard", "collimated_display"])
 def test_a_plan_that_ships_gives_no_warning(name: str) -> None:
     assert check(bed(name)).findings == []

@@ -94,6 +94,7 @@ def test_a_noise_free_image_gives_the_true_attitude(name: str, start: str) -> No
     assert error_deg(build_tracker(testbed).solve(frame.image_dn).attitude, truth) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["shefex2", "nps_tas2_ideal", "apl_dome_ideal"])
 def test_a_shipped_scene_without_noise_and_fixed_pattern_is_solved(name: str) -> None:
     """Nothing but light: the wings of the images and the readout smear must not join the lights to one blob."""

@@ -128,6 +128,7 @@ def test_a_table_is_followed_exactly_without_a_controller_and_closely_with_one()
     assert 1e-6 < off_deg.max() < 0.02
 
 
+@pytest.mark.slow
 def test_a_profile_beside_its_scene_starts_the_vehicle_and_ends_in_a_hold(tmp_path: Path) -> None:
     """Named relative to the scene; the vehicle starts on it, moving; then the next maneuver."""
     columns = swing(np.arange(1.0, 4.05, 0.1))
@@ -254,6 +255,7 @@ AGAIN = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "changes", "file"), AGAIN)
 def test_a_run_exported_and_flown_again_has_the_same_centroids(
     name: str, changes: dict[str, Any], file: str, tmp_path: Path

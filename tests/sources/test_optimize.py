@@ -162,6 +162,7 @@ def on_sphere(tilt_deg: Floats, azimuth_deg: Floats) -> Floats:
     return Rotation.from_euler("ZYZ", angles, degrees=True).apply([0.0, 0.0, 1.0])
 
 
+@pytest.mark.slow
 def test_a_field_that_is_turned_about_the_bearing_is_wholly_alike_and_its_mirror_is_not() -> None:
     """Seven LEDs, and the same rigidly turned by 30 deg: share 1, LED on LED; two left out: 5 of 7."""
     pattern = on_sphere(np.array([0, 1.2, 2.1, 2.6, 3.1, 3.5, 3.8]), np.array([0, 20, 250, 110, 305, 170, 60]))

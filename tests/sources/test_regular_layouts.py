@@ -146,6 +146,7 @@ def arcs_m(made: surface.Surface, place_m: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(np.diff(points, axis=0), axis=2).sum(axis=0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("on", SURFACES.values(), ids=SURFACES)
 def test_leds_of_a_circle_are_a_pitch_apart_on_the_surface(on: dict[str, Any]) -> None:
     place_m = lit({"kind": "string", "pitch": "33 mm", "spacing": "15 cm"}, on).place[:, :3]
@@ -162,6 +163,7 @@ def test_leds_of_a_circle_are_a_pitch_apart_on_the_surface(on: dict[str, Any]) -
         assert 0.033 * (1 - 1e-5) <= arcs_m(made, closing)[0] < 0.066 or len(leds) < 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("on", SURFACES.values(), ids=SURFACES)
 def test_leds_of_a_spiral_are_a_pitch_apart_on_the_surface(on: dict[str, Any]) -> None:
     place_m = lit({"kind": "string", "winding": "spiral", "pitch": "33 mm", "spacing": "10 cm"}, on).place[:, :3]

@@ -185,6 +185,7 @@ def test_render_then_solve_agrees_with_the_wcs_of_the_true_pointing(
     assert answer["fov_deg"] == pytest.approx(2 * np.degrees(np.arctan(329 * 9.9e-3 / 25)), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_solve_takes_a_picture_of_which_nothing_is_told(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
     """2 atan(658 x 9.9 um / 50 mm) between the middles of the edge columns, where the scene points."""
     ran = skysim("solve", rendered / "frame_0000.fits", "--json", "--out", tmp_path)
@@ -195,6 +196,7 @@ def test_solve_takes_a_picture_of_which_nothing_is_told(skysim: Skysim, rendered
     assert answer["dec_deg"] == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_solve_leaves_out_a_header_s_date_that_cannot_be_and_says_so(
     skysim: Skysim, rendered: Path, tmp_path: Path
 ) -> None:
@@ -226,6 +228,7 @@ def test_solve_writes_what_it_prints_and_a_picture(skysim: Skysim, rendered: Pat
     assert (height * 659, channels) == (width * 493, 3)
 
 
+@pytest.mark.slow
 def test_a_run_s_json_parses_and_counts(skysim: Skysim, tmp_path: Path) -> None:
     ran = skysim("run", "shefex2", "--frames", "2", "--json", "--out", tmp_path)
     assert (ran.code, ran.err) == (0, "")
@@ -274,6 +277,7 @@ def test_the_stages_of_a_run_are_those_named(skysim: Skysim, tmp_path: Path) -> 
     assert triad["cross_sigma_arcsec"] > 1.1 * quest["cross_sigma_arcsec"]
 
 
+@pytest.mark.slow
 def test_exposures_are_told_frame_by_frame(skysim: Skysim, tmp_path: Path) -> None:
     """By a run and by a rendering, which are of the same frames."""
     growing = "tracker.exposure_control={mean_dn: 500, min_stars: 1000}"
@@ -291,6 +295,7 @@ def test_exposures_are_told_frame_by_frame(skysim: Skysim, tmp_path: Path) -> No
 # Scenes that are wrong
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -463,6 +468,7 @@ BAD_IMAGES: dict[str, tuple[Any, str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(BAD_IMAGES))
 def test_a_bad_image_is_one_line_and_leaves_nothing_half_written(
     skysim: Skysim, rendered: Path, tmp_path: Path, kind: str

@@ -89,6 +89,7 @@ def test_every_key_of_the_2005_program_is_on_the_map() -> None:
 # Forms.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(path.stem for path in SCENES.glob("*.yaml")))
 def test_a_form_s_own_values_make_the_same_scene(name: str) -> None:
     """What stands in the fields, put over the file, changes nothing: units, defaults and lists come back."""

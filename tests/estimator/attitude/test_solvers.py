@@ -94,6 +94,7 @@ AXES = {
 }
 
 
+@pytest.mark.slow
 @every_solver
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("short_of_rad", [0.0, 1e-12, 1e-8, 1e-4])
@@ -343,6 +344,7 @@ def test_triad_rests_on_the_pair_with_the_least_worst_variance(half: float) -> N
 # ---- The covariance ----
 
 
+@pytest.mark.slow
 def test_the_compiled_core_gives_the_optimum_and_its_covariance() -> None:
     rng = np.random.default_rng(55)
     for _ in range(50):
@@ -388,6 +390,7 @@ def test_fifteen_stars_err_as_the_reference_says() -> None:
     assert predicted == pytest.approx([cross, cross, roll], rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("count", [2, 3, 5, 30])
 def test_the_covariance_is_true(count: int, name: str) -> None:

@@ -74,6 +74,7 @@ def test_equal_errors_have_the_covariance_of_the_solver() -> None:
     np.testing.assert_allclose(ours, R @ covariance @ R.T, rtol=1e-8, atol=1e-8 * covariance.max())
 
 
+@pytest.mark.slow
 def test_own_errors_that_differ_by_led_and_direction_have_the_claimed_covariance() -> None:
     """LEDs believed off along one axis of the lab, by 0.1 mm to 1 mm, and solved with equal weights."""
     position_m, sigma = leds_in_view(7, 2), np.full(7, 1e-4)
@@ -88,6 +89,7 @@ def test_own_errors_that_differ_by_led_and_direction_have_the_claimed_covariance
     assert_covariance(errors, claimed)
 
 
+@pytest.mark.slow
 def test_common_errors_have_the_claimed_covariance() -> None:
     """A map shifted and turned as a whole, and a focal length that is wrong."""
     position_m, sigma = leds_in_view(7, 4), np.full(7, 1e-4)
@@ -120,6 +122,7 @@ def whitened(tracker_of: Callable[[int], tuple[DomeTracker, Floats]], draws: int
     return np.array(values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["own", "common", "focal", "all"])
 def test_the_dome_tracker_claims_the_errors_of_its_map(kind: str) -> None:
     """Errors along the lab's x for each LED, a shift of all, a focal length: whitened errors are standard normal."""

@@ -154,6 +154,7 @@ def test_the_lens_s_covariance_is_true(clean: list[tuple[Field, Calibration]]) -
     assert low < np.mean(nees) < high
 
 
+@pytest.mark.slow
 def test_the_attitudes_covariance_is_true_and_knows_of_the_lens(
     clean: list[tuple[Field, Calibration]],
 ) -> None:

@@ -93,6 +93,7 @@ def test_the_fit_recovers_a_noise_free_gaussian(sigma: float) -> None:
         assert found.flux[0] == pytest.approx(1e4, rel=CONVERGED_PX**2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(CENTROIDERS))
 def test_a_centroid_follows_its_star_by_whole_pixels_and_across_the_diagonal(name: str) -> None:
     image = np.full((80, 96), 50.0)
@@ -164,6 +165,7 @@ def test_the_fit_reaches_the_cramer_rao_bound(flux_e: float, noise_e: float, pub
 
 # cog's own variance is photon + pixel noise over its box; its box moves with the noise, hence the wider band.
 # The S-curves of the other two are in their variance as if their profiles were Gaussian.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "band"),
     [
@@ -249,6 +251,7 @@ def test_the_disk_fit_is_true_and_better_than_gravity_where_noise_rules(radius: 
     assert np.std(off) < 1.1 * np.std(by_gravity)
 
 
+@pytest.mark.slow
 def test_a_saturated_disk_is_placed_by_its_edge() -> None:
     rng = np.random.default_rng(28)
     off, sigma = [], []

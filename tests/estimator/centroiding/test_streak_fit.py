@@ -140,6 +140,7 @@ def test_a_line_filter_gains_over_a_round_one() -> None:
     assert not blobs.flag.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [4.41, 8.8, 15.0])
 def test_the_middle_is_mid_exposure_within_a_true_covariance(length: float) -> None:
     rng = np.random.default_rng(64)

@@ -45,6 +45,7 @@ def flags_near(blobs: Blobs, x: float, y: float) -> int:
     return int(blobs.flag[inside][0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.45, 0.7, 1.0, 2.0])
 def test_stars_are_stars(sigma: float) -> None:
     rng = np.random.default_rng(40)
@@ -157,6 +158,7 @@ def test_only_a_clear_line_is_a_track_among_streaks(peak_sigma: float, flag: int
     assert [flags_near(blobs, x, y) for x, y in places] == [flag] * len(places)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("centroider", ["cog", "gaussian_window", "gaussian_fit"])
 @pytest.mark.parametrize("over", [2.0, 10.0])
 def test_saturated_stars_are_kept_with_a_sigma_that_covers_them(centroider: str, over: float) -> None:

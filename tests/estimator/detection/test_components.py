@@ -40,6 +40,7 @@ def test_both_scans_find_the_same_objects(seed: int) -> None:
         np.testing.assert_array_equal(getattr(once, name).round(6), getattr(again, name).round(6))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scan", [sequential_scan, maximum_scan])
 @pytest.mark.parametrize("seed", range(3))
 def test_the_objects_are_scipy_s_labels(scan, seed: int) -> None:
@@ -96,6 +97,7 @@ def test_the_thesis_takes_full_scale_from_the_saturation() -> None:
         detect.thesis(image)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["u2", "i4", "f8"])
 def test_runs_are_scipy_s_mask_under_a_bilinear_threshold(dtype: str) -> None:
     rng = np.random.default_rng(16)

@@ -153,6 +153,7 @@ def test_stars_on_a_gentle_ramp_are_all_found() -> None:
     assert nearest_px(blobs.xy_px, xy).max() < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["u1", "u2", "f4", "f8", ">f4", ">f8", ">u2", "f2"])
 @pytest.mark.parametrize("name", [name for name in detect.DETECTORS if name != "thesis"])
 def test_stars_are_found_in_pixels_of_any_type(name: str, dtype: str) -> None:
@@ -236,6 +237,7 @@ def test_a_texture_is_refused() -> None:
         detect.local(image)
 
 
+@pytest.mark.slow
 def test_no_line_is_filtered_for_that_is_longer_than_any_star_s(monkeypatch: pytest.MonkeyPatch) -> None:
     """A lattice that closes to lines over the whole frame: filters of their length took a minute."""
     taps: list[int] = []

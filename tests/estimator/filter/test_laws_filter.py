@@ -31,6 +31,7 @@ def assert_sound(told: FilterState) -> None:
     np.testing.assert_allclose(told.sigma_bias_rad_s**2, np.diag(told.covariance)[3:], rtol=1e-12, atol=0)
 
 
+@pytest.mark.slow
 @law(
     AttitudeFilter.propagate,
     AttitudeFilter.state,

@@ -91,6 +91,7 @@ def test_the_rate_is_the_last_call_s_less_the_bias() -> None:
 # ---- The covariance ----
 
 
+@pytest.mark.slow
 def test_an_error_common_to_all_solutions_stays_and_is_claimed() -> None:
     """Fifteen solutions with a common error of covariance S and noise of S / 9: NEES 3, less what S adds as noise."""
     rng, common_rad2, nees = np.random.default_rng(15), TRACKER_RAD2, []

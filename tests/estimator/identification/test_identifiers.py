@@ -92,6 +92,7 @@ def test_the_real_sky_is_identified_and_never_wrongly(sky: pair_index.PairIndex,
     assert np.mean(chi2) == pytest.approx(3, abs=4 * np.sqrt(6 / len(chi2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PAPERS)
 def test_a_mirrored_sky_is_refused(sky: pair_index.PairIndex, name: str) -> None:
     for one in fields(sky, 10, 91):

@@ -21,6 +21,7 @@ LEVER = Lever(np.array([0.0, 0.0, 0.381]), Rotation.identity())
 PLACES_M = np.array([[0, 0], [0.03, 0.01], [-0.02, 0.03], [0.04, -0.03], [-0.05, -0.02], [-0.01, -0.04]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("boards", "second", "further"),
     [([0, 0, 0, 0, 0, 0], 1, 4), ([0, 0, 0, 1, 1, 1], 2, 2), ([0, 0, 1, 1, 2, 2], 3, 0), ([0, 1, 2, 3, 3, 3], 1, 1)],

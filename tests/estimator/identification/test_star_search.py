@@ -60,6 +60,7 @@ def attitude_error(solution: Solution, truth: Rotation):
     return (Rotation.from_quat(solution.cam_from_ref_xyzw) * truth.inv()).as_rotvec()
 
 
+@pytest.mark.slow
 def test_the_sky_holds_every_pair_in_its_bin() -> None:
     chord = 2 * np.sin(WIDE_RAD / 2)
     expected = {tuple(sorted(pair)) for pair in cKDTree(VECTORS).query_pairs(chord)}

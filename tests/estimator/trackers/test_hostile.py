@@ -49,6 +49,7 @@ def tracker(stars: catalog.StarCatalog) -> StarTracker:
     return StarTracker(CAMERA, stars, stars.vectors, Settings())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("detector", DETECTORS)
 @BRIEF
 @given(image=IMAGES, centroider=some.sampled_from(sorted(CENTROIDERS)))

@@ -268,6 +268,7 @@ def test_a_camera_is_fitted_to_exact_pixels(rng: np.random.Generator, longer: fl
     assert (found * truth.inv()).magnitude() < 1e-4
 
 
+@pytest.mark.slow
 @law(StarTracker.solve)
 @given(
     settings_=some.builds(

@@ -291,6 +291,7 @@ def under_the_dome(
     return lever.cam_from_body * body_from_lab, pixels
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("lever", LEVERS)
 def test_true_centroids_under_a_dome_give_the_true_attitude(lever: str, shape: str) -> None:

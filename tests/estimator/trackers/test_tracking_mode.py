@@ -51,6 +51,7 @@ def off_rad(report, truth: Rotation) -> float:
     return float((report.attitude.cam_from_ref * truth.inv()).magnitude())
 
 
+@pytest.mark.slow
 def test_it_searches_once_and_follows_then(tracker: StarTracker) -> None:
     follower = TrackingMode(tracker)
     reports = [follower.solve(photograph(tracker, attitude(t), n), t) for n, t in enumerate(np.arange(8) * STEP_S)]
@@ -155,6 +156,7 @@ def test_half_a_sky_is_called_missing_and_few_stars_few(tracker: StarTracker) ->
     assert report.health == Health.MISSING | Health.FEW
 
 
+@pytest.mark.slow
 def test_saturated_and_smeared_stars_are_told(tracker: StarTracker) -> None:
     follower = TrackingMode(tracker)
     follower.solve(photograph(tracker, START), 0.0)

@@ -45,6 +45,7 @@ def sky() -> PairIndex:
     return monte_carlo.catalog(monte_carlo.FITTED_LIMIT_MAG)
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_the_covariance(sky: PairIndex) -> None:
     """P = sigma^2 [sum(I - b b')]^-1: across 1 / sqrt(N), roll by the stars' distance from the axis."""
     truly, told, stars = monte_carlo.simulate(sky, monte_carlo.version("fialho_2"), 600, 7)

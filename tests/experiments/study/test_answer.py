@@ -124,6 +124,7 @@ def test_the_scene_is_in_a_table(tmp_path: Path) -> None:
     assert rows["drawn in every trial"] == "light.layout.hardware_seed"
 
 
+@pytest.mark.slow
 def test_the_checks_are_made_at_every_level_and_say_where_they_found_something(tmp_path: Path) -> None:
     """The image of a disk of 10 mm at 0.8 m is 110 px wide, which the detector takes for background."""
     levels = {"small": {}, "large": {"light.led.disk_diameter": "10 mm"}}

@@ -428,6 +428,7 @@ def test_dask_loses_a_worker_and_makes_the_same_rows(
     assert contents(again) == serial_contents
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheduler", ["", "nonsense", "tcp://127.0.0.1", "tcp://127.0.0.1:99999", "foo://1.2.3.4:5"])
 def test_an_address_that_is_none_is_told_in_one_line(scheduler: str) -> None:
     pytest.importorskip("distributed")

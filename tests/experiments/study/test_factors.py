@@ -38,6 +38,7 @@ def test_a_range_ends_at_its_ends_and_is_even_in_ratio_where_that_is_wanted():
     assert [value for value, _ in integer.options()] == [1, 1, 2, 2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("told", "law"),
     [

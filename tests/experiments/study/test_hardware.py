@@ -47,6 +47,7 @@ def test_every_replicate_has_hardware_of_its_own_and_the_same_at_every_point(tmp
     assert loaded(tmp_path, seed=6).spec.trial_settings({}, 7) != spec.trial_settings({}, 7)
 
 
+@pytest.mark.slow
 def test_the_trials_are_of_different_domes_and_pooled(tmp_path: Path) -> None:
     """Each replicate's scene has its own hash; the table has a row for a noise, none for a dome."""
     told = loaded(tmp_path)

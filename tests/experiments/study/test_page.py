@@ -211,6 +211,7 @@ def test_names_sort_in_the_studys_order_and_quantities_by_their_number(tmp_path:
     assert by_radius == {"48 in": 48, "24 in": 24, "96 in": 96}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("keys", "count"),
     [

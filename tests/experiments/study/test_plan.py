@@ -119,6 +119,7 @@ def test_there_is_no_such_study():
         loader.load("which")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(plan.STUDIES.glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_study_that_comes_along_can_be_asked(path):
     """Every level of every factor makes a scene; `load` has tried them all."""

@@ -118,6 +118,7 @@ def test_an_option_that_has_an_effect_at_another_factor_s_level_is_allowed(order
     assert loader.load(study(tmp_path, "afit_simsat", DOME, factors)).trials == 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "trial", "settings", "change"),
     [
