@@ -64,6 +64,7 @@ def test_it_says_what_it_is(testbed: Testbed) -> None:
     assert 10 < len(testbed.scene.title) < 80
 
 
+@pytest.mark.slow
 def test_its_first_frame_shows_at_least_five_sources_or_what_was_published(testbed: Testbed) -> None:
     frame, truth = exposure.render_frame(testbed, 0)
     camera, detector = testbed.scene.camera, testbed.scene.camera.detector

@@ -159,6 +159,7 @@ TABLES: dict[str, Callable[[Path], object]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:loadtxt")
 @pytest.mark.parametrize("head", TABLES)
 @AS_IT_IS

@@ -139,6 +139,7 @@ def test_the_pixels_share_out_the_whole_field(camera: dict[str, object]) -> None
     assert pixels == pytest.approx(2 * halves.sum(), rel=2e-5)
 
 
+@pytest.mark.slow
 def test_vignetting_takes_its_share_of_the_sky_and_none_of_a_leak() -> None:
     table = {"kind": "table", "angle_deg": (0, 10, 30), "transmission": (1, 0.7, 0.1)}
     clear, dim = optics(), optics(vignetting=table)

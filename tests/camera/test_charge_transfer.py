@@ -45,6 +45,7 @@ def test_blooming_ends_where_endless_halving_does(seed: int) -> None:
     np.testing.assert_allclose(image[:, 1], halve_till_it_fits(column), rtol=0, atol=1e-3 * WELL)
 
 
+@pytest.mark.slow
 def test_blooming_keeps_the_charge_and_its_center() -> None:
     rng = np.random.default_rng(2)
     image = rng.uniform(0, 0.5 * WELL, (400, 30)).astype(np.float32)
@@ -198,6 +199,7 @@ def test_smear_is_that_of_a_column_clocked_under_light() -> None:
     np.testing.assert_allclose(single, wanted, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_leaking_register_smears_by_its_leak() -> None:
     rate = np.random.default_rng(8).uniform(0, 1e5, (40, 65))
     open_sky, covered = rate * 0.1, rate * 0.1

@@ -57,6 +57,7 @@ def test_the_code_blocks_run(folder: Path) -> None:
     assert "b'px'" in printed.getvalue()
 
 
+@pytest.mark.slow
 def test_the_photograph_as_tiff_is_solved_by_the_calibration(folder: Path) -> None:
     answers = (folder / "out" / "solve" / "solutions.json").read_text()
     assert '"status": "solved"' in answers

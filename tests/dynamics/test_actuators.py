@@ -262,6 +262,7 @@ def test_gyros_push_with_gimbal_rate_times_momentum(rate):
     np.testing.assert_allclose(crossed, asked, rtol=1e-12, atol=0)
 
 
+@pytest.mark.slow
 def test_away_from_singularities_both_ways_of_steering_agree():
     """lambda is 0.01 exp(-10 det A A^T), 5e-8 at rest with det = 32/27: the rates differ by no more."""
     torque = np.array([0.1, -0.05, 0.2])
@@ -377,6 +378,7 @@ def test_rotors_deliver_what_singular_gimbals_cannot():
     assert np.linalg.norm(along @ fixed.jacobian(angles, THREE) * stuck) < 1e-14
 
 
+@pytest.mark.slow
 def test_rotors_idle_where_gimbals_can():
     """At angle zero A = 1 N m s, det A A^T = 1: the weights leave the rotors 0.25 exp(-10) of the torque."""
     set_, torque = variable(), np.array([0.3, -0.2, 0.1])

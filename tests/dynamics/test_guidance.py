@@ -195,6 +195,7 @@ CHANGES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("begin", "end", "lasts_s"), CHANGES)
 def test_spin_up_is_the_integral_of_its_rate(begin: tuple, end: tuple, lasts_s: float) -> None:
     """Against scipy's eighth-order integration of q' = q w / 2 with w by hand, to 1e-9 rad."""

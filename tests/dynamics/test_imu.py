@@ -179,6 +179,7 @@ def test_uncompensated_earth_turns_a_still_vehicles_navigator(attitude: Rotation
     np.testing.assert_allclose(np.linalg.norm(drift), 15.041, rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("attitude", ATTITUDES)
 def test_compensated_earth_leaves_a_still_vehicle_where_it_is(attitude: Rotation) -> None:
     navigator = Navigator(wxyz(attitude), EARTH)

@@ -91,6 +91,7 @@ def test_a_mast_on_the_vehicle_hides_just_the_leds_behind_it(start: str, tmp_pat
     np.testing.assert_array_equal(multibody.occluded(testbed.obstacles, truth.lab_from_body, testbed.sources), behind)
 
 
+@pytest.mark.slow
 def test_a_beam_of_the_lab_stays_while_the_vehicle_turns(tmp_path: Path) -> None:
     beam = SIMSAT.replace("<worldbody>", f"<worldbody>{mast(MAST_M)}", 1)
     counts = []

@@ -46,6 +46,7 @@ def attitudes(spline, t_s: np.ndarray) -> Rotation:
     return Rotation.from_quat(spline.states_at(t_s)[0], scalar_first=True)
 
 
+@pytest.mark.slow
 def test_the_spline_goes_through_its_samples_with_a_unit_quaternion() -> None:
     spline = fit_spline(sampled())
     assert angle(attitudes(spline, TIMES), tumble(TIMES)).max() < 1e-14

@@ -126,6 +126,7 @@ def test_the_leds_are_off_by_what_their_sigmas_say(statistics: dict[str, Any], f
     assert (folder / "survey.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_scene_beside_the_file_believes_it(statistics: dict[str, Any], folder: Path) -> None:
     """Places, sigma, lever and lens as measured; LEDs not surveyed are left out; frames of the scene are solved."""
     (folder / "mapped.yaml").write_text("schema: 1\nbase: small.yaml\ntracker: {map: leds.ecsv}\n")

@@ -236,6 +236,7 @@ def test_a_function_that_fails_is_named_with_its_time(installed: Path) -> None:
         flown(controller=5)
 
 
+@pytest.mark.slow
 def test_an_entry_point_that_fails_is_named_with_its_time(installed: Path) -> None:
     with pytest.raises(InputError, match=r"^motion.control.law: crashing: RuntimeError: out of fuel, at 0.03 s$"):
         flown(controller="crashing")

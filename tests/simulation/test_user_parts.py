@@ -160,6 +160,7 @@ def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> 
         loader.load(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "changes", "size_deg", "told"),
     [

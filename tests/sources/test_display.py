@@ -395,6 +395,7 @@ def test_a_black_bench_s_glow_is_that_of_its_pixels_in_the_chip_s() -> None:
     assert seen == pytest.approx(wanted, abs=1)
 
 
+@pytest.mark.slow
 def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None:
     """A noise-free frame with it less one without is the glow by the exposure, but for what is taken off the stars."""
     silent = {"camera.detector.noise": "false"}

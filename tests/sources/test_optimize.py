@@ -181,6 +181,7 @@ def test_a_field_that_is_turned_about_the_bearing_is_wholly_alike_and_its_mirror
     assert field_ambiguity(np.concatenate([pattern, mirrored]), *seen).fraction[0] < 0.5
 
 
+@pytest.mark.slow
 def test_leds_that_are_off_by_more_than_the_tolerance_do_not_coincide() -> None:
     pattern = on_sphere(np.array([0, 1.2, 2.1, 2.6, 3.1, 3.5]), np.array([0, 20, 250, 110, 305, 170]))
     turned = Rotation.from_euler("ZYZ", [40, 30, 75], degrees=True).apply(pattern)

@@ -220,6 +220,7 @@ def test_solve_leaves_out_a_header_s_date_that_cannot_be_and_says_so(
     assert json.loads(ran.out)[0]["ra_deg"] == good["ra_deg"]
 
 
+@pytest.mark.slow
 def test_solve_writes_what_it_prints_and_a_picture(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
     ran = skysim("solve", rendered / "frame_0000.png", "--fov", "14.8", "--json", "--out", tmp_path)
     assert json.loads((tmp_path / "solutions.json").read_text()) == json.loads(ran.out)
@@ -492,6 +493,7 @@ def test_a_bad_image_does_not_stop_the_good_one_behind_it(skysim: Skysim, render
     assert [answer["status"] == "solved" for answer in json.loads(ran.out)] == [False, True]
 
 
+@pytest.mark.slow
 def test_noise_is_looked_at_and_refused_an_attitude(skysim: Skysim, tmp_path: Path) -> None:
     noise = 64 + 2 * np.random.default_rng(3).standard_normal((493, 659))
     path = as_fits(tmp_path, np.rint(noise).astype(np.uint16))
@@ -565,6 +567,7 @@ def test_check_as_json_has_numbers_and_findings(skysim: Skysim) -> None:
     assert any(line.startswith("light.layout.cap_deg: ") for line in told["findings"])
 
 
+@pytest.mark.slow
 def test_a_run_carries_the_findings_before_its_frames_and_in_its_report(skysim: Skysim, tmp_path: Path) -> None:
     words = ("--frames", 1, "--set", "light.led.intensity=60 mcd", "--out", tmp_path)
     ran = skysim("run", "afit_simsat", *words, "--json")

@@ -34,6 +34,7 @@ def error_rad(a: Rotation, b: Rotation) -> float:
     return (a * b.inv()).magnitude()
 
 
+@pytest.mark.slow
 @every_optimal
 @pytest.mark.parametrize("count", [2, 3, 5, 20])
 def test_each_is_the_svd_s_rotation(count: int, solve: Solver) -> None:
@@ -291,6 +292,7 @@ def test_no_method_leaves_its_arrays() -> None:
         )
 
 
+@pytest.mark.slow
 def test_the_bare_quest_loses_in_a_narrow_field_what_the_polish_brings_back() -> None:
     rng, worst = np.random.default_rng(52), 0.0
     for _ in range(50):

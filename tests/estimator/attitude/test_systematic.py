@@ -155,6 +155,7 @@ def test_the_dome_tracker_claims_the_errors_of_its_map(kind: str) -> None:
     assert np.abs(products - np.eye(3)).max() < 5 * np.sqrt(2 / 200)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("focal", [0.0, 2e-3])
 def test_the_star_tracker_claims_the_error_of_its_focal_length(focal: float) -> None:
     """Stars to one side of the image, so that a wrong focal length turns the attitude: the mean NEES is 3."""

@@ -170,6 +170,7 @@ def test_the_attitudes_covariance_is_true_and_knows_of_the_lens(
     assert min(alone) > 5
 
 
+@pytest.mark.slow
 def test_the_misfit_is_that_of_honest_sigmas(clean: list[tuple[Field, Calibration]]) -> None:
     freedom = 800 - 60 - 8
     misfit2 = np.array([found.report.misfit for _, found in clean]) ** 2

@@ -186,6 +186,7 @@ def test_the_reported_sigma_is_true(
     assert band[0] < chi2 < band[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(CENTROIDERS))
 @pytest.mark.parametrize("apart_px", [8.0, 11.0])
 def test_stars_side_by_side_do_not_pull_each_other(name: str, apart_px: float) -> None:

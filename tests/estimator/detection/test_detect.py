@@ -68,6 +68,7 @@ def test_the_measured_sky_is_the_mean_and_the_filtered_noise() -> None:
     assert background.noise.mean() == pytest.approx(3, abs=3 * 0.2 / 8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["u2", "i4", "f8"])
 def test_the_sky_of_a_crowded_tile_is_the_sky_between_the_stars(dtype: str) -> None:
     # A fifth of the pixels hold 60 units of light; clipping at 3 sigma forgets them, a plain mean would show 12.

@@ -27,7 +27,7 @@ from estimator.detection.detect import DETECTORS
 from estimator.trackers import pipeline
 from estimator.trackers.pipeline import Clock, Settings
 
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 WIDTH, HEIGHT = 90, 70
 CAMERA = Camera.from_fov(WIDTH, HEIGHT, 0.3)
 # Those that compiled code is compiled for once, and any other.
@@ -179,7 +179,6 @@ def test_a_verdict_changes_flags_alone(
         np.testing.assert_array_equal(getattr(taken, name), getattr(told, name)[order])
 
 
-@pytest.mark.slow
 @law(windows.in_windows)
 @given(rng=SEEDS, strange=arrays("f8", (4, 2), elements=ANY), half_px=some.floats(0, 20))
 def test_windows_anywhere_hold_blobs_of_the_frame(rng: np.random.Generator, strange: NDArray, half_px: float) -> None:
@@ -193,7 +192,6 @@ def test_windows_anywhere_hold_blobs_of_the_frame(rng: np.random.Generator, stra
 # Centroids
 
 
-@pytest.mark.slow
 @law(
     *CENTROIDERS.values(),
     centroid.cog,
@@ -218,7 +216,6 @@ def test_a_centroid_is_its_star_s_whatever_the_order(rng: np.random.Generator, n
     assert len(CENTROIDERS[name](odd, blobs, 1.0, FramePriors())) == len(blobs)
 
 
-@pytest.mark.slow
 @law(centroid.streak, centroid.streak_ends, centroid.gaussian_fit)
 @given(rng=SEEDS, long_px=some.floats(7, 11))
 def test_a_streak_s_middle_is_between_its_ends(rng: np.random.Generator, long_px: float) -> None:
@@ -331,7 +328,6 @@ def test_a_longer_lens_has_a_smaller_field(fov_rad: float, factor: float) -> Non
 # Attitude
 
 
-@pytest.mark.slow
 @law(*SOLVERS.values(), solvers.rotation)
 @given(rng=SEEDS, count=some.integers(2, 12), noise=some.floats(0, 0.01), name=some.sampled_from(sorted(SOLVERS)))
 def test_a_solver_finds_the_turn_in_any_order(rng: np.random.Generator, count: int, noise: float, name: str) -> None:

@@ -13,6 +13,8 @@ from estimator.core.errors import ImageError
 from estimator.core.types import StarMatch
 from estimator.identification.registry import IDENTIFIERS
 
+pytestmark = pytest.mark.slow  # much is compiled
+
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 ARCSEC_RAD = np.pi / 648_000
 SIGMA_RAD, EPSILON_MAG = 10 * ARCSEC_RAD, 0.25
@@ -92,7 +94,6 @@ def test_the_real_sky_is_identified_and_never_wrongly(sky: pair_index.PairIndex,
     assert np.mean(chi2) == pytest.approx(3, abs=4 * np.sqrt(6 / len(chi2)))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", PAPERS)
 def test_a_mirrored_sky_is_refused(sky: pair_index.PairIndex, name: str) -> None:
     for one in fields(sky, 10, 91):

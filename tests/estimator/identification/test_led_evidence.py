@@ -62,6 +62,7 @@ def wide_field(level_from_lab: Rotation) -> tuple[DomeIndex, LedDetections, Floa
     return dome, search.build_detections(rays, sigma, dome)._replace(sigma=sigma), R_cam_from_lab
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.5, -0.7, 0.5)])
 def test_two_fits_of_the_attitude_come_to_the_truth(axis: tuple[float, float, float]) -> None:
     """Gauss-Newton of exact detections squares the error: 0.5 deg, some 1e-4 rad, below 1e-6 rad."""

@@ -9,6 +9,8 @@ from estimator.core.arrays import Floats
 from estimator.identification.published.master_star import master_star
 from estimator.identification.published.shefex import SearchOptions, angle_interval, cos_error, search
 
+pytestmark = pytest.mark.slow  # much is compiled
+
 ARCSEC_RAD = np.pi / 648_000
 SCREEN_CORNERS = catalog.unit(np.array([[0.1, 0.1, 1], [-0.1, 0.1, 1], [0.1, -0.1, 1], [-0.1, -0.1, 1]]))
 PIXEL_RAD = np.radians(0.02)  # "the angle per pixel, computed from the FOV and the CCD size (0.02 deg)"
@@ -37,7 +39,6 @@ def test_the_gate_s_ends_are_off_by_cos_error_in_the_cosine() -> None:
     assert angle_interval(0.001, 5.5e-5)[0] == 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("triangles", "checks", "begun"), [(3, 10**6, 3), (100, 0, 0), (100, 10**6, 20)])
 def test_no_triangle_is_begun_once_the_effort_is_used_up(triangles: int, checks: int, begun: int) -> None:
     """Six stars have 20 triangles; no star of the catalog is near theirs, so that none is found."""
@@ -63,7 +64,6 @@ def observe(rng: np.random.Generator, stars: Floats, noise_rad: float) -> tuple[
 TOLERANCE_RAD = 500 * ARCSEC_RAD / np.sqrt(2)  # +-500 arcsec of an angle
 
 
-@pytest.mark.slow
 def test_nine_stars_on_a_screen_are_told_by_their_master() -> None:
     rng, found = np.random.default_rng(120), 0
     for _ in range(40):

@@ -28,7 +28,7 @@ from estimator.identification.leds import index, search
 from estimator.trackers import dome_tracker
 from estimator.trackers.dome_tracker import DomeTracker
 
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 CAMERA = Camera(640, 480, 900.0, (319.5, 239.5))
 SPHERE = LedMap(np.arange(0), np.empty((0, 3)), np.zeros(3), np.full(3, 1.2))
 OVAL = LedMap(np.arange(0), np.empty((0, 3)), np.array([0, 0, 0.4]), np.array([1.0, 1.0, 0.8]))
@@ -174,7 +174,6 @@ def test_lights_are_named_as_they_are_or_not_at_all(eye: DomeTracker, rng: np.ra
         assert len(set(named)) == len(named)
 
 
-@pytest.mark.slow
 @law(DomeTracker.solve_centroids, DomeTracker.solve, dome_tracker.star_identifier, slow=True)
 @given(
     xy_px=arrays("f8", (8, 2), elements=ANY),
@@ -220,7 +219,6 @@ def test_a_field_holds_its_inner_one(rng: np.random.Generator, factor: float, ma
 # The claimed error
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("led_mm", "lever_mm", "noise_px"), [(0.5, 0.0, 0.5), (0.0, 1.0, 0.5), (0.4, 0.5, 0.2)])
 def test_the_mean_of_many_frames_errs_by_what_is_claimed_as_systematic(
     led_mm: float, lever_mm: float, noise_px: float

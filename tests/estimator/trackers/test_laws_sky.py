@@ -33,7 +33,7 @@ from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import TrackingMode
 
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 CAMERA = Camera.from_fov(640, 480, np.radians(40))
 RAYS = arrays("f8", some.tuples(some.integers(0, 12), some.just(3)), elements=ANY)
 
@@ -268,7 +268,6 @@ def test_a_camera_is_fitted_to_exact_pixels(rng: np.random.Generator, longer: fl
     assert (found * truth.inv()).magnitude() < 1e-4
 
 
-@pytest.mark.slow
 @law(StarTracker.solve)
 @given(
     settings_=some.builds(

@@ -326,6 +326,7 @@ def test_the_dome_tracker_s_covariance_is_true(camera: Camera, count: int, solve
     assert np.mean(nees) == pytest.approx(3, abs=0.6)
 
 
+@pytest.mark.slow
 def test_the_dome_tracker_refuses_too_few_and_unknown_lights() -> None:
     tracker = DomeTracker(DOME_CAMERA, dome("sphere"), LEVERS["axial"])
     rng = np.random.default_rng(97)
@@ -334,6 +335,7 @@ def test_the_dome_tracker_refuses_too_few_and_unknown_lights() -> None:
     assert {answer.status for answer in spots} == {NO_MATCH}
 
 
+@pytest.mark.slow
 def test_a_dome_seen_as_stars_at_infinity_is_not_assumed(tracker: StarTracker) -> None:
     leds = dome("sphere")
     rng = np.random.default_rng(98)

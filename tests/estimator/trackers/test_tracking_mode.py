@@ -16,6 +16,8 @@ from estimator.trackers.pipeline import Clock, Settings
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import Health, TrackingMode
 
+pytestmark = pytest.mark.slow  # much is compiled
+
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 CAMERA = Camera.from_fov(659, 493, np.radians(14.87))
 START = Rotation.from_euler("xyz", [20, 50, 130], degrees=True)
@@ -51,7 +53,6 @@ def off_rad(report, truth: Rotation) -> float:
     return float((report.attitude.cam_from_ref * truth.inv()).magnitude())
 
 
-@pytest.mark.slow
 def test_it_searches_once_and_follows_then(tracker: StarTracker) -> None:
     follower = TrackingMode(tracker)
     reports = [follower.solve(photograph(tracker, attitude(t), n), t) for n, t in enumerate(np.arange(8) * STEP_S)]
@@ -156,7 +157,6 @@ def test_half_a_sky_is_called_missing_and_few_stars_few(tracker: StarTracker) ->
     assert report.health == Health.MISSING | Health.FEW
 
 
-@pytest.mark.slow
 def test_saturated_and_smeared_stars_are_told(tracker: StarTracker) -> None:
     follower = TrackingMode(tracker)
     follower.solve(photograph(tracker, START), 0.0)

@@ -391,6 +391,7 @@ def tasks(dask_scheduler: Any) -> int:
     return len(dask_scheduler.tasks)
 
 
+@pytest.mark.slow
 def test_other_code_on_the_cluster_is_refused(cluster: Cluster) -> None:
     on_dask(cluster, 2).client.run(change_code, "0123456789abcdef")
     try:

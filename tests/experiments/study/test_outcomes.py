@@ -125,6 +125,7 @@ def test_false_lights_have_no_centroid_error() -> None:
     assert math.isnan(outcomes.centroid_error_px(np.empty((0, 2)), true_px, 3.0))
 
 
+@pytest.mark.slow
 def test_a_streak_is_as_long_as_the_rate_times_the_exposure() -> None:
     spec = replace(SKY, trial={"kind": "frames", "rate_deg_s": 4.0})
     setup = setups.prepared_setup(spec, {})
@@ -133,6 +134,7 @@ def test_a_streak_is_as_long_as_the_rate_times_the_exposure() -> None:
     assert math.isnan(trials.run_centroid_trial(setups.prepared_setup(SKY, {}), 5).streak_px)
 
 
+@pytest.mark.slow
 def test_frames_solved_in_flight_have_the_streaks_of_rendered_ones() -> None:
     """A closed loop solves its frames during the motion; their streaks come from the trajectory alone."""
     flight = {"kind": "flight"}
