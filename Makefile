@@ -29,7 +29,7 @@ test: $(READY)
 
 # The tests that CI runs beside those of `make test`.
 test-slow: $(READY)
-	$(PYTEST) -m slow
+	$(PYTEST) -m "slow and not long and not browser"
 
 test-long: $(READY)
 	$(PYTEST) -m long

@@ -7,7 +7,7 @@ import math
 import subprocess
 import sys
 import tempfile
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -61,11 +61,11 @@ def with_imports(source: Path, uses: Mapping[Path, set[Path]]) -> set[Path]:
     return found
 
 
-# Modules run as commands, one group per process: the trackers, and the renderer. They share no compiled function.
-SCENES = ("shefex2", "afit_simsat")
-GROUPS = (
-    [["skysim.simulation.compilation", scene] for scene in SCENES],
-    [["skysim", "render", scene, "--frames", "1", "--out", "{folder}"] for scene in SCENES],
+# Modules run as commands, one group per process. The last one finds most of its functions compiled by the first group.
+TRACKER, FRAME = "skysim.simulation.compilation", ("--frames", "1", "--out", "{folder}")
+GROUPS: tuple[Sequence[Sequence[str]], ...] = (
+    [(TRACKER, "shefex2")],
+    [("skysim", "render", "shefex2", *FRAME), ("skysim", "render", "afit_simsat", *FRAME), (TRACKER, "afit_simsat")],
 )
 
 
@@ -78,7 +78,7 @@ def pytest_xdist_setupnodes(config: pytest.Config) -> None:
         list(pool.map(lambda group: [run_module(words, folder) for words in group], GROUPS))
 
 
-def run_module(words: list[str], folder: str) -> None:
+def run_module(words: Sequence[str], folder: str) -> None:
     """Run `python -m WORDS`; its output appears only if it fails."""
     command = [sys.executable, "-m", *(word.format(folder=folder) for word in words)]
     subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)

@@ -257,6 +257,7 @@ def at_random(config: VehicleConfig, rate_body_rad_s: np.ndarray) -> multibody.S
     return flight
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_second_of_random_control_makes_no_warning(name: str) -> None:
     flight = at_random(loader.load(name).vehicle, np.zeros(3))

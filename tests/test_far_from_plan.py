@@ -74,6 +74,7 @@ def test_what_cannot_be_stepped_is_told_in_one_line_and_leaves_no_file(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_the_gyros_apparent_bias_is_what_the_navigator_drifts_by() -> None:
     """Turning at a constant rate with scale errors, misalignments and a bias, and no noise: the integral of it."""
     overrides = {

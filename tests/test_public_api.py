@@ -96,6 +96,7 @@ def test_a_notebook_shows_picture_and_numbers(run) -> None:
     assert "data:image/jpeg;base64," in run._repr_html_()
 
 
+@pytest.mark.slow
 def test_an_image_is_solved_where_the_truth_is(run, tmp_path) -> None:
     folder = run.save(tmp_path)
     found = skysim.solve(folder / "frame_0000.fits", fov_deg=14.87)

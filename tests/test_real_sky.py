@@ -65,6 +65,7 @@ def test_a_photograph_is_solved_with_its_field_known_to_five_per_cent(row):
     check_right(answer(row, worst), row)
 
 
+@pytest.mark.slow
 @needs_photographs
 @by_file(NOT_TO_SOLVE)
 def test_a_picture_without_stars_is_refused(row):

@@ -41,6 +41,7 @@ def field(tracker: DomeTracker, turned: Rotation, missing: float, false: int, rn
     return Centroids(xy, np.full(len(xy), 0.2), np.ones(len(xy)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("missing", "false", "least_solved"),
     [(0.0, 0, 0.995), (0.0, 5, 0.995), (0.2, 5, 0.95), (0.5, 5, 0.3), (0.7, 10, 0.0), (1.0, 15, 0.0)],

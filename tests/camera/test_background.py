@@ -152,6 +152,7 @@ def test_vignetting_takes_its_share_of_the_sky_and_none_of_a_leak() -> None:
     np.testing.assert_array_equal(leak, np.full((601, 801), 3.5, np.float32))
 
 
+@pytest.mark.slow
 def test_the_sky_s_slope_is_relative_and_a_degree() -> None:
     lens = optics()
     flat, sloped = (drawn(glow(**SKY | {"gradient_per_deg": g}), lens) for g in ((0, 0), (0.02, -0.01)))
@@ -194,6 +195,7 @@ def test_moonlight_falls_off_to_a_right_angle_and_is_none_without_air() -> None:
     assert scattering(0.0) == scattering(0.26)
 
 
+@pytest.mark.slow
 def test_moonlight_on_the_frame_comes_from_the_moon_s_side() -> None:
     """The Moon 25 degrees to the right of the boresight, just outside of the frame; separations by dot products."""
     lens = optics()
@@ -242,6 +244,7 @@ SLOPED = SKY | {"gradient_per_deg": (0.005, 0.004)}
 FAR_MOON = MOON | dict(zip(("ra_deg", "dec_deg"), lab_place(60.0), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", [SLOPED, FAR_MOON])
 @pytest.mark.parametrize("camera", [{}, BENT, {"focal_length": "3 mm"}])
 def test_frames_drawn_between_nodes_are_within_a_thousandth(part: dict[str, object], camera: dict[str, object]) -> None:

@@ -58,6 +58,7 @@ def test_blooming_keeps_the_charge_and_its_center() -> None:
     np.testing.assert_allclose(rows @ image.astype(float), rows @ before, rtol=0, atol=10.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wells", [1, 3, 11, 41])
 def test_a_single_source_fills_as_many_pixels_as_it_has_wells(wells: int) -> None:
     column = np.zeros(101)
@@ -153,6 +154,7 @@ def test_parallel_and_serial_loss_of_a_frame_are_clocked_one_after_the_other() -
     np.testing.assert_allclose(image, wanted, rtol=0, atol=0.1)
 
 
+@pytest.mark.slow
 def test_deferred_charge_of_a_flat_field_is_transfers_times_inefficiency() -> None:
     """The extended-pixel edge response: what trails a flat field of n rows is n cti of a row (Janesick 2001)."""
     rows, cti = 1000, 1e-6

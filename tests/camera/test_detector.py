@@ -82,6 +82,7 @@ def test_the_histogram_is_the_law_s(
     assert stats.chi2.sf(chi2, common.sum() - 1) > 1e-4
 
 
+@pytest.mark.slow
 def test_photon_transfer_slope_is_one_over_the_gain() -> None:
     """Variance against mean of ten thousand frames' pixels is a line of slope 1/gain from the read noise
     (Janesick). A ramp of light across the chip gives all levels at once; each pixel is compared with itself, so the
@@ -238,6 +239,7 @@ def test_a_well_overflows_along_its_column_and_loses_nothing() -> None:
     assert drained.sum() == 20000
 
 
+@pytest.mark.slow
 def test_transfers_leave_charge_behind_the_star() -> None:
     """31 parallel transfers of 1e-3 leave 3 % in the pixel that is read after it (away from the register)."""
     made = np.mean([expose(spot(1e4), detector_with((64, 32), cti_parallel=1e-3), n) for n in range(60)], axis=0) - 1000
@@ -264,6 +266,7 @@ def test_particles_add_their_tracks() -> None:
 # Shutters of charge
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shutter", "share"),
     [
@@ -298,6 +301,7 @@ def test_without_noise_the_frame_is_the_expectation() -> None:
     np.testing.assert_allclose(made, (mean_e + 50) / 7 + 64, rtol=1e-15, atol=0)
 
 
+@pytest.mark.slow
 def test_the_mean_of_many_frames_is_the_frame_without_noise() -> None:
     settings = {
         "read_noise_e": 10.0,

@@ -238,6 +238,7 @@ def disk_image(x_px: float, y_px: float, radius_px: float, sigma_px: float) -> F
     return total / (np.pi * radius_px**2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius_px", [0.3, 1.0, 2.0, 2.9, 3.3, 5.0, 10.4])
 def test_a_disk_is_the_convolution_of_disk_and_gaussian(radius_px: float) -> None:
     lens = blurred(1.0, radius_px)
@@ -510,6 +511,7 @@ def test_a_rolling_shutter_bands_a_pulsed_led() -> None:
 # Any attitude history
 
 
+@pytest.mark.slow
 def test_jitter_widens_a_star_by_its_own_variance() -> None:
     line = JitterLineConfig(kind="line", frequency_hz=40.0, rms_arcsec=(60.0, 120.0, 0.0))
     shaken = Vibration.draw(MotionConfig(jitter=(line,)), np.random.default_rng(4)).add_to(STILL)

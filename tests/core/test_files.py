@@ -86,6 +86,7 @@ def test_every_16_bit_value_survives_png_and_fits(tmp_path: Path, sky: Shot) -> 
     np.testing.assert_array_equal(images.read_image(tmp_path / "all.fits"), image)
 
 
+@pytest.mark.slow
 def test_a_noise_free_frame_stays_a_float_in_fits_and_is_rounded_in_png(tmp_path: Path, dome: Shot) -> None:
     loaded, frame, truth = dome
     frames.write_frame(tmp_path, frame, truth, loaded)
@@ -178,6 +179,7 @@ def test_a_shorter_run_leaves_no_frames_of_a_longer_one(tmp_path: Path, sky: Sho
 # The WCS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "pointing",
     [
@@ -204,6 +206,7 @@ def test_astropy_puts_the_true_stars_on_their_true_pixels(tmp_path: Path, pointi
     np.testing.assert_allclose(np.column_stack([x, y]), truth.sources.xy_px, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_under_the_dome_there_is_no_wcs(tmp_path: Path, dome: Shot) -> None:
     frames.write_fits(tmp_path / "f.fits", dome[1], dome[2], dome[0])
     assert not [key for key in fits.getheader(tmp_path / "f.fits") if key.startswith(("CTYPE", "CRVAL"))]

@@ -29,6 +29,7 @@ def with_value(data: bytes, key: str, value: int) -> bytes:
     return data[:begin] + f"{value:20d}".encode() + data[begin + 20 :]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["HCOMPRESS_1", "RICE_1"])
 def test_a_compressed_image_is_decoded(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "x.fits"
@@ -36,6 +37,7 @@ def test_a_compressed_image_is_decoded(tmp_path: Path, kind: str) -> None:
     np.testing.assert_array_equal(images.read_image(path), PIXELS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "value", "told"),
     [

@@ -33,6 +33,7 @@ def picture(cam_from_icrs: Rotation) -> np.ndarray:
     return np.clip(light + np.random.default_rng(1).normal(10, 1.5, light.shape), 0, 255).astype(np.uint8)
 
 
+@pytest.mark.slow
 def test_five_lines_solve_an_image(tmp_path: Path, monkeypatch, capsys) -> None:
     truth = Rotation.from_euler("xyz", [25, 40, 10], degrees=True)
     cv2.imwrite(str(tmp_path / "my_sky.jpg"), picture(truth))

@@ -106,6 +106,7 @@ def wheels(n: int, torque_limit_nm: float = 0.5) -> WheelSet:
 # ---- wheels ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [3, 4])
 def test_wheels_turn_the_body_and_take_its_momentum(n):
     """From rest nothing is stored but what they take: rate = BUS^-1 T t, and all of it comes back to zero."""
@@ -215,12 +216,14 @@ ANGLES = np.array([0.4, -1.1, 2.0, 0.7])
 SPEEDS = np.array([100.0, 80, -120, 95])
 
 
+@pytest.mark.slow
 def test_the_momentum_is_the_turned_rotors():
     set_ = pyramid_set()
     axles = Rotation.from_rotvec((set_.gimbal_axes * ANGLES).T).apply(set_.spin_axes.T)
     np.testing.assert_allclose(set_.momentum(ANGLES, SPEEDS), 0.01 * SPEEDS @ axles, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_the_jacobian_is_the_momentums_derivative():
     """By a five-point difference, exact to the fourth order of 1e-3 rad."""
     set_, step = pyramid_set(), 1e-3
@@ -271,6 +274,7 @@ def test_away_from_singularities_both_ways_of_steering_agree():
     assert 0 < np.abs(plain - robust).max() < 3 * lambda_ * np.abs(plain).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steering", STEERING)
 def test_gimbals_at_their_limit_keep_the_direction(steering):
     torque = np.array([1.0, -0.5, 2.0])
@@ -302,6 +306,7 @@ def test_the_pyramid_saturates_where_every_rotor_points_its_best():
     assert set_.manipulability(angles, SPEED) < 1e-12
 
 
+@pytest.mark.slow
 def test_in_a_singularity_the_pseudo_inverse_still_does_the_rest():
     set_, angles = pyramid_set("pseudo_inverse"), np.radians([-90, 0, 90, 0])
     rate, _ = set_.drive(np.array([0.3, 0.1, -0.2]), STILL, angles, SPEED, 0.0)
@@ -332,6 +337,7 @@ def test_the_pseudo_inverse_is_caught_by_the_inner_singularity():
     assert np.abs(rates[2000:]).max() == pytest.approx(1, rel=1e-12)  # at the limit, to and fro, for nothing
 
 
+@pytest.mark.slow
 def test_the_robust_inverse_passes_it_and_comes_to_saturation():
     """The whole 2 + 2 c = 3.155 instead of 1.155, at bounded rates, for a stray momentum of a few per cent."""
     momentum, rates, angles = pushed_along_x(pyramid_set("singularity_robust"), 60)
@@ -388,6 +394,7 @@ def test_rotors_idle_where_gimbals_can():
     assert 0 < np.linalg.norm(motor) < 2 * 0.25 * math.exp(-10) * np.linalg.norm(torque)
 
 
+@pytest.mark.slow
 def test_variable_speed_gyros_do_as_asked_at_any_angle():
     """800 random attitudes of the gimbals: exact to rounding wherever nothing is at its limit."""
     set_, rng = variable(rotor_torque_limit_nm=5.0), np.random.default_rng(4)
@@ -399,6 +406,7 @@ def test_variable_speed_gyros_do_as_asked_at_any_angle():
         np.testing.assert_allclose(given, torque, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_variable_speed_gyros_at_their_limits_keep_the_direction():
     set_, along = variable(rotor_torque_limit_nm=0.05), np.array([2.0, 1.0, -2.0]) / 3
     angles = singular_angles(set_, along)
@@ -435,6 +443,7 @@ def test_the_torque_is_the_momentum_over_the_time_against_it():
     np.testing.assert_allclose(Desaturator(PART).torque(np.array([4.0, -8.0, 0])), [-0.5, 1, 0], rtol=1e-15, atol=0)
 
 
+@pytest.mark.slow
 def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
     """h falls as exp(-t / 8 s), from 1.5 to 0.2 N m s in 8 ln 7.5 = 16.1 s, and the body comes to rest where it was."""
     set_, fan, blow = wheels(3), Desaturator(PART), fans(limit_n=1.0)

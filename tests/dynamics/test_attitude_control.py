@@ -198,6 +198,7 @@ def test_a_far_error_asks_for_no_more_than_a_rate_that_can_be_braked(fastest: fl
     np.testing.assert_array_equal(law.error_sum_rad_s, NONE)
 
 
+@pytest.mark.slow
 def test_a_great_step_is_taken_without_swinging() -> None:
     """60 deg of yaw all at once with 1 N m on 9 kg m2: there in little more than the quickest, 2 sqrt(e J / T) = 6.1 s.
 

@@ -81,6 +81,7 @@ def test_gusts_begin_as_they_go_on() -> None:
     np.testing.assert_allclose((first**2).mean(axis=0) / RMS_NM**2, 1, rtol=0, atol=4 * math.sqrt(2 / 4000))
 
 
+@pytest.mark.slow
 def test_a_steady_wind_and_the_turbine_blow_along_the_lab_s_axes() -> None:
     """Turned by 90 deg of yaw, what twists about lab x twists about body -y."""
     config = DisturbancesConfig.model_validate({"turbine": ["1 mN m", "0 N m", "2 mN m"]})
@@ -123,6 +124,7 @@ def integrated(slope: object, attitude: Rotation, rate: Floats, t_s: Floats) -> 
     return Rotation.from_matrix(run.y[:9].T.reshape(-1, 3, 3)), run.y[9:].T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stored", [NONE, np.array([1.5, -2.0, 3.0])])
 def test_a_free_vehicle_in_a_turning_lab(stored: Floats) -> None:
     """Integrated among the stars, where no torque acts, and seen from the lab; and in the lab with the extra torque.
@@ -168,6 +170,7 @@ def test_a_spinning_wheel_is_a_gyrocompass() -> None:
     np.testing.assert_allclose(torque, [0, -2 * up, 2 * north], rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_a_flown_vehicle_feels_the_earth_turn() -> None:
     """Let go with no turn among the stars, it turns in the lab with -15.04 deg/h about the Earth's axis."""
     earth = earth_rate_lab_rad_s(SiteConfig(latitude_deg=39.8, x_azimuth_deg=90))

@@ -220,6 +220,7 @@ def test_spin_up_is_the_integral_of_its_rate(begin: tuple, end: tuple, lasts_s: 
     np.testing.assert_allclose([ref.state_at(1.0 + t)[1] for t in at], [rate(t) for t in at], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_spin_up_from_rest_and_to_rest_again_turns_by_half_of_rate_times_time() -> None:
     """The mean of the smoothstep is 1/2; the axis stands still, so this is exact."""
     up, down = (SPIN | {"rate_deg_s": w, "duration": "10 s"} for w in ([6, 0, -12], [0, 0, 0]))
@@ -230,6 +231,7 @@ def test_spin_up_from_rest_and_to_rest_again_turns_by_half_of_rate_times_time() 
     np.testing.assert_array_equal(ref.state_at(30.0)[1:], np.zeros((2, 3)))
 
 
+@pytest.mark.slow
 def test_first_spin_up_begins_at_the_vehicles_own_rate() -> None:
     ref = reference(SPIN, rate_deg_s=(1.0, 2.0, -3.0))
     np.testing.assert_allclose(np.degrees(ref.state_at(0.0)[1]), [1, 2, -3], rtol=1e-14)
@@ -245,6 +247,7 @@ def test_a_spin_up_of_too_many_knots_is_refused_in_one_line() -> None:
     reference(HOLD, fast | {"duration": "10 h"})  # one axis needs no knots
 
 
+@pytest.mark.slow
 def test_sine_swings_by_its_amplitude_about_the_attitude_it_started_from() -> None:
     """Between the first and the last period phi(t) is amplitude sin(2 pi f t), exactly."""
     ref, amplitude = reference(HOLD, SINE), np.radians([4, -2, 1])

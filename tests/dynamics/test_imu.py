@@ -188,6 +188,7 @@ def test_compensated_earth_leaves_a_still_vehicle_where_it_is(attitude: Rotation
     assert (believed * attitude.inv()).magnitude() < 1e-11
 
 
+@pytest.mark.slow
 def test_compensation_holds_on_a_turning_vehicle() -> None:
     """20 s at 20 deg/s: what is left is the swing of the Earth rate in the body, Omega (w dt)^2 / 12 for 20 s: 1e-10.
 
@@ -345,6 +346,7 @@ def test_one_knot_is_refused_and_no_sample_is_none() -> None:
 # --- the unit's errors
 
 
+@pytest.mark.slow
 def test_all_off_is_exact() -> None:
     """Zero parameters leave every bit."""
     ideal = CONE.felt(np.arange(0, 1.0005, 1e-3), np.arange(1, 401) * STEP, EARTH)
@@ -393,6 +395,7 @@ def test_one_error_more_leaves_the_noise_as_it_was() -> None:
     np.testing.assert_allclose(got, quiet, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_units_off_the_line_scatter_as_declared() -> None:
     """2000 units: a standard deviation is sure to 1/sqrt(2 n), a mean to sigma/sqrt(n); 4 sigma of each."""
     many = [Imu.from_config(ImuConfig(hardware_seed=seed), np.random.default_rng(0)) for seed in range(2000)]
@@ -422,6 +425,7 @@ def test_scale_and_misalignment_on_a_known_turn() -> None:
     np.testing.assert_allclose(backwards.angle_rad.sum(axis=0), -total, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_bias_is_the_rate_at_rest() -> None:
     one = unit({"turn_on_bias_deg_h": 5.0, "bias_deg_h": 2.0})
     count = one.measure(steady([0, 0, 0], 1))
@@ -557,6 +561,7 @@ def test_theory_of_the_wandering_bias_peaks_at_0617() -> None:
     np.testing.assert_allclose(markov_allan(300.0, 1.0, 300.0), np.sqrt(variance), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_allan_deviation_of_an_ln200_is_its_random_walk_at_one_second() -> None:
     """Forty minutes at 400 Hz with all its errors: ADEV 4.20 deg/h at 1 s (bar: 5 %).
 

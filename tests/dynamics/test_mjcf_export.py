@@ -81,6 +81,7 @@ def vertices_m(model: mujoco.MjModel, data: mujoco.MjData, prefix: str) -> np.nd
 # The model
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", STARTS)
 def test_the_exported_laboratory_flies_like_the_stepped_model(start: str) -> None:
     angles_deg, rate = STARTS[start]
@@ -138,6 +139,7 @@ def test_export_leaves_the_stepped_model_alone_and_weighs_nothing() -> None:
     assert not model.geom_conaffinity[added].any()
 
 
+@pytest.mark.slow
 def test_a_vehicle_of_mesh_files_stands_alone(tmp_path: Path) -> None:
     """The tetrahedron is off its origin, turned, scaled and mirrored; it stays where it was, without its file."""
     points = np.array([[0.1, 0.2, 0.0], [0.6, 0.2, 0.1], [0.1, 0.5, 0.0], [0.2, 0.2, 0.7]])
@@ -177,6 +179,7 @@ def test_a_vehicle_that_has_its_own_camera_lab_is_refused(tmp_path: Path) -> Non
 # Where things stand
 
 
+@pytest.mark.slow
 def test_dome_and_leds_stand_where_the_scene_has_them() -> None:
     scene, vehicle, sources = dome_lab()
     model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
@@ -253,6 +256,7 @@ SURFACES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("surface", SURFACES)
 def test_the_lab_s_camera_has_all_of_the_dome_and_of_the_vehicle_in_view(surface: str) -> None:
     scene, vehicle, sources = dome_lab(SURFACES[surface])

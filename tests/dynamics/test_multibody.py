@@ -299,6 +299,7 @@ def test_mujocos_warning_is_an_error_and_leaves_no_file(tmp_path: Path, monkeypa
 # --- the scene's own maneuver ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_pid_flies_the_afit_maneuver() -> None:
     """80 kg, tens of micrometers out of balance: below 0.02 deg throughout, below 0.001 deg when settled."""
     given = yaml.safe_load((SCENES / "afit_simsat.yaml").read_text(encoding="utf-8"))
@@ -542,6 +543,7 @@ def test_what_the_scene_declares_is_not_the_file_s_to_say(tmp_path: Path, right:
         spoilt(tmp_path, right, wrong, wheels={}, fans={})
 
 
+@pytest.mark.slow
 def test_a_reference_to_a_locked_joint_is_told_why(tmp_path: Path) -> None:
     sensor = '<sensor><jointvel joint="wheel_x"/></sensor></mujoco>'
     with pytest.raises(InputError, match=r"vehicle\.wheels is off, which locks joint wheel_x"):
@@ -549,6 +551,7 @@ def test_a_reference_to_a_locked_joint_is_told_why(tmp_path: Path) -> None:
     assert len(spoilt(tmp_path, "</mujoco>", sensor, wheels={}).wheels) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "inertial",
     [

@@ -143,6 +143,7 @@ def test_the_camera_s_own_housing_does_not_blind_it(tmp_path: Path) -> None:
     assert picture(furnished(tmp_path, on_bus(cap.format("0.43"))))[1] == set()
 
 
+@pytest.mark.slow
 def test_a_geom_that_cannot_be_seen_hides_nothing(tmp_path: Path) -> None:
     clear = on_bus(mast(MAST_M).replace("/>", ' rgba="1 1 1 0"/>'))
     assert len(picture(furnished(tmp_path, clear))[1]) == len(picture(furnished(tmp_path, SIMSAT))[1])
@@ -270,6 +271,7 @@ def test_a_panel_hides_its_leds_from_above_as_far_as_it_reaches() -> None:
     assert not behind_wall(panel, np.array([0.1, 0.2, 0.5]), np.array([[0.3, 0.2, 1.0]])).any()
 
 
+@pytest.mark.slow
 def test_a_wall_hides_what_its_scene_says(tmp_path: Path) -> None:
     """Through `furnish`: a camera beside a narrow drum looks at the wall's outside, and at LEDs beneath its edge."""
     beside = SIMSAT.replace('name="star_camera" pos="0 0 0.081"', 'name="star_camera" pos="0.5 0 0.0"')

@@ -99,6 +99,7 @@ def test_energy_and_momentum_are_kept_for_a_minute_where_nobody_drives() -> None
     assert np.ptp(flight.angles_rad[vehicle.gimbals.qpos]) > 1  # rad: they did swing
 
 
+@pytest.mark.slow
 def test_torque_free_motion_keeps_momentum_and_energy() -> None:
     """A tumble about the middle axis, a minute long: L in the lab and w.Jw/2 stay to 1e-11 of themselves."""
     vehicle = multibody.build(vehicle_config(mount="free"))

@@ -54,6 +54,7 @@ def test_the_spline_goes_through_its_samples_with_a_unit_quaternion() -> None:
     np.testing.assert_allclose(np.linalg.norm(spline.states_at(between)[0], axis=1), 1, rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_rate_and_acceleration_are_the_derivatives_of_the_attitude() -> None:
     """Central differences within the steps, the continued ends included: off by their own h^2 and by rounding / h."""
     spline, h = fit_spline(sampled()), 1e-4
@@ -65,6 +66,7 @@ def test_rate_and_acceleration_are_the_derivatives_of_the_attitude() -> None:
     np.testing.assert_allclose((after[1] - before[1]) / (2 * h), acceleration, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_rate_and_acceleration_are_continuous_at_every_sample() -> None:
     spline, eps = fit_spline(sampled()), 1e-9
     before, after = spline.states_at(TIMES[1:-1] - eps), spline.states_at(TIMES[1:-1] + eps)

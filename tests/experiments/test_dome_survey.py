@@ -258,6 +258,7 @@ def test_frames_that_hang_on_no_others_are_left_out() -> None:
 # --- the file -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_map_is_read_as_it_was_written(statistics: dict[str, Any], folder: Path, tmp_path: Path) -> None:
     first = dome_map_file.read_dome_map(folder / "leds.ecsv")
     dome_map_file.write_dome_map(tmp_path / "again.ecsv", first)
@@ -266,6 +267,7 @@ def test_a_map_is_read_as_it_was_written(statistics: dict[str, Any], folder: Pat
     assert first.distortion_sigma == (0.0,) * 5  # held
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("right", "wrong", "says"),
     [

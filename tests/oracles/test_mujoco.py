@@ -126,6 +126,7 @@ def test_mujoco_draws_the_ball_where_our_optics_project_it(pose: str, tmp_path: 
     np.testing.assert_allclose(found, wanted, rtol=0, atol=0.25)
 
 
+@pytest.mark.slow
 def test_right_of_mujoco_s_camera_is_right_and_up_is_up(tmp_path: Path) -> None:
     """By MuJoCo's manual alone: its camera looks along -z, +x is right, +y is up; row 0 is the top."""
     balls_m = np.array([[0.6, 0.0, -2.0], [0.0, 0.4, -2.0]])

@@ -114,6 +114,7 @@ def test_the_standard_s_own_examples() -> None:
     np.testing.assert_allclose(matrix_b_from_a(np.array(rows[0])) @ [1, 0, 0], [0, -1, 0], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_under_the_stars_the_message_puts_every_star_on_its_pixel(stars: Flown, tmp_path: Path) -> None:
     """Star directions by the annex's matrix into the camera, by the lens onto the chip, where the truth has them."""
     testbed, run = stars

@@ -107,6 +107,7 @@ def test_every_sample_of_the_imu_is_in_its_table() -> None:
     assert table["accelerometer_overloaded"].tolist() == [True] + [False] * 7
 
 
+@pytest.mark.slow
 def test_the_plot_shows_a_panel_for_everything_there_is() -> None:
     heights = [
         cv2.imdecode(np.frombuffer(telemetry_report.figure(log), np.uint8), cv2.IMREAD_COLOR).shape[0]

@@ -187,6 +187,7 @@ def test_a_contradiction_is_told_with_its_line(lens: Path, said: str, complaint:
     assert "line" in str(raised.value)
 
 
+@pytest.mark.slow
 def test_a_frame_is_solved_by_its_camera_s_calibration(lens: Path) -> None:
     """A focal length wrong by a part in a thousand, as chessboards have it, is found again."""
     own = lens.parent / "mine.yaml"

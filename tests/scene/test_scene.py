@@ -444,6 +444,7 @@ def test_a_kind_that_is_none_is_answered_with_those_that_are(
     assert re.fullmatch(rf"{re.escape(key)}: unknown \w+ '\w+'; allowed: {allowed} {re.escape(place)}", message)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "value", "says"),
     [

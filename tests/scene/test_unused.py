@@ -117,6 +117,7 @@ CASES = [
 KEYS = [case.key for case in CASES]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=KEYS)
 def test_a_key_without_effect_is_refused(case: Case) -> None:
     """In one line: the key, why, what is allowed, where; and not where it has an effect."""
@@ -160,6 +161,7 @@ def outcome(scene: str, settings: dict[str, str]) -> tuple[np.ndarray, np.ndarra
 SAMPLE = ("tracker.limit_mag", "tracker.survey.surface_seed", "light.led.pwm_period", "camera.detector.dark_doubling_c")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [case for case in CASES if case.key in SAMPLE], ids=lambda case: case.key)
 def test_a_refused_key_changes_neither_motion_nor_frame_nor_solution(case: Case) -> None:
     check_no_effect(case)

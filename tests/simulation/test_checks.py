@@ -96,6 +96,7 @@ def test_a_disk_that_is_not_resolved_is_not_wrong() -> None:
     assert errors[0] < 1e-3 < errors[1] < 0.9 * errors[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("diameter_mm", [0.2, 1.0, 2.0])
 def test_peaks_are_wrong_by_what_a_convolution_of_the_ellipse_says(diameter_mm: float) -> None:
     """The peak behind a Gaussian blur is its integral over the ellipse, over the area. The law takes disk and blur
@@ -128,6 +129,7 @@ def test_the_warning_says_how_wrong_the_worst_disk_is() -> None:
     assert error == pytest.approx(100 * (1 - cos_i / cos_a**3), abs=1.5)  # the angles are rounded to a degree
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["afit_simsat", "apl_dome", "nps_tas2", "celestial_dome", "tas2_vscmg"])
 def test_no_shipped_dome_is_warned_of(name: str) -> None:
     """Their LEDs face the camera and are near the axis, or are not resolved."""

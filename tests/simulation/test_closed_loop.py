@@ -66,6 +66,7 @@ def in_sigma(telemetry: Telemetry) -> Floats:
 # --- the accident -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_frame_is_solved_and_used(bumped: Testbed) -> None:
     assert bumped.update_statuses == dict.fromkeys(range(8), "used")
     assert {report.attitude.status for report in bumped.reports.values()} == {"solved"}
@@ -101,6 +102,7 @@ def test_the_filter_knows_what_it_does_not_know(bumped: Testbed) -> None:
     assert (sigma_deg[telemetry.t_s > 2.45] < 0.01).all()
 
 
+@pytest.mark.slow
 def test_the_filter_allows_for_the_survey_s_error() -> None:
     """An error of survey and lever that all solutions share does not average out, and the filter says so."""
     telemetry = told(prepared(**EARLY))
@@ -143,6 +145,7 @@ def test_steered_by_the_imu_it_stays_where_the_imu_is_wrong() -> None:
 # --- frames in flight and after it --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_was_solved_in_flight_is_what_the_frames_say_afterwards(bumped: Testbed) -> None:
     """Rendered from a piece of the flight when its time came, and from the whole: the same photons, one answer."""
     kept = [shot.report.attitude for shot in run.run(bumped, build_tracker(bumped))]

@@ -165,6 +165,7 @@ def test_it_gets_what_the_page_says() -> None:
     assert seen[1].achieved_nm[2] == pytest.approx(0.6, rel=1e-9)  # the wheels' limit, not the 5 N m asked for
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("feedback", ["imu", "filter"])
 def test_it_measures_what_the_scene_s_feedback_gives(feedback: str) -> None:
     seen: list[ControllerInput] = []
@@ -199,6 +200,7 @@ def test_set_up_and_input_come_through_json_as_they_were() -> None:
 # --- what goes wrong ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("torque", "told"),
     [
@@ -221,6 +223,7 @@ def test_a_large_torque_is_limited_by_the_actuators() -> None:
     np.testing.assert_array_equal(check_torque([0, 0, 599], 0.6), [0, 0, 599])
 
 
+@pytest.mark.slow
 def test_a_function_that_fails_is_named_with_its_time(installed: Path) -> None:
     from mypd import crashing, weak
 
@@ -278,6 +281,7 @@ def test_a_program_that_fails_is_named_and_ended(text: str, told: str, tmp_path:
         os.kill(int((tmp_path / "pid").read_text()), 0)
 
 
+@pytest.mark.slow
 def test_a_program_ends_with_its_motion(tmp_path: Path) -> None:
     """Also where the motion does not begin: a tilt beyond the stop is found after the controller was started."""
     text = (

@@ -147,6 +147,7 @@ def moving(testbed: Testbed, lab_from_body: Rotation, rate_deg_s: Floats) -> Tes
     return replace(testbed, trajectory=Trajectory(t_s, lab_from_body * turned, np.tile(rate, (9, 1))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "rate_deg_s"), [("afit_simsat", 2.0), ("shefex2", 2.0), ("apl_dome", 0.5)])
 def test_positions_electrons_peaks_and_paths_are_the_renderer_s(name: str, rate_deg_s: float) -> None:
     """Peaks are those of centered images: an image between pixels is lower by what a pixel's phase does."""

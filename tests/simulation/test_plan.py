@@ -49,6 +49,7 @@ def samples_of(testbed: Testbed) -> tuple[detection.Context, Samples]:
 # Attitudes
 
 
+@pytest.mark.slow
 def test_frames_are_checked_where_the_vehicle_will_be() -> None:
     """The reference at mid-exposure; the controller follows it to a hundredth of a degree."""
     testbed = bed("afit_simsat", exposure__frames="40")
@@ -106,6 +107,7 @@ def test_the_field_and_the_pixel_are_the_pinhole_s(afit: plan.Check) -> None:
     assert field["arcsec_px"] == pytest.approx(4e-6 / 36.53e-3 / ARCSEC_RAD, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["afit_simsat", "shefex2", "apl_dome"])
 def test_as_many_lights_are_counted_as_the_tracker_uses(name: str) -> None:
     testbed = bed(name, exposure__frames="1")
@@ -140,6 +142,7 @@ def test_the_depth_of_focus_ends_where_defocus_is_a_pixel(afit: plan.Check) -> N
     assert fact(check(bed("shefex2")), "depth of focus").values["far_m"] == math.inf
 
 
+@pytest.mark.slow
 def test_smear_is_the_rate_times_the_exposure() -> None:
     """Stars cross f w T pixels; under a dome the pupil on its lever moves too: by R / (R - M) more."""
     moving = fact(check(bed("shefex2", motion__rate_deg_s="[3, 4, 0]")), "smear").values
@@ -169,6 +172,7 @@ def test_the_cap_s_margin_is_the_angle_beyond_the_field() -> None:
     assert found.needed_deg == pytest.approx(25 + math.degrees(at_bearing), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_what_the_tracker_believes_is_said() -> None:
     changes = {
         "tracker__survey": "{led_sigma: 0.3 mm, rotation_deg: [0.01, 0, 0]}",
@@ -241,6 +245,7 @@ def test_a_mistake_is_warned_of_with_its_key(scene: str, changes: dict[str, str]
     assert not [line for line in check(bed(scene)).findings if words in line]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "key"),
     [
@@ -285,6 +290,7 @@ def test_only_the_plans_with_saturated_and_too_few_leds_are_warned_of() -> None:
     assert {name.removesuffix("_ideal") for name in warned} == {"afit_test2", "afit_test3"}
 
 
+@pytest.mark.slow
 def test_a_check_costs_a_fraction_of_a_second() -> None:
     """Of CPU, after its functions were loaded once: against the time to set up the same scene, twice."""
     testbed = bed("shefex2")

@@ -84,6 +84,7 @@ def true_centroids(truth: Truth) -> Centroids:
 # Without noise
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "start"), [("afit_simsat_ideal", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS]
 )
@@ -105,6 +106,7 @@ def test_a_shipped_scene_without_noise_and_fixed_pattern_is_solved(name: str) ->
     assert error_deg(build_tracker(testbed).solve(frame.image_dn).attitude, truth) < 5e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "start"), [("afit_simsat_ideal", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS]
 )
@@ -308,6 +310,7 @@ def test_a_blinded_frame_is_a_status_and_no_attitude() -> None:
     assert shot.report.attitude.cam_from_ref is None
 
 
+@pytest.mark.slow
 def test_a_starless_frame_is_a_status_and_no_attitude() -> None:
     testbed = prepared("shefex2", exposure__frames="1", light__limit_mag="0", motion__start="{ra_deg: 10, dec_deg: 60}")
     (shot,) = shots_of(testbed)
@@ -424,6 +427,7 @@ def test_a_bright_body_shortens_the_exposure_and_turning_away_restores_the_stars
     assert not any(shot.report.attitude.solved for shot in shots[5:gone])
 
 
+@pytest.mark.slow
 def test_frames_taken_in_flight_are_taken_again_with_the_same_exposures() -> None:
     """For the filter frames are taken in flight; the run shows the very same, and one that flies anew agrees."""
     flight = {"vehicle__imu": "{}", "filter": "{start_deg: 0.1}", "motion__control": "none"}

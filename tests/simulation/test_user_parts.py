@@ -290,6 +290,7 @@ def sky() -> skysim.results.run.Run:  # type: ignore[name-defined]
     return skysim.simulate(skysim.load_scene("shefex2", STILL))
 
 
+@pytest.mark.slow
 def test_a_function_of_an_image_is_a_tracker(sky: Any) -> None:
     """What it returns, in every form; and it gets each image once, in order, unchanged."""
     truth, images = sky[0].truth.cam_from_lab, []
@@ -308,6 +309,7 @@ def test_a_function_of_an_image_is_a_tracker(sky: Any) -> None:
         assert [np.array_equal(image, frame.image) for image, frame in zip(images, sky, strict=True)] == [True, True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("answer", "status"),
     [
@@ -328,6 +330,7 @@ def test_what_a_function_cannot_answer_is_the_frame_s_status(answer: Any, status
     assert run_[0].row.status == status
 
 
+@pytest.mark.slow
 def test_an_estimator_or_a_name_is_a_tracker(sky: Any) -> None:
     height_px, width_px = sky[0].image.shape
     camera = estimator.Camera.from_fov(width_px, height_px, fov_deg=14.87)
@@ -349,6 +352,7 @@ def test_an_estimator_or_a_name_is_a_tracker(sky: Any) -> None:
             skysim.simulate(scene, tracker=wrong)
 
 
+@pytest.mark.slow
 def test_a_function_s_attitudes_reach_the_filter_and_the_controller() -> None:
     """With a covariance: a tracker that errs by half a degree of yaw pulls filter and vehicle to it."""
     changes = {

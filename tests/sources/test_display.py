@@ -304,6 +304,7 @@ def test_a_bench_s_stars_follow_pogson_to_half_a_gray() -> None:
     np.testing.assert_allclose(got[made.magnitude < 2], 1, rtol=1e-12, atol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("conjugate_m", [None, 20.0, 500.0])
 def test_a_camera_on_a_lever_sees_no_parallax_but_that_of_the_collimation(conjugate_m: float | None) -> None:
     """Stars at D are seen along D d - r, in the light of 1 / |D d - r|^2; r is SimSat's camera, tilted."""
@@ -350,6 +351,7 @@ def glow_e_s(testbed: Testbed) -> np.ndarray:
     return glow
 
 
+@pytest.mark.slow
 def test_a_black_panel_s_glow_is_that_of_all_its_pixels_by_the_contrast() -> None:
     """20 x 15 pixels drawn white one by one, off the axis and seen aslant: their light on the frame over the contrast.
 
@@ -416,6 +418,7 @@ def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None
 # Slips
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "says"),
     [

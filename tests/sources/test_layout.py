@@ -77,6 +77,7 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 # Spreads
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("surface", [SPHERE, MEASURED, FLAT])
 @pytest.mark.parametrize("layout", SPREADS, ids=lambda part: part["kind"])
 def test_every_led_is_on_the_surface_faces_along_its_normal_and_is_within_the_cap(layout: dict, surface: dict) -> None:
@@ -98,6 +99,7 @@ def test_fibonacci_has_its_share_in_every_cap() -> None:
         np.testing.assert_allclose(seen, 20_000 * share, rtol=0.02, atol=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("surface", [SPHERE, MEASURED, FLAT])
 def test_poisson_disk_leaves_none_too_near_and_no_room(surface: dict) -> None:
     """No pair nearer than the spacing; and no place, but one in a thousand, has every LED farther than that."""
@@ -142,6 +144,7 @@ def test_random_leds_are_a_poisson_field() -> None:
 # 1,000 attitudes: an even dome's own error is that of its LEDs at the field's border, a random one's of the .53 of
 # 1,400 LEDs that tilts to 25 deg look at, 2.5 % conditioned on all: three of either.
 # Poisson-disk's LEDs stand denser along the rim, as if the cap were wider by half of their spacing.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("layout", "rim_in", "within"), [(SPREADS[0], 0, 0.02), (SPREADS[1], 0, 0.08), (SPREADS[2], 0.65, 0.03)]
 )
@@ -164,6 +167,7 @@ def test_the_afit_field_sees_eight_of_a_thousand(layout: dict, rim_in: float, wi
     assert round(share, 3) == 0.008
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", [*SPREADS, BOARDS, SKY | {"count": 40}], ids=lambda part: part["kind"])
 def test_the_same_hardware_is_the_same_dome_and_another_has_other_lamps(layout: dict) -> None:
     first, again, other = (lit(layout | {"hardware_seed": s}, scatter=0.08) for s in (5, 5, 6))

@@ -112,6 +112,7 @@ def test_a_dome_that_fits_is_built(room: dict[str, Any], on: dict[str, Any]) -> 
     check(room, on)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("room", "on", "complaint"),
     [
@@ -213,6 +214,7 @@ optimize:
 """
 
 
+@pytest.mark.slow
 def test_a_room_constrains_a_search(tmp_path: Path) -> None:
     """A candidate that does not fit is infeasible, and the reason says by how much."""
     (tmp_path / "study.yaml").write_text(SEARCH)

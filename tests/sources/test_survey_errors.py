@@ -137,6 +137,7 @@ def test_without_errors_the_map_is_the_truth_bit_for_bit() -> None:
 ALL = "{{led_sigma: 0.2 mm, lever_sigma: {lever}, seed: {seed}}}"
 
 
+@pytest.mark.slow
 def test_the_survey_is_hardware_the_frames_seed_does_not_touch_it_and_its_own_does() -> None:
     def places(seed: int, own: int) -> tuple[bytes, ...]:
         told = ALL.format(lever="0.1 mm", seed=own)

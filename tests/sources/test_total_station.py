@@ -61,6 +61,7 @@ def test_a_survey_without_errors_is_the_truth() -> None:
     np.testing.assert_allclose(found, PLACES_M, rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_the_own_errors_have_the_covariance_that_is_claimed() -> None:
     """Monte Carlo of angles and distances through the polar coordinates, each LED, each element."""
     config = station()
@@ -76,6 +77,7 @@ def test_the_own_errors_have_the_covariance_that_is_claimed() -> None:
     assert np.abs(across).max() < 5 * variance.max() / np.sqrt(DRAWS)
 
 
+@pytest.mark.slow
 def test_the_common_errors_have_the_covariance_that_is_claimed() -> None:
     """Between any two LEDs too: sum over the errors of the outer products of their displacements."""
     config = station()

@@ -145,6 +145,7 @@ def test_the_imu_feels_the_vibration() -> None:
     assert np.ptp(still[:, 0]) > 400 * ARCSEC
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate_hz", [100, 400, 1000])
 def test_tick_by_tick_it_feels_the_whole_flight(rate_hz: int) -> None:
     """The samples of all ticks together are those of the whole flight at once: as many, and their sum to 1e-9 rad."""
@@ -267,6 +268,7 @@ def doubted_of(name: str, changes: dict[str, str]) -> list[str]:
     return check(build_testbed(loader.load(name, changes))).findings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("surface", "doubted"),
     [
@@ -286,6 +288,7 @@ def test_a_surface_that_is_no_upright_ellipsoid_is_doubted(surface: str, doubted
         assert 1 < missed_mm < 300 * np.radians(3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["afit_simsat", "apl_dome"])
 def test_a_camera_outside_of_the_dome_is_doubted(scene: str) -> None:
     """Its frames would be black, without a word."""
@@ -299,6 +302,7 @@ def test_under_the_stars_there_is_no_surface_to_doubt() -> None:
     assert doubted_of("shefex2", {}) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
@@ -319,6 +323,7 @@ def test_what_no_tracker_copes_with_is_doubted(changes: dict[str, str], told: st
     assert lines[0] in check(testbed).findings
 
 
+@pytest.mark.slow
 def test_a_doubt_is_one_line_before_the_run_which_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     changes = ["light.surface.tilt_deg=[8, 0]", "exposure.first=0 s"]
     run_command.run("afit_simsat", frames=1, seed=None, out=tmp_path, set_=changes, scene_3d=False, json=True)

@@ -130,6 +130,7 @@ def test_a_folder_has_the_frame_and_goes_with_the_program(kind: str) -> None:
     assert not path.parent.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "told"),
     [
@@ -285,6 +286,7 @@ def test_a_trial_of_another_release_of_a_tracker_is_another(installed: None, tmp
     assert setups.scene_hash(told) != before
 
 
+@pytest.mark.slow
 def test_a_package_s_tracker_is_scored_by_the_error_that_it_makes(installed: None) -> None:
     """36 arcsec across in frame 0; raised in 1; in 2 a roll of 0.2 deg as well, which is wrong."""
     told = loader.load("shefex2", {"exposure.frames": "3"})

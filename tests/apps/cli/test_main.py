@@ -94,6 +94,7 @@ def test_help_lists_the_commands(skysim: Skysim) -> None:
         assert f" {command} " in ran.out
 
 
+@pytest.mark.slow
 def test_scenes_are_listed_with_their_titles(skysim: Skysim) -> None:
     listed = json.loads(skysim("scenes", "--json").out)
     assert {entry["name"] for entry in listed} == {path.stem for path in SCENES.glob("*.yaml")}
@@ -102,6 +103,7 @@ def test_scenes_are_listed_with_their_titles(skysim: Skysim) -> None:
     assert "AFIT SimSat" in skysim("scenes").out
 
 
+@pytest.mark.slow
 def test_export_writes_a_scene_that_mujoco_s_own_loader_takes(skysim: Skysim, tmp_path: Path) -> None:
     path = tmp_path / "made" / "lab.xml"
     done = skysim("scenes", "export", "simsat_cmg", "--out", path)
@@ -132,6 +134,7 @@ def test_render_leaves_frames_with_their_truth_and_nothing_else(rendered: Path) 
     assert {p.name for p in rendered.iterdir()} == {"frame_0000.fits", "frame_0000.png", "frame_0000.ecsv"}
 
 
+@pytest.mark.slow
 def test_what_only_the_first_frame_shows_to_be_wrong_costs_no_earlier_results(skysim: Skysim, tmp_path: Path) -> None:
     words = ["render", "afit_simsat", "--frames", "1", "--out", str(tmp_path)]
     assert skysim(*words).code == 0
@@ -151,6 +154,7 @@ def test_a_frame_of_a_camera_outside_of_the_dome_is_not_black_without_a_word(sky
     assert told.err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_preview_is_a_picture_beside_the_frame(skysim: Skysim, tmp_path: Path) -> None:
     ran = skysim("render", "shefex2", "--frames", "1", "--preview", "--out", str(tmp_path))
     assert ran.code == 0
@@ -243,6 +247,7 @@ def test_a_run_s_json_parses_and_counts(skysim: Skysim, tmp_path: Path) -> None:
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
 
 
+@pytest.mark.slow
 def test_the_same_seed_writes_the_same_bytes(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
     assert skysim("render", "shefex2", "--frames", "1", "--out", tmp_path).code == 0
     for name in ("frame_0000.fits", "frame_0000.png", "frame_0000.ecsv"):
@@ -255,6 +260,7 @@ def test_a_shorter_run_leaves_no_frames_of_a_longer_one(skysim: Skysim, tmp_path
     assert not (tmp_path / "frame_0039.fits").exists()
 
 
+@pytest.mark.slow
 def test_an_option_overrides_the_scene(skysim: Skysim, tmp_path: Path) -> None:
     skysim("render", "shefex2", "--frames", "1", "--seed", "9", "--out", tmp_path, "--set", "title=Nine")
     assert fits.getheader(tmp_path / "frame_0000.fits")["SEED"] == 9
@@ -486,6 +492,7 @@ def test_a_bad_image_is_one_line_and_leaves_nothing_half_written(
     assert [p.name for p in out.iterdir()] == ["solutions.json"]
 
 
+@pytest.mark.slow
 def test_a_bad_image_does_not_stop_the_good_one_behind_it(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
     good = rendered / "frame_0000.fits"
     ran = skysim("solve", tmp_path / "nosuch.fits", good, "--camera", SHEFEX, "--json", "--out", tmp_path / "out")
@@ -503,6 +510,7 @@ def test_noise_is_looked_at_and_refused_an_attitude(skysim: Skysim, tmp_path: Pa
     assert answer["status"] != "solved"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -540,6 +548,7 @@ def test_a_camera_file_with_a_slip_is_one_line(skysim: Skysim, rendered: Path, t
 # Check a plan, show a scene
 
 
+@pytest.mark.slow
 def test_check_prints_facts_and_warnings_in_eighty_columns(skysim: Skysim) -> None:
     ran = skysim("check", "afit_simsat", "--set", "light.led.intensity=60 mcd")
     assert (ran.code, ran.err) == (0, "")

@@ -118,6 +118,7 @@ def test_fields_know_their_unit_and_their_choices() -> None:
     assert not values["camera.detector.bits"].is_set
 
 
+@pytest.mark.slow
 def test_the_loop_is_closed_by_something_else_whether_the_scene_has_a_word_or_a_section() -> None:
     for name in ("afit_simsat", "simsat_bump", "simsat_slew"):
         values = forms.loop_overrides(name, {}, "truth")

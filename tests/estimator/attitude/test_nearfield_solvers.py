@@ -75,6 +75,7 @@ def compare(method: str, surface: str, tilts: tuple[int, ...], trials: int) -> N
                 assert agrees(squares, published), (tilt, published, rms_and_error(squares))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "surface"), PUBLISHED, ids=" ".join)
 def test_the_reference_s_table(method: str, surface: str) -> None:
     compare(method, surface, (30,), 60)
@@ -160,6 +161,7 @@ def test_the_exact_solve_s_covariance_holds_within_ten_per_cent(trials: int) -> 
     assert 0.0045 < roll_deg < 0.0055 * (1 + 3 / np.sqrt(2 * trials))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("surface", ["flat at 48 in", "NPS flat at 1 m"])
 @pytest.mark.parametrize("method", ["infinity", "thesis", "tappe", "ray_on_surface"])
 def test_every_covariance_is_that_of_the_noise(method: str, surface: str) -> None:

@@ -60,6 +60,7 @@ def test_quest_is_the_svd_s_rotation_in_a_star_tracker_s_field(count: int) -> No
         assert error_rad(quest(cam, ref, np.ones(count)), oracle) < 1e-8
 
 
+@pytest.mark.slow
 @every_solver
 @pytest.mark.parametrize("half_rad", [0.1, 0.01, 1e-3, 2e-4])
 def test_directions_close_together_keep_their_digits(half_rad: float, solve: Solver) -> None:
@@ -72,6 +73,7 @@ def test_directions_close_together_keep_their_digits(half_rad: float, solve: Sol
         assert error_rad(solve(cam, truth.inv().apply(cam), np.ones(3)), truth) < 20 * 2.2e-16 / half_rad
 
 
+@pytest.mark.slow
 @every_solver
 def test_directions_on_one_great_circle_are_enough(solve: Solver) -> None:
     rng = np.random.default_rng(43)
@@ -242,6 +244,7 @@ def davenport_matrix(B: np.ndarray) -> np.ndarray:
     return np.block([[S - trace * np.eye(3), z[:, None]], [z[None], np.array([[trace]])]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RAW)
 @pytest.mark.parametrize("half_turn", [False, True])
 def test_each_bare_method_solves_davenport_s_equation_itself(name: str, half_turn: bool) -> None:
@@ -273,6 +276,7 @@ def test_each_bare_method_stands_at_half_a_turn(name: str, axis: str) -> None:
         assert np.abs(RAW[name](B) - truth.as_matrix()).max() < 1e-13  # rounding over a gap of 0.3
 
 
+@pytest.mark.slow
 def test_no_method_leaves_its_arrays() -> None:
     """NumPy refuses an index beyond an array; compiled code would read and write what lies behind it."""
     plain, rng = interpreted("estimator.attitude.wahba"), np.random.default_rng(56)

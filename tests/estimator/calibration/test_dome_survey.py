@@ -159,6 +159,7 @@ def test_the_free_moves_change_no_pixel() -> None:
     assert np.abs(still_rest).max() < 1e-13 * np.abs(terms.rest @ rest).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [{}, {"loss": "cauchy"}, {"known_length": (0, 7, 0.5)}, {"reference_frame": 4}])
 def test_noise_free_frames_give_all_back(how: dict) -> None:
     found, place, turned, lever = small_survey(0.0, 5, **how)

@@ -136,6 +136,7 @@ def test_an_adjustment_comes_to_rest_where_the_pixels_are(rng: np.random.Generat
         assert_covariance(matrix)
 
 
+@pytest.mark.slow
 def test_no_step_of_an_adjustment_raises_the_cost(monkeypatch: pytest.MonkeyPatch) -> None:
     """Levenberg-Marquardt takes a step only if the cost falls; from this far off the first steps often overshoot."""
     normal_equations, costs = ba.normal_equations, list[float]()

@@ -140,6 +140,7 @@ def test_a_sky_without_patterns_is_refused() -> None:
         pair_index.build(np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0.001, 1]]), np.radians(1.0))
 
 
+@pytest.mark.slow
 def test_a_range_of_magnitudes_is_brute_force_s() -> None:
     rng = np.random.default_rng(35)
     magnitude = np.sort(np.round(rng.uniform(0, 6, 300), 1))  # many are equal

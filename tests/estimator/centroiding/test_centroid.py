@@ -149,6 +149,7 @@ def test_what_the_fit_cannot_fit_keeps_its_center_of_gravity() -> None:
     np.testing.assert_array_equal(fitted.flux, wanted.flux)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("flux_e", "noise_e", "published_px"),
     [(1e4, 15, 0.0097), (1e5, 15, 0.0025), (3e3, 15, 0.022), (1e5, 0.5, 0.0024)],
@@ -207,6 +208,7 @@ def test_stars_side_by_side_do_not_pull_each_other(name: str, apart_px: float) -
     assert np.all((chi2 > 0.7) & (chi2 < 1.3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(CENTROIDERS))
 def test_the_flux_is_the_light_above_the_sky(name: str) -> None:
     image = np.random.default_rng(24).normal(300, 2, (128, 128)) + gaussian((128, 128), 60.2, 70.9, 5e4)
@@ -215,6 +217,7 @@ def test_the_flux_is_the_light_above_the_sky(name: str) -> None:
     assert found.flux[0] == pytest.approx(5e4, abs=225)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(CENTROIDERS))
 def test_a_big_endian_frame_gives_the_same_centroids(name: str) -> None:
     image = np.random.default_rng(25).normal(300, 5, (128, 128)) + gaussian((128, 128), 60.2, 70.9, 5e4)

@@ -170,6 +170,7 @@ def test_the_middle_is_mid_exposure_within_a_true_covariance(length: float) -> N
     assert off[:, 0].std() < np.linalg.norm(ends, axis=1).std() * 3
 
 
+@pytest.mark.slow
 def test_the_fit_reaches_the_bound_along_and_across() -> None:
     along, across = cramer_rao_px(4.41, 2000.0, 15.0)
     # The reference's section 3: .074 and .037 for a streak of 4.41 px, 2,000 e, read noise 15.
@@ -241,6 +242,7 @@ def test_false_streaks_of_white_noise_are_rare() -> None:
     assert frame_background.estimate_background(image).noise.mean() == pytest.approx(9 * 0.375, rel=0.03)
 
 
+@pytest.mark.slow
 def test_streaks_too_faint_to_be_seen_are_found_by_their_direction() -> None:
     """Five streaks of which the filter for round stars sees two at most; nobody tells which way they go."""
     rng = np.random.default_rng(31)

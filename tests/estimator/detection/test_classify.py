@@ -57,6 +57,7 @@ def test_stars_are_stars(sigma: float) -> None:
     assert np.concatenate(flags).tolist() == [0] * 200
 
 
+@pytest.mark.slow
 def test_hot_pixels_are_flagged_and_left_out() -> None:
     rng = np.random.default_rng(41)
     light, xy = sky_frame(rng, 15, 0.7)
@@ -75,6 +76,7 @@ def off_px(found: Centroids, places: np.ndarray) -> np.ndarray:
     return np.linalg.norm(found.xy_px[None] - places[:, None], axis=2).min(axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle_deg", [10.0, 45.0, 100.0, 170.0])
 def test_a_track_among_round_stars_is_flagged(angle_deg: float) -> None:
     rng = np.random.default_rng(42)
@@ -127,6 +129,7 @@ def test_branches_are_texture() -> None:
     assert [flags_near(blobs, *place) for place in clear] == [0] * len(clear)
 
 
+@pytest.mark.slow
 def test_smeared_stars_are_no_tracks_and_tell_their_streak() -> None:
     rng = np.random.default_rng(46)
     light = np.zeros(SHAPE)
@@ -180,6 +183,7 @@ def test_saturated_stars_are_kept_with_a_sigma_that_covers_them(centroider: str,
     assert np.mean(np.concatenate(scaled) ** 2) < 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("centroider", ["cog", "gaussian_fit"])
 def test_a_star_on_a_mended_pixel_is_known_as_well_as_it_says(centroider: str) -> None:
     rng = np.random.default_rng(48)

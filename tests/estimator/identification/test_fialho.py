@@ -19,6 +19,8 @@ from estimator.identification.published.fialho import (
     triplets,
 )
 
+pytestmark = pytest.mark.slow  # much is compiled
+
 SIGMA_RAD, EPSILON_MAG = np.radians(5 / 3600), 0.25
 HALF_TAN = np.tan(np.radians(10))
 DIAGONAL_RAD = 2 * np.arctan(np.sqrt(2) * HALF_TAN)
@@ -87,7 +89,6 @@ def by_brute_force(seen: Floats, light: Floats, sky: pair_index.PairIndex, eps: 
 PAIRS = [(0, 1), (0, 2), (1, 2)]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("optimized", [False, True])
 @pytest.mark.parametrize("gate", [1.0, np.inf])
 def test_the_triplets_are_brute_force_s(gate: float, optimized: bool) -> None:
@@ -117,7 +118,6 @@ def test_the_number_of_triplets_is_theory_s(sky: pair_index.PairIndex) -> None:
     assert found == pytest.approx(expected, abs=5 * np.sqrt(expected) + 0.03 * expected)
 
 
-@pytest.mark.slow
 def test_lists_from_neighbors_answer_as_lists_from_the_whole_catalog(sky: pair_index.PairIndex) -> None:
     rng = np.random.default_rng(104)
     for _ in range(60):

@@ -88,6 +88,7 @@ def test_the_information_is_that_of_the_projection_s_slopes() -> None:
     np.testing.assert_allclose(info, slopes @ slopes.T / 0.01**2, rtol=0, atol=1e-7 * np.abs(info).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sigmas", "matched"), [(3.0, 6), (-3.0, 6), (8.0, 0)])
 def test_leds_are_matched_within_the_error_of_their_pair_s_direction(sigmas: float, matched: int) -> None:
     """Two detections of error sigma, s apart, give the roll about their middle to sqrt(2) sigma / s.

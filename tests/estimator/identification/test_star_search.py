@@ -78,6 +78,7 @@ def test_the_sky_holds_every_pair_in_its_bin() -> None:
 coordinate = st.one_of(st.floats(-1, 1), st.sampled_from([-1.0, 0.0, 1.0]))
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(coordinate, coordinate, coordinate, st.floats(1e-4, 0.05))
 @example(-1.0, -1.0, 0.921875, 0.046875)  # the star stands at a tangent of 1.13 of the face
@@ -145,6 +146,7 @@ def test_half_of_the_lights_may_be_false(known: bool) -> None:
     assert solved == 40
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zoom", [0.0, 0.05])
 def test_the_covariance_is_true(zoom: float) -> None:
     """NEES of 300 attitudes; with the focal length unknown to 5 % that of the zoom's own error too."""
@@ -184,6 +186,7 @@ def test_lights_that_fell_anywhere_are_refused() -> None:
         assert not len(solve(detections_of(tangent, np.sort(rng.choice(MAG, count)))).star)
 
 
+@pytest.mark.slow
 def test_a_mirrored_sky_is_refused() -> None:
     rng = np.random.default_rng(6)
     for _ in range(40):

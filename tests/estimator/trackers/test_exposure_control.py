@@ -86,6 +86,7 @@ def test_bad_limits_are_one_clear_line(limits: dict[str, float], what: str) -> N
 # ---- What the chart looks at ----
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["uint8", "uint16", "float32"])
 def test_objects_with_more_than_one_saturated_pixel_are_counted(kind: str) -> None:
     rng = np.random.default_rng(80)
@@ -146,6 +147,7 @@ def flown(
 GLARE_E_S = 4e5
 
 
+@pytest.mark.slow
 def test_an_intruder_shortens_the_exposure_and_its_leaving_restores_the_stars(testbed: Testbed) -> None:
     glare = [0.0] * 3 + [GLARE_E_S] * 19 + [0.0] * 12
     control = Control(mean_dn=150.0)
@@ -176,6 +178,7 @@ def test_without_the_mean_the_same_intruder_would_lengthen_it(testbed: Testbed) 
     assert guarded[-1].time_s < 0.0021
 
 
+@pytest.mark.slow
 def test_one_planet_shortens_nothing_and_four_do(testbed: Testbed) -> None:
     # Strengths multiplied until the brightest stars of the field saturate: one of them, then many.
     truth = exposure.render_frame(testbed, 0)[1]

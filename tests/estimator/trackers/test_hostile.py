@@ -82,6 +82,7 @@ def test_no_lights_of_noise_have_an_attitude(tracker: StarTracker, xy_px: NDArra
     assert not tracker.solve_centroids(Centroids(xy_px, sigma_px, flux)).solved
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS)
 @BRIEF
 @given(count=some.integers(0, 6), data=some.data())

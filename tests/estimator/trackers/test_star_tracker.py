@@ -142,6 +142,7 @@ def test_a_mirrored_field_is_a_status(tracker: StarTracker) -> None:
     assert not any(answer.solved for answer in mirrored)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("centroider", ["cog", "gaussian_fit"])
 def test_a_picture_gives_its_attitude(tracker: StarTracker, centroider: str) -> None:
     rng = np.random.default_rng(87)
@@ -163,6 +164,7 @@ def replaced(tracker: StarTracker, settings: Settings) -> StarTracker:
     return other
 
 
+@pytest.mark.slow
 def test_a_dark_frame_is_a_status(tracker: StarTracker) -> None:
     report = tracker.solve(np.random.default_rng(88).normal(300, 5, (493, 659)))
     assert report.attitude.status == NO_STARS
@@ -182,6 +184,7 @@ def test_a_saturated_frame_is_refused(tracker: StarTracker) -> None:
         blinded.solve(image)
 
 
+@pytest.mark.slow
 def test_a_light_cut_off_by_the_border_is_left_out(tracker: StarTracker) -> None:
     places = np.array([[0.4, 200.0], [300.0, 491.8], [100.0, 100.0], [400.0, 300.0]])
     image = frame(CAMERA, places, np.full(4, 2e4), seed=90)
@@ -191,6 +194,7 @@ def test_a_light_cut_off_by_the_border_is_left_out(tracker: StarTracker) -> None
     np.testing.assert_allclose(np.sort(found.xy_px[:, 0]), [100, 400], rtol=0, atol=0.3)
 
 
+@pytest.mark.slow
 def test_a_focal_length_three_per_cent_off_is_found(uncertain: StarTracker) -> None:
     rng = np.random.default_rng(91)
     for _ in range(8):

@@ -103,6 +103,7 @@ def test_an_image_against_the_catalog_of_itself_is_not_turned_at_all(testbed: Te
     assert np.abs(found.error_deg[:, 1:, :2]).max() < 0.02  # the slip of eq. 44
 
 
+@pytest.mark.slow
 def test_an_imu_drifts_by_the_earth_s_rate() -> None:
     """15.04 deg/h: north by the cosine of 39.8 deg of latitude along x, up by its sine along z; t from home."""
     units = 40

@@ -10,6 +10,8 @@ from skysim.core.units import ARCSEC_RAD
 from skysim.experiments.papers.other_domes import apl, nps, oled
 from skysim.simulation.testbed import build_testbed
 
+pytestmark = pytest.mark.slow  # much is compiled
+
 
 @pytest.fixture(scope="module")
 def level() -> nps.OnboardModel:

@@ -120,6 +120,7 @@ def test_intervals_of_four_hold_what_they_promise() -> None:
     assert abs(covered(intervals.prediction_interval, lambda rng: rng.normal(3.0, 2.0)) - 0.95) < 0.018
 
 
+@pytest.mark.slow
 def test_a_bootstrap_of_four_is_widened_to_what_it_promises() -> None:
     """Efron's own percentiles hold a mean of four in some 80 %."""
     few = np.random.default_rng(3).normal(3.0, 2.0, (300, 4))
@@ -175,6 +176,7 @@ def test_an_unknown_id_is_told_with_the_allowed_ones() -> None:
     assert check_ids(["afit-table-1", "afit-table-1"]) == ["afit-table-1"]
 
 
+@pytest.mark.slow
 def test_its_report_and_its_page_show_what_its_json_says(tmp_path: Path) -> None:
     markdown = tmp_path / "papers.md"
     words = ["afit-table-1", "--report", "--out", str(tmp_path), "--markdown", str(markdown)]
@@ -311,6 +313,7 @@ TIMED = {"shefex-fig-3"}  # whose ratio another machine may double
 QUICK = ("afit-table-1", "shefex-fig-3", "shefex-figs-4-5")  # about a second each
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "id", [pytest.param(id, marks=() if id in QUICK else pytest.mark.long) for id in published.experiments()]
 )

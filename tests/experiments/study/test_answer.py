@@ -114,6 +114,7 @@ def loaded(folder: Path, **keys: Any) -> Any:
     return loader.load(path)
 
 
+@pytest.mark.slow
 def test_the_scene_is_in_a_table(tmp_path: Path) -> None:
     rows = dict(overview.overview(loaded(tmp_path, hardware=["light.layout.hardware_seed"])).rows)
     assert rows["light"] == "dome (ellipsoid, 1.219 m above the bearing) with 500 LEDs (random) within 40°"

@@ -191,6 +191,7 @@ def test_exports_say_what_the_store_says(tmp_path):
     assert not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.slow
 def test_a_trial_is_replayed_with_its_frames(tmp_path):
     told, kept = done(tmp_path, STUDY)
     with kept as rows:

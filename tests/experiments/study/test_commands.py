@@ -71,6 +71,7 @@ def test_a_study_that_ran_out_of_its_budget_is_resumed(typed):
     assert "of 60 trials" in out
 
 
+@pytest.mark.slow
 def test_what_was_overridden_is_remembered(typed):
     words = ("question.yaml", "--engine", "serial", "--out", "here")
     assert typed("study", "run", *words, "--set", "replicates=3")[0] == 0

@@ -78,6 +78,7 @@ def serial_contents(plan_: plan.Plan) -> str:
 # A pool.
 
 
+@pytest.mark.slow
 def test_what_raises_is_told_with_seed_and_traceback_and_the_rest_is_done(tmp_path: Path) -> None:
     """One level's scene file vanishes after the study was checked: its trials fail, in a pool as in one process."""
     lost = tmp_path / "lost.yaml"

@@ -64,6 +64,7 @@ def test_the_trials_are_of_different_domes_and_pooled(tmp_path: Path) -> None:
         runner.prepare_store(told, kept, resume=True)  # its first and last scenes are those of their own hardware
 
 
+@pytest.mark.slow
 def test_leds_and_survey_are_drawn_independently(tmp_path: Path) -> None:
     """The believed places less the true ones scatter by the survey's 0.2 mm about each axis."""
     spec = loaded(tmp_path).spec

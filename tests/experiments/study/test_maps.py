@@ -153,6 +153,7 @@ def of_points(*tables: Columns) -> Callable[[int], Columns]:
 LINES = [PointRow(n, {"leds": leds}, {}) for n, leds in enumerate((500, 900))]
 
 
+@pytest.mark.slow
 def test_a_map_has_a_panel_for_each_level_and_is_a_picture() -> None:
     tables = columns(400), columns(400, wrong=np.ones(400))
     for by, labels, wrong in (("leds", ["500", "900"], [0.0, 1.0]), (None, [""], [0.0])):
@@ -251,6 +252,7 @@ def test_the_worst_of_a_proportion_count_for_it() -> None:
     assert [one.trial for one in worst.worst_trials(table, "coverage_4", count=1)] == [60]
 
 
+@pytest.mark.slow
 def test_the_worst_of_real_trials_are_found_again_by_their_number() -> None:
     """A trial is replayed from the number in the list, with the same attitude and error."""
     plan = loader.load("led_count", {"replicates": "40"})

@@ -273,6 +273,7 @@ def test_killed_and_resumed_it_leaves_the_same_store(tmp_path: Path, every: int)
         assert repr(search.collect_result(made, kept)) == repr(whole)
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_with_a_real_scene(tmp_path: Path) -> None:
     told = changed(candidates=4) | {"replicates": 3}
     made = loaded(tmp_path, told)
@@ -405,6 +406,7 @@ def test_a_factor_sets_several_keys_alike(factor: dict[str, Any]) -> None:
             plan.Study.model_validate(STUDY | {"factors": {"size": factor | wrong}})
 
 
+@pytest.mark.slow
 def test_the_shipped_study_is_what_it_says(tmp_path: Path) -> None:
     made = loader.load("dome_for_the_money")
     search.check(made.study)

@@ -132,6 +132,7 @@ def test_other_noise_leaves_the_attitude():
     assert not np.array_equal(seen.xy_px, other.xy_px)
 
 
+@pytest.mark.slow
 def test_centroid_trials_err_as_much_as_theory_says():
     """QUEST's covariance holds: mean NEES of three degrees of freedom, to five standard errors."""
     spec = replace(SKY, base={"tracker.centroid_sigma_px": 1e-3, "light.limit_mag": 5.5, "tracker.limit_mag": 5.5})
@@ -141,6 +142,7 @@ def test_centroid_trials_err_as_much_as_theory_says():
     assert nees.mean() == pytest.approx(3, abs=5 * math.sqrt(6 / len(nees)))
 
 
+@pytest.mark.slow
 def test_a_frame_that_turns_is_smeared_by_what_the_gyro_tells():
     """Streak length in the truth against rate times exposure, at the middle of the field."""
     spec = replace(SKY, trial={"kind": "frames", "rate_deg_s": 4.0, "gyro": True})
@@ -155,6 +157,7 @@ def test_a_frame_that_turns_is_smeared_by_what_the_gyro_tells():
     assert came.frames == 1
 
 
+@pytest.mark.slow
 def test_a_flight_counts_its_frames_after_it_settled():
     spec = replace(DOME, base={"exposure.frames": 6}, trial={"kind": "flight", "settle": "2.1 s"})
     ready = setups.prepared_setup(spec, {})
@@ -166,6 +169,7 @@ def test_a_flight_counts_its_frames_after_it_settled():
     assert math.isnan(came.filter_arcsec)
 
 
+@pytest.mark.slow
 def test_a_flights_filter_is_scored_at_every_tick():
     told = {
         **{"vehicle.imu": {}, "filter": {"start_deg": 0.1}, "exposure.frames": 4},
@@ -180,6 +184,7 @@ def test_a_flights_filter_is_scored_at_every_tick():
     assert math.isfinite(came.drift_arcsec)
 
 
+@pytest.mark.slow
 def test_a_bench_is_kept_and_shared_where_only_the_trial_differs():
     first = setups.prepared_setup(SKY, {"trial.noise_px": 0.1})
     other = setups.prepared_setup(SKY, {"trial.noise_px": 0.2})

@@ -25,6 +25,7 @@ def study(folder: Path, scene: str, trial: str, factors: str, settings: str = "{
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "trial", "factors", "settings", "told"),
     [
