@@ -1,4 +1,4 @@
-"""Lost-in-space identification on six workloads, from centroids and magnitudes, compared with an oracle.
+"""Lost-in-space identification on twelve workloads, from centroids and magnitudes, compared with an oracle.
 
 `python -m benchmarks.lost_in_space [FIELDS] [SEED] [IDENTIFIER ...]` prints success, wrong attitudes and time. The sky
 is Hipparcos to the workload's limiting magnitude, without the fainter of any two stars closer than 30". Attitudes are
@@ -42,6 +42,7 @@ class Workload:
     fov_deg       : (2,) field of view, width and height; width_px pixels wide, with square pixels
     brightest     : maximum number of centroids; false_share : fraction of the centroids that are false, after this cut
     false, missing: number of false lights, and fraction of the stars not detected
+    false_brighter: whether every false light is brighter than any star
     """
 
     name: str
@@ -53,6 +54,7 @@ class Workload:
     false_share: float = 0.0
     false: int = 0
     missing: float = 0.0
+    false_brighter: bool = False
 
     @property
     def camera(self) -> Camera:
@@ -71,6 +73,12 @@ WORKLOADS = (
     Workload("SHEFEX, .5 px, a fifth false", SHEFEX, 659, 5.75, 0.5, brightest=15, false_share=0.2),
     Workload("hard, V < 6.5", (10, 7.5), 1024, 6.5, 1.0, false=3, missing=0.2),
     Workload("hard, V < 7", (10, 7.5), 1024, 7.0, 1.0, false=3, missing=0.2),
+    Workload("17 x 13 deg, half false", (17, 13), 1024, 6.0, 0.2, false_share=0.5),
+    Workload("17 x 13 deg, 70 % false", (17, 13), 1024, 6.0, 0.2, false_share=0.7),
+    Workload("the same, half false, brighter", (17, 13), 1024, 6.0, 0.2, false_share=0.5, false_brighter=True),
+    Workload("6 x 6 deg, 70 % false", (6, 6), 1024, 7.5, 0.2, false_share=0.7),
+    Workload("35 x 20 deg, 70 % false", (35, 20), 1280, 5.5, 0.2, false_share=0.7),
+    Workload("23 x 23 deg, 70 % false", (23, 23), 1024, 5.5, 0.2, false_share=0.7),
 )
 
 
@@ -114,7 +122,8 @@ def field(work: Workload, stars: catalog.StarCatalog, rng: np.random.Generator) 
     detected = xy[row] + work.noise_px * rng.standard_normal((len(row), 2))
     false_xy = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (false, 2))
     xy = np.concatenate([detected, false_xy])
-    mag = np.concatenate([mag, rng.choice(stars.v_mag, false)])
+    false_mag = rng.choice(stars.v_mag, false) - (stars.v_mag.max() - mag.min(initial=0) if work.false_brighter else 0)
+    mag = np.concatenate([mag, false_mag])
     order = np.argsort(mag)
     sigma = np.full(len(xy), work.noise_px)
     star = np.concatenate([row, np.full(false, -1)])

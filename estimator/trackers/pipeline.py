@@ -30,7 +30,8 @@ class Settings:
     """Algorithm of each stage, and its parameters.
 
     centroid_sigma_px : floor of a centroid's error, for errors beyond its own noise
-    base_stars        : number of brightest blobs from which patterns are formed
+    base_stars        : number of brightest blobs from which the published identifiers form patterns
+    searched_stars    : number of brightest blobs that the default identifier uses to find an attitude
     field_stars       : mean number of catalog stars per field in the pattern index
     merge_px          : catalog stars closer than this are merged into one
     zero_point_mag    : magnitude of a source of flux 1; None if unknown: magnitudes are then not used
@@ -51,6 +52,7 @@ class Settings:
     saturation: float = float("inf")
     centroid_sigma_px: float = 0.1
     base_stars: int = 20
+    searched_stars: int = 80
     field_stars: float = 30.0
     merge_px: float = 2.0
     zero_point_mag: float | None = None

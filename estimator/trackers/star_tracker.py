@@ -237,8 +237,8 @@ class StarTracker:
         """
         for min_error_px, relative_error, checks in searches:
             sigma_px = self.sigma_px(centroids, min_error_px, relative_error)
-            base = self.settings.base_stars
-            solution = search.lost_in_space(self.detections(centroids, sigma_px), patterns, self.sky, base, checks)
+            most, detections = self.settings.searched_stars, self.detections(centroids, sigma_px)
+            solution = search.lost_in_space(detections, patterns, self.sky, most, checks)
             clock.lap("identify")
             if not len(solution.star):
                 continue

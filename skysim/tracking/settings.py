@@ -39,6 +39,7 @@ def assumed_settings(scene: Scene) -> Settings:
     return Settings(
         max_blobs=config.brightest or default.max_blobs,
         base_stars=min(config.brightest or default.base_stars, default.base_stars),
+        searched_stars=min(config.brightest or default.searched_stars, default.searched_stars),
         threshold_sigma=config.threshold_sigma,
         min_area_px=config.min_area_px,
         gain_e_dn=scene.camera.detector.gain_e_dn,

@@ -54,6 +54,8 @@ NO_RIVAL_DEX = ACCEPT_DEX - MARGIN_DEX  # below this an attitude is neither acce
 RIVAL_EFFORT, MIN_RIVAL_EFFORT = 2, 2000
 MAG_GATE_SIGMA = 4.0  # greatest difference of magnitudes in the first round, in standard deviations
 EVALUATION_COST = 6  # of one evaluation in units of one star look-up, so that frames without a solution end
+FEW = 20  # number of detections of the first search
+SHORT_EFFORT, MANY_EFFORT = 1 / 16, 1 / 4  # fractions of the effort: of the first search at first, and of the second
 MAX_MISSES = 4  # detections without a star after which the first round drops a candidate
 
 
@@ -63,22 +65,25 @@ def lost_in_space(
 ) -> Solution:
     """Identify the detections and solve the attitude.
 
-    The search uses the `max_detections` brightest detections and the pairs of `patterns`; the attitude found is then
-    fitted to all detections and all `stars`. Returns an empty solution if the search finds nothing beyond chance, or
-    if the full field keeps no more than half of its matches. max_checks bounds the effort (see `search`).
+    The search uses the FEW brightest detections and, if it fails, the `max_detections` brightest, with the pairs of
+    `patterns`: a few bright stars among many faint false lights are found by the first, stars among brighter false
+    lights by the second. The first is short; it is repeated with the whole effort if the second fails too. Each of the
+    two must have twice the evidence, so that together they accept a chance match as rarely as one. The attitude found
+    is then fitted to all detections and all `stars`. Returns an empty solution if the search finds nothing beyond
+    chance, or if the full field keeps no more than half of its matches.
+    max_checks : bound on the effort (see `search`)
     """
-    count = min(max_detections, len(detections.sigma))
-    brightest = Detections(
-        detections.tangent[:count],
-        detections.sigma[:count],
-        detections.weight[:count],
-        detections.mag[:count],
-        detections.mag_sigma,
-        detections.field,
-        detections.focal_uncertainty,
-    )
-    candidate = search(brightest, patterns, max_checks)
-    if candidate.dex < ACCEPT_DEX:
+    few, many = min(FEW, max_detections, len(detections.sigma)), min(max_detections, len(detections.sigma))
+    if many == few:
+        accept_dex = ACCEPT_DEX
+        candidate = search(_brightest(detections, few), patterns, max_checks)
+    else:
+        accept_dex = ACCEPT_DEX + log10(2.0)
+        for count, effort in ((few, SHORT_EFFORT), (many, MANY_EFFORT), (few, 1.0)):
+            candidate = search(_brightest(detections, count), patterns, int(effort * max_checks))
+            if candidate.dex >= accept_dex:
+                break
+    if candidate.dex < accept_dex:
         return build_solution(detections, stars, no_hypothesis())
     gates = 1.5 * GATE_SIGMA * detections.sigma
     full = evaluate(detections, stars, candidate.R_cam_from_ref.copy(), candidate.focal_ratio, gates, -np.inf)
@@ -96,6 +101,20 @@ def lost_in_space(
 
 
 @jit
+def _brightest(detections: Detections, count: int) -> Detections:
+    """The first `count` detections."""
+    return Detections(
+        detections.tangent[:count],
+        detections.sigma[:count],
+        detections.weight[:count],
+        detections.mag[:count],
+        detections.mag_sigma,
+        detections.field,
+        detections.focal_uncertainty,
+    )
+
+
+@jit
 def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis:
     """The first attitude with DECISIVE_DEX of evidence; else the best one, if it passes ACCEPT_DEX and MARGIN_DEX.
 
@@ -103,8 +122,9 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
     SHORT_PAIR) and rare magnitudes first. Each attempt doubles the cost of its two detections, so that a false
     detection does not hold up the search. The first round drops a candidate after MAX_MISSES detections without a star
     and skips stars outside of the magnitude gate; the second round has neither limit, and is skipped if there are so
-    few detections that MAX_MISSES covers them. After an attitude reaches ACCEPT_DEX the search continues for rivals,
-    with RIVAL_EFFORT times the effort so far.
+    few detections that MAX_MISSES covers them. Every attempt checks its candidates at another MAX_MISSES detections
+    first: a fixed order would drop every true candidate of a frame in which these are all false. After an attitude
+    reaches ACCEPT_DEX the search continues for rivals, with RIVAL_EFFORT times the effort so far.
     max_checks : bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
     """
     total = len(detections.sigma)
@@ -113,10 +133,10 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
     for max_misses in (MAX_MISSES, total):
         tried = np.zeros((total, total), np.bool_)
         cost = rarity.copy()
-        for _ in range(total * (total - 1) // 2):
+        for attempt in range(total * (total - 1) // 2):
             a, b = _next_pair(length, tried, cost)
             tried[a, b] = True
-            candidate = _test_pair(detections, sky, a, b, max_misses, best, checks)
+            candidate = _test_pair(detections, sky, a, b, attempt * MAX_MISSES, max_misses, best, checks)
             same = _same_attitude(candidate, best)
             if candidate.dex > best.dex:
                 # The previous best becomes a rival unless it is the same attitude.
@@ -185,6 +205,7 @@ def _test_pair(
     sky: SkyIndex,
     a: int,
     b: int,
+    start: int,
     max_misses: int,
     previous: Hypothesis,
     checks: NDArray,
@@ -192,9 +213,10 @@ def _test_pair(
     """Test two detections against every catalog pair of the same separation, in both orders.
 
     Returns the first hypothesis with ACCEPT_DEX that is another attitude than `previous`, else the best one.
+    start  : the other detections are looked up from this one on
     checks : (1,) effort so far, increased in place
     """
-    gates, order = _pair_gates(detections, a, b), _other_detections(len(detections.sigma), a, b)
+    gates, order = _pair_gates(detections, a, b), _other_detections(len(detections.sigma), a, b, start)
     attitude_dex = _attitude_dex(detections, a, b)
     required = required_matches(detections.sigma, field_area(detections), attitude_dex, ACCEPT_DEX)
     in_cam, in_ref = np.empty((3, 3)), np.empty((3, 3))
@@ -259,9 +281,11 @@ def _pair_range(detections: Detections, sky: SkyIndex, a: int, b: int) -> tuple[
 
 
 @jit
-def _other_detections(total: int, a: int, b: int) -> NDArray[np.int64]:
+def _other_detections(total: int, a: int, b: int, start: int) -> NDArray[np.int64]:
+    """(N - 2,) all detections but a and b, from number `start` on and around."""
     out, count = np.empty(total, np.int64), 0
-    for n in range(total):
+    for step in range(total):
+        n = (start + step) % total
         if n not in (a, b):
             out[count] = n
             count += 1

@@ -18,7 +18,7 @@ WIDE_RAD = np.radians(12.0)
 FIELD = np.tan(np.radians([-5.0, 5.0, -4.0, 4.0]))
 SIGMA = 2e-5
 CHECKS = 200_000
-BASE = 20
+SEARCHED = 80
 
 
 def random_sky(count: int, seed: int):
@@ -52,7 +52,7 @@ def detections_of(tangent, mag, sigma=SIGMA, zoom=0.0) -> evidence.Detections:
 
 
 def solve(detections: evidence.Detections, sky: sky_index.SkyIndex = SKY) -> Solution:
-    return search.lost_in_space(detections, sky, sky, BASE, CHECKS)
+    return search.lost_in_space(detections, sky, sky, SEARCHED, CHECKS)
 
 
 def attitude_error(solution: Solution, truth: Rotation):
@@ -96,6 +96,29 @@ def test_a_sky_without_a_pattern_is_refused() -> None:
     in_a_row = Rotation.from_rotvec([[0, 0, 0], [0, 0.15, 0], [0, 0.3, 0]]).apply([0.0, 0.0, 1.0])
     with pytest.raises(ImageError, match=r"2 pairs of stars within 12\.00 deg are too few; allowed: 3 or more"):
         sky_index.build(in_a_row, MAG[:3], WIDE_RAD)
+
+
+@pytest.mark.parametrize(("share", "brighter"), [(0.5, False), (0.5, True), (0.7, False)])
+def test_false_lights_may_be_the_brightest(share: float, brighter: bool) -> None:
+    """Half of the lights false and brighter than any star, or two in three: the search begins with false ones alone."""
+    rng, solved = np.random.default_rng(14), 0
+    for _ in range(40):
+        truth = Rotation.random(rng=rng)
+        tangent, mag, row = observe(truth, rng)
+        false = round(len(row) * share / (1 - share))
+        lights = np.vstack([tangent, rng.uniform(FIELD[[0, 2]], FIELD[[1, 3]], (false, 2))])
+        false_mag = rng.uniform(mag.min() - 2, mag.min() - 1, false) if brighter else rng.choice(MAG, false)
+        shown = np.concatenate([mag, false_mag])
+        order = np.argsort(shown)
+        solution = solve(detections_of(lights[order], shown[order]))
+        if not len(solution.star):
+            continue
+        solved += 1
+        assert np.linalg.norm(attitude_error(solution, truth)) < 1e-3
+        number = order[solution.observed]  # of the light, below len(row) a star's
+        assert np.mean(number < len(row)) > 0.9
+        assert (row[number[number < len(row)]] == solution.star[number < len(row)]).all()
+    assert solved >= 38
 
 
 def test_lights_that_are_worse_along_than_across_count_as_they_are() -> None:
@@ -361,8 +384,9 @@ def test_the_quick_check_stops_as_soon_as_it_knows(
     sky = sky_index.build_without_pairs(
         (rays / np.linalg.norm(rays, axis=1, keepdims=True))[there], np.ones(len(there))
     )
-    order = PLAIN._other_detections(6, 0, 1)
+    order = PLAIN._other_detections(6, 0, 1, 0)
     assert order.tolist() == [2, 3, 4, 5]
+    assert PLAIN._other_detections(6, 2, 4, 9).tolist() == [3, 5, 0, 1]
     tables = sky.vectors, sky.cell_first, sky.cell_star, sky.side
     found = PLAIN._quick_check(places, *tables, np.eye(3), 1.0, np.full(6, 1e-4), order, required, max_misses)
     assert found == (lookups, fits)
