@@ -9,6 +9,7 @@ refused (`keys.unused`). Every error becomes an InputError of one line with key,
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import re
@@ -123,7 +124,9 @@ def merge(base: dict[str, Any], override: dict[str, Any]) -> dict[str, Any]:
 
 
 def over_base(
-    base: dict[str, Any], own: dict[str, Any], camera_of: Callable[[Any], dict[str, Any]] = lambda name: preset(str(name))
+    base: dict[str, Any],
+    own: dict[str, Any],
+    camera_of: Callable[[Any], dict[str, Any]] = lambda name: preset(str(name)),
 ) -> dict[str, Any]:
     """The keys of a scene over those of its base. A camera preset in `own` also replaces the base's keys.
 
@@ -132,10 +135,8 @@ def over_base(
     camera, below = own.get("camera"), base.get("camera")
     named = camera.get("preset") if isinstance(camera, dict) else None
     if named is not None and isinstance(below, dict):
-        try:
+        with contextlib.suppress(InputError):
             base = base | {"camera": undefined_keys(below, camera_of(named))}
-        except InputError:
-            pass
     return merge(base, own)
 
 

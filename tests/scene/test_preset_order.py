@@ -71,7 +71,7 @@ def test_an_unknown_preset_over_a_base_is_an_error_with_its_line(folder: Path) -
 
 
 def test_a_preset_file_is_named_as_the_origin_of_its_keys(folder: Path) -> None:
-    entries = provenance.effective(write(folder, '{preset: mine.yaml, f_number: 4}'))
+    entries = provenance.effective(write(folder, "{preset: mine.yaml, f_number: 4}"))
     origin = {".".join(entry.path): str(entry.origin) for entry in entries}
     assert origin["camera.focal_length"] == "preset mine.yaml, line 5"
     assert origin["camera.shutter.kind"] == "preset mine.yaml, line 7"

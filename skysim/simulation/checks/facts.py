@@ -67,14 +67,8 @@ class Fact(NamedTuple):
 
 def field_of_view(context: Context, samples: Samples) -> Fact:
     """Angles between the centers of opposite edges and corners of the chip, without distortion."""
-    camera = context.camera.optics.camera
-    width, height, diagonal = (
-        2 * math.degrees(math.atan(px / 2 / camera.focal_px))
-        for px in (camera.width_px, camera.height_px, math.hypot(camera.width_px, camera.height_px))
-    )
-    arcsec_px = 1 / camera.focal_px / ARCSEC_RAD
-    text = f"{width:.2f}° × {height:.2f}°, diagonal {diagonal:.2f}°; {arcsec_px:.4g}{ARCSEC} a pixel"
-    return Fact("field of view", [text], {"field_deg": [width, height, diagonal], "arcsec_px": arcsec_px})
+    lens = context.camera.optics.camera.calibration()
+    return Fact("field of view", [lens.field_text()], {"field_deg": list(lens.field_deg), "arcsec_px": lens.arcsec_px})
 
 
 def lights_in_field(context: Context, samples: Samples) -> Fact:

@@ -14,9 +14,9 @@ import typer
 from skysim.apps.cli.options import Json, Overrides, SceneArg, load, with_location
 from skysim.apps.cli.terminal import print_check, print_error, print_json
 from skysim.core.errors import InputError
+from skysim.scene.data_sheet.sheet import PLACEHOLDER_LENS
 
 KINDS = ("scene", "study")
-PLACEHOLDER_LENS = {"focal_length": "1 m", "f_number": 1.0}  # because a camera preset has no lens
 
 
 class Verdict(NamedTuple):
