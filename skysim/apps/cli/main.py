@@ -19,6 +19,7 @@ from skysim.apps.cli.commands.solve import solve, survey
 from skysim.apps.cli.commands.stream import stream
 from skysim.apps.cli.commands.study import app as studies
 from skysim.apps.cli.commands.validate import check, validate
+from skysim.apps.cli.examples import add_examples
 from skysim.apps.cli.options import with_location
 from skysim.apps.cli.terminal import print_error
 from skysim.core import errors
@@ -32,6 +33,7 @@ app.add_typer(scenes_app, name="scenes")
 app.add_typer(cameras, name="camera")
 app.add_typer(catalog_app, name="catalog")
 app.add_typer(studies, name="study")
+add_examples(app)
 
 
 def version(requested: bool) -> None:
