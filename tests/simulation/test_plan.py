@@ -180,7 +180,7 @@ def test_what_the_tracker_believes_is_said() -> None:
     for words in ("LEDs to 0.3 mm", "rotated by 36″", "length wrong by +0.2 %", "another distortion", "lever wrong by"):
         assert words in lines
     told = " ".join(fact(check(bed("shefex2")), "tracker knows").lines)
-    assert "epoch J1991.25 moved to 2012-06-22" in told
+    assert "of hipparcos_hp6.5, epoch J1991.25 moved to 2012-06-22" in told
 
 
 def test_causes_are_in_order_and_each_is_found_where_it_is_put() -> None:

@@ -20,6 +20,14 @@ if TYPE_CHECKING:
     from skysim.scene.opencv_calibration import Calibration
 
 
+def complete_camera(incomplete: str) -> list[str]:
+    """Names of camera presets, scenes and YAML files that begin with what was typed."""
+    from skysim.core.paths import DATA
+
+    names = {path.stem for path in (DATA / "cameras").glob("*.yaml") if path.stem.startswith(incomplete)}
+    return sorted(names | set(complete_scene(incomplete)))
+
+
 class CameraGroup(TyperGroup):
     """`skysim camera FILE` is short for `skysim camera show FILE`."""
 
@@ -30,20 +38,18 @@ class CameraGroup(TyperGroup):
             args = ["show", *args]
         return super().parse_args(ctx, args)
 
+    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
+        """Subcommands, and what `show` takes."""
+        item = type(super().shell_complete(ctx, "")[0])  # the class of typer's own parser or of click
+        names = [] if incomplete.startswith("-") else complete_camera(incomplete)
+        return [*super().shell_complete(ctx, incomplete), *map(item, names)]
+
 
 app = typer.Typer(
     cls=CameraGroup,
     invoke_without_command=True,
     help="Show a camera: field of view, arcseconds a pixel, calibration. Make one from a data sheet.",
 )
-
-
-def complete_camera(incomplete: str) -> list[str]:
-    """Names of camera presets, scenes and YAML files that begin with what was typed."""
-    from skysim.core.paths import DATA
-
-    names = {path.stem for path in (DATA / "cameras").glob("*.yaml") if path.stem.startswith(incomplete)}
-    return sorted(names | set(complete_scene(incomplete)))
 
 
 @app.callback()
