@@ -47,8 +47,8 @@ MORE = """
 
 Three keys are applied before the others: `base`, the name or file of a scene whose keys this one overrides;
 `camera.preset`, a camera whose keys the section overrides: {presets}, or a file
-([`skysim camera new`](../howto/camera.md#from-a-data-sheet) writes one); and `camera.calibration`, a file of OpenCV that gives size, focal
-length, principal point and distortion."""
+([`skysim camera new`](../howto/camera.md#from-a-data-sheet) writes one); and `camera.calibration`, a file of OpenCV
+with size, focal length, principal point and distortion."""
 
 
 def names(options: Iterable[str]) -> str:

@@ -155,8 +155,8 @@ class LengthToleranceConfig(ToleranceConfig):
 class TimeToleranceConfig(ToleranceConfig):
     """The tolerance of a time: {tolerance: "±1 ms"}, uniformly distributed.
 
-    With {tolerance: "±1 ms", distribution: truncated_normal, sigma: "0.4 ms"} it is a Gaussian that ends there; sigma is
-    a third of the tolerance if left out.
+    With {tolerance: "±1 ms", distribution: truncated_normal, sigma: "0.4 ms"} it is a Gaussian that ends there; sigma
+    is a third of the tolerance if left out.
     """
 
     tolerance_s: Annotated[Time, Field(gt=0), SIGNED_QUANTITY] | None = None
@@ -166,8 +166,8 @@ class TimeToleranceConfig(ToleranceConfig):
 class NumberToleranceConfig(ToleranceConfig):
     """The tolerance of a bare number, in the unit of its key: {tolerance: 0.1}, uniformly distributed.
 
-    With {tolerance: 0.1, distribution: truncated_normal, sigma: 0.04} it is a Gaussian that ends there; sigma is a third
-    of the tolerance if left out.
+    With {tolerance: 0.1, distribution: truncated_normal, sigma: 0.04} it is a Gaussian that ends there; sigma is a
+    third of the tolerance if left out.
     """
 
     tolerance: Annotated[Number, Field(gt=0), SIGNED_NUMBER] | None = None
