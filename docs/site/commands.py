@@ -7,6 +7,7 @@ from typing import Any
 
 import typer
 
+from skysim.apps.cli.examples import EXAMPLES
 from skysim.apps.cli.main import app
 from skysim.core.paths import ROOT
 
@@ -49,7 +50,9 @@ def section(context: Any) -> str:
     name, usage = context.command_path, command.get_usage(context).removeprefix("Usage: ")
     heading = f"{'##' if context.parent is None or context.parent.parent is None else '###'} `{name}`"
     table = "\n".join(["| parameter | meaning |", "|---|---|", *rows]) if rows else ""
-    return "\n\n".join(filter(None, [heading, command.help or "", f"```text\n{usage}\n```", table]))
+    examples = "\n".join(EXAMPLES[name.partition(" ")[2]])
+    parts = [heading, command.help or "", f"```text\n{usage}\n```", table, f"Examples:\n\n```text\n{examples}\n```"]
+    return "\n\n".join(filter(None, parts))
 
 
 def row(parameter: Any, context: Any) -> str:

@@ -25,6 +25,7 @@ from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers.dome_tracker import IDENTIFIERS as DOME_IDENTIFIERS
 from skysim.apps.gui.page.forms import file_value, yaml_line
 from skysim.core.paths import CATALOGS, ROOT
+from skysim.core.tolerance import ErrorSchema
 from skysim.core.units import ConfigModel, si_unit
 from skysim.experiments.study.plan import Study
 from skysim.scene.camera import CURVE_FOLDER
@@ -44,8 +45,10 @@ the same as JSON Schema, for editors.{more}
 """
 MORE = """
 
-Two keys are applied before the others: `base`, the name or file of a scene whose keys this one overrides, and
-`camera.preset`, a camera whose keys the section overrides: {presets}."""
+Three keys are applied before the others: `base`, the name or file of a scene whose keys this one overrides;
+`camera.preset`, a camera whose keys the section overrides: {presets}, or a file
+([`skysim camera new`](../howto/camera.md#from-a-data-sheet) writes one); and `camera.calibration`, a file of OpenCV
+with size, focal length, principal point and distortion."""
 
 
 def names(options: Iterable[str]) -> str:
@@ -107,6 +110,8 @@ class Section(typing.NamedTuple):
 
 def models(annotation: Any) -> Iterator[type[BaseModel]]:
     """The models within a type, in its order."""
+    if isinstance(annotation, ErrorSchema):
+        yield annotation.section
     if isinstance(annotation, type) and issubclass(annotation, ConfigModel):
         yield annotation
     for argument in typing.get_args(annotation):
@@ -121,7 +126,8 @@ def sections(root: type[BaseModel]) -> dict[str, Section]:
     def visit(model: type[BaseModel], path: str) -> None:
         for name, field in model.model_fields.items():
             below = f"{path}.{field.alias or name}".lstrip(".")
-            for inner in (one for one in models(field.annotation) for one in (one, *one.__subclasses__())):
+            direct = [one for part in (field.annotation, *field.metadata) for one in models(part)]
+            for inner in (one for one in direct for one in (one, *one.__subclasses__())):
                 known = inner.__name__ in found
                 section = found.setdefault(inner.__name__, Section(inner, []))
                 if below not in section.paths:

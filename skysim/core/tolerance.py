@@ -142,21 +142,33 @@ SIGNED_NUMBER = BeforeValidator(
 
 
 class LengthToleranceConfig(ToleranceConfig):
-    """The tolerance of a length."""
+    """The tolerance of a length: {tolerance: "±0.5 mm"}, uniformly distributed.
+
+    With {tolerance: "±0.5 mm", distribution: truncated_normal, sigma: "0.2 mm"} it is a Gaussian that ends there; sigma
+    is a third of the tolerance if left out.
+    """
 
     tolerance_m: Annotated[Length, Field(gt=0), SIGNED_QUANTITY] | None = None
     sigma_m: Annotated[Length, Field(gt=0)] | None = None
 
 
 class TimeToleranceConfig(ToleranceConfig):
-    """The tolerance of a time."""
+    """The tolerance of a time: {tolerance: "±1 ms"}, uniformly distributed.
+
+    With {tolerance: "±1 ms", distribution: truncated_normal, sigma: "0.4 ms"} it is a Gaussian that ends there; sigma
+    is a third of the tolerance if left out.
+    """
 
     tolerance_s: Annotated[Time, Field(gt=0), SIGNED_QUANTITY] | None = None
     sigma_s: Annotated[Time, Field(gt=0)] | None = None
 
 
 class NumberToleranceConfig(ToleranceConfig):
-    """The tolerance of a bare number, in the unit of its key."""
+    """The tolerance of a bare number, in the unit of its key: {tolerance: 0.1}, uniformly distributed.
+
+    With {tolerance: 0.1, distribution: truncated_normal, sigma: 0.04} it is a Gaussian that ends there; sigma is a
+    third of the tolerance if left out.
+    """
 
     tolerance: Annotated[Number, Field(gt=0), SIGNED_NUMBER] | None = None
     sigma: Annotated[Number, Field(gt=0)] | None = None

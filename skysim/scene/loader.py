@@ -1,17 +1,19 @@
 """Load a scene: presets, calibration files, `base` scenes and overrides, then validation.
 
 The raw YAML tree is built in layers, the later ones over the earlier: the `base` scene (recursively), the scene's own
-keys, then the overrides of `--set`. Next, the camera section is merged over its preset, and a calibration file's
+keys, then the overrides of `--set`. A layer that names a camera preset also drops the keys that this preset defines
+from the layers below (`over_base`). Next, the camera section is merged over its preset, and a calibration file's
 values over both (`with_preset`). Only then does pydantic validate the tree. Last, an option that has no effect is
 refused (`keys.unused`). Every error becomes an InputError of one line with key, file and line.
 """
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,11 +37,17 @@ def list_cameras() -> list[str]:
     return sorted(path.stem for path in PRESETS.glob("*.yaml"))
 
 
-def preset(name: str, where: str) -> dict[str, Any]:
-    """The `camera` section of data/cameras/NAME.yaml, or of a file. Raises InputError for an unknown name."""
+def preset_path(name: str, where: str = "camera.preset") -> Path:
+    """The file of a camera preset: a name in data/cameras, or a file. Raises InputError for an unknown name."""
     path = PRESETS / f"{name}.yaml" if name in list_cameras() else Path(name)
     if path.suffix not in (".yaml", ".yml") or not is_file(path):
         raise InputError(f"{where}: {unknown_name('preset', name, list_cameras())}, or a .yaml file with a camera")
+    return path
+
+
+def preset(name: str, where: str = "camera.preset") -> dict[str, Any]:
+    """The `camera` section of data/cameras/NAME.yaml, or of a file. Raises InputError for an unknown name."""
+    path = preset_path(name, where)
     camera = resolve_files(path, read_yaml(path)[0]).get("camera")
     if not isinstance(camera, dict) or "preset" in camera:
         raise InputError(f"{where}: {path} is not a camera; allowed: a section camera without a preset")
@@ -56,7 +64,7 @@ def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(camera, dict) or not {"preset", "calibration"} & set(camera):
         return tree
     own = {key: value for key, value in camera.items() if key not in ("preset", "calibration")}
-    base = preset(str(camera["preset"]), "camera.preset") if camera.get("preset") is not None else {}
+    base = preset(str(camera["preset"])) if camera.get("preset") is not None else {}
     if camera.get("calibration") is None:
         return tree | {"camera": merge(base, own)}
     for key in CALIBRATED_KEYS:
@@ -115,6 +123,35 @@ def merge(base: dict[str, Any], override: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
+def over_base(
+    base: dict[str, Any],
+    own: dict[str, Any],
+    camera_of: Callable[[Any], dict[str, Any]] = lambda name: preset(str(name)),
+) -> dict[str, Any]:
+    """The keys of a scene over those of its base. A camera preset in `own` also replaces the base's keys.
+
+    camera_of : the camera section of a preset. An unknown preset replaces nothing; `with_preset` reports it.
+    """
+    camera, below = own.get("camera"), base.get("camera")
+    named = camera.get("preset") if isinstance(camera, dict) else None
+    if named is not None and isinstance(below, dict):
+        with contextlib.suppress(InputError):
+            base = base | {"camera": undefined_keys(below, camera_of(named))}
+    return merge(base, own)
+
+
+def undefined_keys(section: dict[str, Any], defined: dict[str, Any]) -> dict[str, Any]:
+    """The keys of a section that another one does not define; of two sections of different kinds, nothing."""
+    kept: dict[str, Any] = {}
+    for key, value in section.items():
+        other = defined.get(key)
+        if key not in defined:
+            kept[key] = value
+        elif isinstance(value, dict) and isinstance(other, dict) and value.get("kind") in (None, other.get("kind")):
+            kept[key] = undefined_keys(value, other)
+    return kept
+
+
 class CameraFileConfig(ConfigModel):
     """A file with a camera section only."""
 
@@ -142,14 +179,23 @@ def load(name: str | Path, overrides: Mapping[str, str] | None = None, refuses_u
 
 def validate(layers: list[Layer], overrides: Mapping[str, str]) -> Scene:
     """The scene of some layers and overrides. Raises InputError with one line."""
-    tree, files = merged(layers), locations(layers)
-    for key, value in overrides.items():
-        set_key(tree, key, value)
+    tree, files = with_overrides(merged(layers), overrides), locations(layers)
     try:
         raw = apply_preset(tree, files, overrides)
         return Scene.model_validate(raw | {NAME_ALIAS: layers[0].path.stem})
     except ValidationError as error:
         raise InputError(explain(error, Scene, tree, files, overrides)) from None
+
+
+def with_overrides(tree: dict[str, Any], overrides: Mapping[str, str]) -> dict[str, Any]:
+    """The raw scene with dotted keys overridden; `tree` may be changed. A camera preset comes before the other keys."""
+    if "camera.preset" in overrides:
+        named: dict[str, Any] = {}
+        set_key(named, "camera.preset", overrides["camera.preset"])
+        tree = over_base(tree, named)
+    for key, value in overrides.items():
+        set_key(tree, key, value)
+    return tree
 
 
 def load_scene(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
@@ -212,7 +258,7 @@ def read_layers(path: Path, derived: tuple[Path, ...] = ()) -> list[Layer]:
 
 def merged(layers: list[Layer]) -> dict[str, Any]:
     """The keys of a scene merged over those of its base scenes; a copy, which `set_key` may change."""
-    tree = functools.reduce(merge, (layer.tree for layer in reversed(layers)))
+    tree = functools.reduce(over_base, (layer.tree for layer in reversed(layers)))
     return copy.deepcopy(tree)
 
 
@@ -296,8 +342,7 @@ def load_camera(
     lens : values for keys that a preset leaves to its scene; keys of the file override them
     """
     tree, files = read(path)
-    for key, value in (overrides or {}).items():
-        set_key(tree, key, value)
+    tree = with_overrides(tree, overrides or {})
     if isinstance(tree.get("camera"), dict):
         tree = tree | {"camera": {**(lens or {}), **tree["camera"]}}
     try:

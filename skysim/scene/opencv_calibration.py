@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from skysim.core.errors import InputError
+from skysim.core.units import ARCSEC_RAD
 from skysim.core.yaml_reader import StrictLoader, excerpt, parse_yaml
 
 MAX_BYTES = 1 << 20  # enough for a calibration with the points of all its views
@@ -34,6 +35,23 @@ class Calibration:
     focal_px: float
     center_px: tuple[float, float]
     distortion: tuple[float, float, float, float, float]
+
+    @property
+    def field_deg(self) -> tuple[float, float, float]:
+        """Angles between the centers of opposite edges and corners: width, height, diagonal; without distortion."""
+        sides_px = self.width_px, self.height_px, math.hypot(self.width_px, self.height_px)
+        width, height, diagonal = (2 * math.degrees(math.atan(px / 2 / self.focal_px)) for px in sides_px)
+        return width, height, diagonal
+
+    @property
+    def arcsec_px(self) -> float:
+        """Angle of a pixel on the axis."""
+        return 1 / self.focal_px / ARCSEC_RAD
+
+    def field_text(self) -> str:
+        """The field of view and the angle of a pixel in words."""
+        width, height, diagonal = self.field_deg
+        return f"{width:.2f}° × {height:.2f}°, diagonal {diagonal:.2f}°; {self.arcsec_px:.4g}″ a pixel"
 
 
 class Loader(StrictLoader):

@@ -79,7 +79,7 @@ def test_the_page_s_survey_prints_what_the_page_shows(tmp_path: Path) -> None:
         command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    (after,) = re.findall(r"^after: (\d+) of \d+.*?cross median ([\d.]+)°.*?roll median ([\d.]+)°", done.stdout, re.M)
+    (after,) = re.findall(r"^after: (\d+) of \d+.*?cross median ([\d.]+)″.*?roll median ([\d.]+)″", done.stdout, re.M)
     rows = dict(re.findall(r"^\| (new attitudes|cross|roll).*\| ([\d.]+)[^|]*\|$", DOME, re.M))
     shown = [float(rows[name]) for name in ("new attitudes", "cross", "roll")]
     assert [float(one) for one in after] == pytest.approx(shown, rel=0.1)

@@ -85,6 +85,7 @@ def test_a_page_of_keys_links_to_its_sections_and_names_what_a_text_may_be(path:
     assert len(linked) > 10
     assert linked <= {heading.lower() for heading in headings}
     assert re.findall(r".*\| (?:list of any length: )?text(?: or null)? \|.*", page) == []
+    assert re.findall(r"^\| `\w+` \|.* (?!\[)\w+Config\b.*", page, re.MULTILINE) == []  # every section has a link
 
 
 def test_names_that_a_key_allows_are_on_its_row() -> None:

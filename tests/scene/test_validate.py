@@ -111,6 +111,10 @@ def test_a_scene_or_study_without_a_version_is_told_the_line_to_add(tmp_path: Pa
     assert load_camera(path).f_number == 1.4
 
 
+def test_a_shipped_camera_is_checked_by_its_name() -> None:
+    assert check_file(Path("imx264")).what == "a camera of 2448 x 2048 pixels"
+
+
 @pytest.mark.slow
 def test_each_kind_of_file_is_told_and_each_fault_is_a_line(tmp_path: Path) -> None:
     broken, xml = tmp_path / "broken.ecsv", tmp_path / "a.xml"

@@ -10,7 +10,8 @@ import typer
 
 from estimator.core.errors import ImageError
 from skysim import __version__
-from skysim.apps.cli.commands.files import camera, catalog_app, export, scenes_app
+from skysim.apps.cli.commands.camera import app as cameras
+from skysim.apps.cli.commands.files import catalog_app, export, scenes_app
 from skysim.apps.cli.commands.gui import gui
 from skysim.apps.cli.commands.reproduce import reproduce
 from skysim.apps.cli.commands.run import compare, render, run, trackers
@@ -18,18 +19,21 @@ from skysim.apps.cli.commands.solve import solve, survey
 from skysim.apps.cli.commands.stream import stream
 from skysim.apps.cli.commands.study import app as studies
 from skysim.apps.cli.commands.validate import check, validate
+from skysim.apps.cli.examples import add_examples
 from skysim.apps.cli.options import with_location
 from skysim.apps.cli.terminal import print_error
 from skysim.core import errors
 from skysim.core.errors import InputError
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
-COMMANDS = (run, check, render, stream, compare, trackers, solve, survey, camera, reproduce, gui, validate, export)
+COMMANDS = (run, check, render, stream, compare, trackers, solve, survey, reproduce, gui, validate, export)
 for command in COMMANDS:
     app.command()(command)
 app.add_typer(scenes_app, name="scenes")
+app.add_typer(cameras, name="camera")
 app.add_typer(catalog_app, name="catalog")
 app.add_typer(studies, name="study")
+add_examples(app)
 
 
 def version(requested: bool) -> None:

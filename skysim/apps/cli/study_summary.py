@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from skysim.apps.cli.terminal import print_error, print_table, terminal_width
+from skysim.apps.cli.terminal import print_error, print_table, print_wrapped, terminal_width
 from skysim.core.errors import printable
 
 if TYPE_CHECKING:
@@ -43,11 +42,11 @@ def study_status(plan: Plan, store: Store) -> dict[str, Any]:
 
 def print_study_status(status: dict[str, Any]) -> None:
     rate = status["done"] / status["seconds"] if status["seconds"] else 0.0
-    print(
-        f"{printable(status['title'])}: {status['done']} of {status['trials']} trials, {status['failed']} failed,"
-        f" {status['wrong']} wrong attitudes; {status['seconds']:.1f} s, {rate:.0f} trials/s\n"
-        f"store: {status['store']} (code {status['code']})"
+    print_wrapped(
+        f"{status['title']}: {status['done']} of {status['trials']} trials, {status['failed']} failed,"
+        f" {status['wrong']} wrong attitudes; {status['seconds']:.1f} s, {rate:.0f} trials/s"
     )
+    print(f"store: {status['store']} (code {status['code']})")
 
 
 def print_points(heads: Sequence[str], cells: Sequence[Sequence[str]], factors: int = 0) -> None:
@@ -81,11 +80,6 @@ def print_answers(findings: Sequence[str], answers: Sequence[str]) -> None:
     """Print what the checks of the scene found, and the answers of a study, wrapped at the terminal's width."""
     for text in (*(f"check: {line}" for line in findings), *answers):
         print_wrapped(text)
-
-
-def print_wrapped(text: str) -> None:
-    """Print a text in lines of the terminal's width."""
-    print(textwrap.fill(printable(text), max(terminal_width(), 40), subsequent_indent="  ", break_on_hyphens=False))
 
 
 def print_worst(response: str, found: Sequence[WorstTrial], levels: Sequence[Mapping[str, Any]], repeat: str) -> None:

@@ -109,15 +109,26 @@ def print_rows(rows: list[FrameRow], names: tuple[str, str, str], exposures_ms: 
         ]
         for row, exposure_ms in zip(rows, exposures_ms, strict=True)
     ]
-    left_out: list[str] = []
-    for name in (f"estimate {triple}", "exp ms", "ms", "deg/s"):  # in the order in which they are left out
-        if table_width(headers, lines) > terminal_width():
-            column = headers.index(name)
-            left_out.append(headers.pop(column))
-            lines = [line[:column] + line[column + 1 :] for line in lines]
-    print_table("", headers, lines)
-    if left_out:
-        print(f"in the report, or in a wider terminal: {', '.join(left_out)}")
+    print_fitting(headers, lines, [headers.index(name) for name in (f"estimate {triple}", "exp ms", "ms", "deg/s")])
+
+
+def print_fitting(headers: list[str], lines: Sequence[Sequence[str | Text]], optional: Sequence[int]) -> None:
+    """Print a table; optional columns are left out, the first of them first, if the terminal is too narrow."""
+    shown = list(range(len(headers)))
+    for column in optional:
+        if table_width([headers[n] for n in shown], [[line[n] for n in shown] for line in lines]) > terminal_width():
+            shown.remove(column)
+    print_table("", [headers[n] for n in shown], [[line[n] for n in shown] for line in lines])
+    if left_out := [headers[n] for n in optional if n not in shown]:
+        print_wrapped(f"in the report, or in a wider terminal: {', '.join(left_out)}")
+
+
+def print_wrapped(text: str, first: str = "", others: str = "  ") -> None:
+    """Print a text in lines of the terminal's width. first, others : what the first line and the others begin with"""
+    import textwrap
+
+    width = max(terminal_width(), 40)
+    print(textwrap.fill(printable(text), width, initial_indent=first, subsequent_indent=others, break_on_hyphens=False))
 
 
 def table_width(headers: Sequence[str], lines: Sequence[Sequence[str | Text]]) -> int:
@@ -177,18 +188,19 @@ def print_motion(run: dict[str, float]) -> None:
         "bias error {filter_bias_deg_h_end:.2g}°/h",
     }
     lines = [text.format(**run) for key, text in templates.items() if key in run]
-    if lines:
-        print("motion: " + "\n        ".join(lines))
+    for n, line in enumerate(lines):
+        print_wrapped(line, first=" " * 8 if n else "motion: ", others=" " * 8)
 
 
 def print_summary(run: dict[str, Any]) -> None:
-    print(
-        f"\n{run['solved']} of {run['frames']} frames solved, {run['wrong']} wrong; "
+    print()
+    print_wrapped(
+        f"{run['solved']} of {run['frames']} frames solved, {run['wrong']} wrong; "
         f"cross-boresight median {run['cross_arcsec_median']:.3g}″ worst {run['cross_arcsec_worst']:.3g}″, "
         f"roll median {run['roll_arcsec_median']:.3g}″ worst {run['roll_arcsec_worst']:.3g}″"
     )
     stages = ", ".join(f"{name} {ms:.2f}" for name, ms in run["stages_ms"].items())
-    print(f"median ms per frame: {stages}")
+    print_wrapped(f"median ms per frame: {stages}")
     print_motion(run["flight"])
     print(f"report: {run['report']}")
 
@@ -222,6 +234,7 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
     """Print the scoreboard of a comparison, and the reasons for unsolved frames."""
     headers = ["what", "frames", "right %", "(95 %)", "wrong", "refused", "failed"]
     headers += ["cross ″", "worst ″", "roll ″", "worst ″", "ms", "95 % ms"]
+    optional = [12, 11, 3, 10, 8]  # the times, the interval, the worst errors
     rows = [
         [
             line.tracker,
@@ -237,11 +250,11 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
         ]
         for line in lines
     ]
-    print_table("", headers, rows)
+    print_fitting(headers, rows, optional)
     for line in lines:
         for status, count in line.refusals.items():
             print(f"{line.tracker}: {count} × {status}")
-    print(f"scoreboard.ecsv, solutions.NAME.ecsv and the frames are in {folder}")
+    print_wrapped(f"scoreboard.ecsv, solutions.NAME.ecsv and the frames are in {folder}")
 
 
 def print_survey(survey: dict[str, Any]) -> None:
@@ -251,10 +264,13 @@ def print_survey(survey: dict[str, Any]) -> None:
         if row["sigma"]
     ]
     print_table("", ["what", *SURVEY_COLUMNS], lines)
-    print(
-        f"\n{survey['surveyed']} of {survey['leds']} LEDs surveyed in {survey['tied']} of {survey['frames']} "
+    print()
+    print_wrapped(
+        f"{survey['surveyed']} of {survey['leds']} LEDs surveyed in {survey['tied']} of {survey['frames']} "
         f"frames, {survey['renamed']} with a corrected identity; {survey['status']}, {survey['outliers']} outliers, "
-        f"{survey['rms_px']:.2g} px rms, misfit {survey['misfit']:.2g}\n"
+        f"{survey['rms_px']:.2g} px rms, misfit {survey['misfit']:.2g}"
+    )
+    print_wrapped(
         f"LEDs: sigma median {survey['led_sigma_mm_median']:.2g} mm worst {survey['led_sigma_mm_worst']:.2g} mm; "
         f"true error {survey['led_mm_before']:.2g} mm rms before, {survey['led_mm_after']:.2g} mm after"
     )
@@ -265,8 +281,10 @@ def print_survey(survey: dict[str, Any]) -> None:
             for name in ("cross", "roll")
             if result["solved"]
         ]
-        print(f"{when}: " + ", ".join([f"{result['solved']} of {result['stops']} test attitudes solved", *errors]))
-    print(f"{survey['map']}: for tracker.map; plot of the errors: {survey['picture']}")
+        print_wrapped(
+            f"{when}: " + ", ".join([f"{result['solved']} of {result['stops']} test attitudes solved", *errors])
+        )
+    print_wrapped(f"{survey['map']}: for tracker.map; plot of the errors: {survey['picture']}")
 
 
 def print_solutions(solutions: list[dict[str, Any]], out: Path) -> None:

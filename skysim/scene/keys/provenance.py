@@ -74,20 +74,35 @@ def located_tree(layers: list[Layer], overrides: Mapping[str, str]) -> dict[str,
     """The raw scene with preset, calibration and overrides applied, and an origin for each value."""
     whats = ["this file", *(f"base {layer.path.name}" for layer in layers[1:])]
     trees = [with_origins(*layer, what) for layer, what in zip(layers, whats, strict=True)]
-    tree: dict[str, Any] = functools.reduce(merge, reversed(trees))
+    tree: dict[str, Any] = functools.reduce(over_base, reversed(trees))
+    if "camera.preset" in overrides:
+        tree = over_base(tree, put({}, ["camera", "preset"], parse_yaml(overrides["camera.preset"])[1]))
     for key, text in overrides.items():
         tree = put(tree, key.split("."), parse_yaml(text)[1])
     camera = tree.get("camera")
     return tree | {"camera": with_preset(camera)} if isinstance(camera, dict) else tree
 
 
+def over_base(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """`loader.over_base` for located values."""
+    return loader.over_base(base, own, preset_camera)
+
+
+def preset_camera(preset: Located) -> dict[str, Any]:
+    """The camera of a preset with the origin of each value; empty if there is none."""
+    if preset.value is None:
+        return {}
+    path = loader.preset_path(str(preset.value))
+    tree, text = read_yaml(path)
+    camera: dict[str, Any] = with_origins(path, text, tree, f"preset {path.name}")["camera"]
+    return camera
+
+
 def with_preset(camera: dict[str, Any]) -> dict[str, Any]:
     """The camera's keys over those of its preset, and a calibration's over both."""
     own = {key: value for key, value in camera.items() if key not in ("preset", "calibration")}
-    if (preset := camera.get("preset")) and preset.value is not None:
-        path = loader.PRESETS / f"{preset.value}.yaml"
-        tree, text = read_yaml(path)
-        own = merge(with_origins(path, text, tree, f"preset {path.name}")["camera"], own)
+    if preset := camera.get("preset"):
+        own = merge(preset_camera(preset), own)
     if (calibration := camera.get("calibration")) and calibration.value is not None:
         path = Path(str(calibration.value))
         origin = Origin(f"calibration {path.name}", str(path))

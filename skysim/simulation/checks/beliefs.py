@@ -193,8 +193,9 @@ def describe(beliefs: Beliefs, scene: Scene) -> list[str]:
     if not math.isnan(beliefs.epoch_jyear):
         error_arcsec = np.degrees(np.linalg.norm(beliefs.direction_error, axis=1)) * 3600
         differ = f"; its stars are {np.median(error_arcsec):.2g}″ (median) from the sky's" if len(error_arcsec) else ""
+        catalog = Path(scene.tracker.catalog).name.removesuffix(".ecsv")
         lines.append(
-            f"{len(beliefs.lights)} stars to V {beliefs.faintest_mag:.2f} of {Path(scene.tracker.catalog).stem}, epoch"
+            f"{len(beliefs.lights)} stars to V {beliefs.faintest_mag:.2f} of {catalog}, epoch"
             f" J{beliefs.epoch_jyear:.2f} moved to {scene.start_time:%Y-%m-%d}{differ}"
         )
     source = f"tracker.map {Path(scene.tracker.map).name}" if scene.tracker.map else "tracker.survey"

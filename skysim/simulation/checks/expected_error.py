@@ -37,7 +37,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.nearfield import SOLVERS
-from estimator.identification.chance import MIN_EVIDENCE_MATCHES
+from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats
 from skysim.core.units import ARCSEC_RAD
@@ -180,6 +180,7 @@ CAUSES: dict[str, Callable[[View, Rotation, Context], Independent | Common | Non
     "star places": star_places,
     "rolling shutter": rolling_shutter,
 }
+UNKNOWN_TO_TRACKER = ("focal length", "distortion", "assumed lever", "rolling shutter")
 CENTROIDS, SOLVER = "centroid noise", "solver"  # the causes that are not displacements of all images
 EXACT_SOLVERS = ("rotation_only", "pnp")  # without an error of their own
 
@@ -220,6 +221,36 @@ def believed_sigma_px(view: View, noise: Independent, context: Context) -> Float
     if beliefs.led_sigma_m:
         survey_px = context.camera.optics.camera.focal_px * beliefs.led_sigma_m / float(view.distance_m.min())
     return np.asarray(np.sqrt(own2 + settings.centroid_sigma_px**2 + survey_px**2))
+
+
+class Mismatch(NamedTuple):
+    """How far images are from where the tracker expects them, after the best attitude for that.
+
+    residual_px : (n,) of all known errors together;  gate_px : (n,) at which the tracker takes a light for another
+    by_cause    : rms of the residual of each cause
+    """
+
+    residual_px: Floats
+    gate_px: Floats
+    by_cause: dict[str, float]
+
+
+def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch | None:
+    """The mismatch by errors that the tracker does not know of; None if there is none, or too few lights."""
+    causes = {name: CAUSES[name](view, lab_from_cam, context) for name in UNKNOWN_TO_TRACKER}
+    known = {name: errors.displacement_px[:, :, 0] for name, errors in causes.items() if isinstance(errors, Common)}
+    if context.beliefs.focal_sigma:
+        known.pop("focal length", None)  # the tracker allows for it
+    if not known or len(view) < MIN_EVIDENCE_MATCHES:
+        return None
+    sigma_px = believed_sigma_px(view, Independent(centroid_variance(view, context)), context)
+    try:
+        gain = gains(view, sigma_px)
+    except np.linalg.LinAlgError:
+        return None
+    left = {name: shift - view.jacobian @ np.einsum("nij,nj->i", gain, shift) for name, shift in known.items()}
+    rms = {name: float(np.sqrt((shift**2).sum(axis=1).mean())) for name, shift in left.items()}
+    return Mismatch(np.linalg.norm(sum(left.values()), axis=1), GATE_SIGMA * sigma_px, rms)
 
 
 def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:

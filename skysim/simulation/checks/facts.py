@@ -67,14 +67,8 @@ class Fact(NamedTuple):
 
 def field_of_view(context: Context, samples: Samples) -> Fact:
     """Angles between the centers of opposite edges and corners of the chip, without distortion."""
-    camera = context.camera.optics.camera
-    width, height, diagonal = (
-        2 * math.degrees(math.atan(px / 2 / camera.focal_px))
-        for px in (camera.width_px, camera.height_px, math.hypot(camera.width_px, camera.height_px))
-    )
-    arcsec_px = 1 / camera.focal_px / ARCSEC_RAD
-    text = f"{width:.2f}° × {height:.2f}°, diagonal {diagonal:.2f}°; {arcsec_px:.4g}{ARCSEC} a pixel"
-    return Fact("field of view", [text], {"field_deg": [width, height, diagonal], "arcsec_px": arcsec_px})
+    lens = context.camera.optics.camera.calibration()
+    return Fact("field of view", [lens.field_text()], {"field_deg": list(lens.field_deg), "arcsec_px": lens.arcsec_px})
 
 
 def lights_in_field(context: Context, samples: Samples) -> Fact:
@@ -85,7 +79,9 @@ def lights_in_field(context: Context, samples: Samples) -> Fact:
     for key, what, sampled in (("frames", "at the frames", samples.frames), ("reach", reach, samples.reach)):
         counts, seen = sampled.counts(), np.array([len(view) for view in sampled.seen])
         where = attitudes.describe(sampled.attitudes, int(counts.argmin()), scene, mount)
-        missed = f" (of {seen.mean():.1f} on the chip)" if seen.mean() > counts.mean() + 0.5 else ""
+        limit = context.settings.max_blobs
+        cut = f"; the tracker uses the {limit} brightest" if (counts == limit).any() else ""
+        missed = f" (of {seen.mean():.1f} on the chip{cut})" if seen.mean() > counts.mean() + 0.5 else ""
         lines.append(f"{what}: mean {counts.mean():.1f}{missed}, least {counts.min()} at {where}")
         values[key] = {"mean": counts.mean(), "least": counts.min(), "least_at": where, "on_chip": seen.mean()}
     return Fact("lights in the field", lines, values)
@@ -138,6 +134,10 @@ def smear(context: Context, samples: Samples) -> Fact:
         f" {np.median(length_px):.2g} px"
     )
     values = {"largest_px": length_px[fastest], "median_px": np.median(length_px), "rate_deg_s": rate_deg_s[fastest]}
+    if length_px[fastest] > 0:
+        width_px = GAUSSIAN_WIDTH * float(np.median(frames.joined("sigma_px")))
+        values["width_rate_deg_s"] = rate_deg_s[fastest] * width_px / length_px[fastest]
+        text += f"; as long as the image is wide at {short(values['width_rate_deg_s'])} deg/s"
     return Fact("smear", [text], values)
 
 

@@ -7,8 +7,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from skysim.scene.camera import TwoStopsConfig
 from skysim.scene.layouts import FibersConfig, Layout, LcdConfig
 from skysim.scene.light import DomeConfig, StarsConfig
+from skysim.scene.scene import Scene
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import (
     BINOMIAL_VARIANCE_PX2,
@@ -17,6 +19,7 @@ from skysim.simulation.checks.detection import (
     full_scale_e,
     threshold_e,
 )
+from skysim.simulation.checks.expected_error import mismatch
 from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, Samples, cap_margin, fill, short
 from skysim.simulation.checks.views import peak_share
 from skysim.sources.photometry import SUN, star_flux_e_s_m2
@@ -25,7 +28,10 @@ MAX_SATURATED = 0.25  # fraction of saturated lights that gives no warning: a br
 TARGET_FILL = 0.7  # of full well, for the light that a fraction MAX_SATURATED exceeds
 MIN_LIGHTS = 4  # that an identification needs
 MIN_DETECTED = 0.5  # fraction of the lights on the chip that the tracker should detect
-MAX_FEW = 0.02  # fraction of the directions in reach that may have fewer
+MAX_FEW, MAX_FEW_SKY = 0.02, 0.5  # fraction of the directions in reach that may have fewer; of the whole sky
+HIGH_THRESHOLD = 20.0  # sigma, beyond which the threshold is the reason that lights are not detected
+MAX_BACKGROUND = 0.5  # of full scale
+MAX_BEYOND = 0.25  # fraction of the images that may lie beyond the tracker's matching radius: more are not identified
 MAX_SMEAR_PX, MAX_SMEAR_WIDTHS = 4.0, 2.0  # a path that is longer than both gives a warning; in widths of the image
 MAX_DEFOCUS = 0.5  # width of the defocus disk over that of the image in focus
 MIN_DEFOCUS_PX = 1.0
@@ -37,7 +43,7 @@ def saturation(context: Context, samples: Samples) -> str:
     """Warn where many lights are saturated."""
     ratio, scene = fill(context, samples), context.testbed.scene
     full = float((ratio >= 1).mean()) if len(ratio) else 0.0
-    if full <= MAX_SATURATED:
+    if full <= MAX_SATURATED or bright_background(context, samples):
         return ""
     factor = TARGET_FILL / float(np.quantile(ratio, 1 - MAX_SATURATED))
     text = (
@@ -52,18 +58,46 @@ def saturation(context: Context, samples: Samples) -> str:
     return f"light.led.radiant_intensity: {text} {short(1e6 * factor * led.radiant_intensity_w_sr, 2)} uW / sr"
 
 
+def bright_background(context: Context, samples: Samples) -> str:
+    """Warn where extended light alone fills the pixels."""
+    scene, camera = context.testbed.scene, context.camera
+    full_e = full_scale_e(scene.camera.detector)
+    if camera.background_e < MAX_BACKGROUND * full_e:
+        return ""
+    shorter_ms = 1e3 * scene.exposure.time_s * MAX_BACKGROUND / 2 * full_e / camera.background_e
+    return (
+        f"background: {camera.background_e:.0f} electrons in a pixel without a light, of {full_e:.0f} at saturation;"
+        f" lower it, or change exposure.time to {short(shorter_ms, 2)} ms"
+    )
+
+
+def dark_corners(context: Context, samples: Samples) -> str:
+    """Warn where the lens passes no light to a part of the chip."""
+    camera, stops = context.camera.optics.camera, context.camera.optics.camera.vignetting
+    corner_deg = math.degrees(math.atan(camera.corner_px / camera.focal_px))
+    if not isinstance(stops, TwoStopsConfig) or stops.cutoff_deg >= corner_deg:
+        return ""
+    return (
+        f"camera.vignetting.cutoff_deg: the lens is dark beyond {stops.cutoff_deg:g} deg from its axis, and the chip's"
+        f" corner is at {corner_deg:.1f} deg; change it to {math.ceil(1.5 * corner_deg)}"
+    )
+
+
 def few_lights(context: Context, samples: Samples) -> str:
-    """Warn where the tracker has fewer than four lights: at the frames, or on a bearing under a dome in reach."""
+    """Warn where the tracker has fewer than four lights: at the frames, or in reach."""
     scene, mount = context.testbed.scene, context.testbed.mount
-    if cap_too_small(context, samples):
+    if cap_too_small(context, samples) or dark_corners(context, samples):
         return ""  # more LEDs where there are some would not help
-    for sampled, allowed in ((samples.frames, 0.0), (samples.reach, MAX_FEW)):
+    if scene.tracker.brightest is not None and scene.tracker.brightest < MIN_LIGHTS:
+        return (
+            f"tracker.brightest: the tracker uses {scene.tracker.brightest} lights; change it to {MIN_LIGHTS} or more"
+        )
+    in_reach = MAX_FEW_SKY if scene.vehicle.mount == "free" else MAX_FEW
+    for sampled, allowed in ((samples.frames, 0.0), (samples.reach, in_reach)):
         counts = sampled.counts()
         few = float((counts < MIN_LIGHTS).mean())
         if few > allowed:
             break
-        if scene.vehicle.mount == "free":
-            return ""
     else:
         return ""
     on_chip = np.array([len(view) for view in sampled.seen])
@@ -76,7 +110,9 @@ def few_lights(context: Context, samples: Samples) -> str:
         return ""  # they are on the chip: `undetected` says why they are not detected
     if isinstance(scene.light, DomeConfig):
         return f"{density_key(scene.light.layout)}: {text}; {denser(scene.light.layout, float(on_chip.mean()))}"
-    fainter = scene.tracker.limit_mag + 1
+    fainter, sky_mag = scene.tracker.limit_mag + 1, getattr(scene.light, "limit_mag", None)
+    if sky_mag is not None and sky_mag < scene.tracker.limit_mag:
+        return f"light.limit_mag: {text}; change it to {scene.tracker.limit_mag:g}, the tracker's limit"
     return f"tracker.limit_mag: {text}; change it to {fainter:g}, or take a shorter camera.focal_length"
 
 
@@ -106,8 +142,11 @@ def denser(layout: Layout, mean: float) -> str:
 def undetected(context: Context, samples: Samples) -> str:
     """Warn where most of the lights on the chip are too faint or too small for the detector."""
     scene, settings = context.testbed.scene, context.settings
-    seen, used = (sum(map(len, views)) for views in (samples.frames.seen, samples.frames.used))
-    if not seen or used >= MIN_DETECTED * seen or scene.tracker.brightest is not None:
+    # As many as the tracker takes from a frame, if more are there.
+    seen = sum(min(len(view), settings.max_blobs) for view in samples.frames.seen)
+    used = sum(map(len, samples.frames.used))
+    explained = (bright_background, dark_corners, long_smear)
+    if not seen or used >= MIN_DETECTED * seen or any(find(context, samples) for find in explained):
         return ""
     area = np.concatenate([detected_area_px(view, context) for view in samples.frames.seen])
     text = f"the tracker detects {100 * used / seen:.0f} % of the lights in the field"
@@ -118,10 +157,68 @@ def undetected(context: Context, samples: Samples) -> str:
         )
     peak_e = samples.frames.joined("peak_e") - context.camera.background_e
     factor = 3 * threshold_e(context) / max(float(np.median(peak_e)), 1e-3)
-    change = f"{short(1e3 * factor * scene.exposure.time_s, 2)} ms"
-    led = getattr(scene.light, "led", None)
-    brighter = ", or light.led.intensity as much" if led is not None else ", or camera.f_number to a faster lens"
-    return f"exposure.time: {text}: the others are below the threshold; change it to {change}{brighter}"
+    text = f"{text}: the others are below the threshold"
+    if scene.tracker.threshold_sigma > HIGH_THRESHOLD:
+        return f"tracker.threshold_sigma: {text} of {scene.tracker.threshold_sigma:g} sigma; change it to 5"
+    return brighter(scene, factor, text)
+
+
+def brighter(scene: Scene, factor: float, text: str) -> str:
+    """The key that makes lights brighter by a factor, and its value: the exposure, if frames leave the time for it."""
+    exposure_s, led = factor * scene.exposure.time_s, getattr(scene.light, "led", None)
+    if exposure_s <= 1 / scene.exposure.rate_hz:
+        other = "light.led.intensity as much" if led is not None else "camera.f_number to a faster lens"
+        return f"exposure.time: {text}; change it to {short(1e3 * exposure_s, 2)} ms, or {other}"
+    if led is None:
+        return f"camera.f_number: {text}; change it to {short(scene.camera.f_number / math.sqrt(factor), 2)}"
+    if led.intensity_cd is not None:
+        return f"light.led.intensity: {text}; change it to {short(1e3 * factor * led.intensity_cd, 2)} mcd"
+    radiant_uw_sr = 1e6 * factor * led.radiant_intensity_w_sr
+    return f"light.led.radiant_intensity: {text}; change it to {short(radiant_uw_sr, 2)} uW / sr"
+
+
+def not_where_expected(context: Context, samples: Samples) -> str:
+    """Warn where errors that the tracker does not know of displace images beyond its matching radius."""
+    frames, scene = samples.frames, context.testbed.scene
+    cam_from_body = context.testbed.mount.cam_from_body
+    found = [
+        one
+        for view, lab_from_body in zip(frames.used, frames.attitudes.lab_from_body, strict=True)
+        if (one := mismatch(view, lab_from_body * cam_from_body.inv(), context)) is not None
+    ]
+    if not found:
+        return ""
+    residual_px, gate_px = (
+        np.concatenate([getattr(one, name) for one in found]) for name in ("residual_px", "gate_px")
+    )
+    beyond = float((residual_px > gate_px).mean())
+    if beyond <= MAX_BEYOND:
+        return ""
+    text = (
+        f"{100 * beyond:.0f} % of the images are up to {short(residual_px.max(), 2)} px from where the tracker expects"
+        f" them, beyond its matching radius of {short(np.median(gate_px), 2)} px"
+    )
+    cause = max(found[0].by_cause, key=lambda name: max(one.by_cause[name] for one in found))
+    excess = float(np.quantile(residual_px / gate_px, 1 - MAX_BEYOND))
+    return f"{MISMATCH_KEYS[cause]}: {text}; {CHANGES[cause](scene, excess)}"
+
+
+MISMATCH_KEYS = {
+    "focal length": "tracker.assumed_focal_length",
+    "distortion": "tracker.assumed_distortion",
+    "assumed lever": "tracker.assumed_camera_body",
+    "rolling shutter": "camera.shutter",
+}
+# What to change, from the scene and how many times too large the displacement is.
+CHANGES: dict[str, Callable[[Scene, float], str]] = {
+    "focal length": lambda scene, excess: f"change it to {short(1e3 * scene.camera.focal_length_m, 5)} mm",
+    "distortion": lambda scene, excess: f"change it to {list(scene.camera.distortion)}, the lens's",
+    "assumed lever": lambda scene, excess: "leave it out, or fit the place with tracker.solver: pnp",
+    "rolling shutter": lambda scene, excess: (
+        f"change it to {{kind: global}}, or turn {short(excess, 2)} times slower: rows are read one after another, and"
+        " the tracker takes them as simultaneous"
+    ),
+}
 
 
 def cap_too_small(context: Context, samples: Samples) -> str:
@@ -202,11 +299,14 @@ def detection_limit_mag(context: Context, samples: Samples) -> float:
 
 
 FINDINGS: tuple[Callable[[Context, Samples], str], ...] = (
+    bright_background,
     saturation,
+    dark_corners,
     few_lights,
     undetected,
     cap_too_small,
     out_of_focus,
     long_smear,
+    not_where_expected,
     sky_too_shallow,
 )

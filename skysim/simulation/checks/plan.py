@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from skysim.camera import wcs
 from skysim.scene.light import DomeConfig, StarsConfig
-from skysim.simulation.checks import attitudes, dome
+from skysim.simulation.checks import attitudes, dome, lookalike
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, context_of, usable
 from skysim.simulation.checks.expected_error import expected
@@ -40,6 +40,10 @@ def check(testbed: Testbed) -> Check:
     samples = Samples(sampled(frames, context), sampled(reach, context))
     facts = [fact for build in FACTS if (fact := build(context, samples)) is not None]
     findings = [line for find in FINDINGS if (line := find(context, samples))]
+    alike = lookalike.of(context, samples)
+    if alike is not None and isinstance(scene.light, DomeConfig):
+        facts.insert(2, lookalike.fact(alike))
+        findings += [line for line in [lookalike.finding(alike, scene.light)] if line]
     return Check(facts, findings + broken_assumptions(testbed))
 
 

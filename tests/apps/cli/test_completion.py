@@ -10,15 +10,27 @@ import pytest
 from skysim.apps.cli.options import complete_scene, complete_study
 
 
-def test_a_shell_completes_a_scene_s_name() -> None:
+@pytest.mark.parametrize(
+    ("typed", "completed"),
+    [
+        ("skysim run ptase", ["ptase_2003"]),
+        ("skysim study run led", ["led_count"]),
+        ("skysim camera imx2", ["imx250", "imx264"]),
+        ("skysim camera show imx2", ["imx250", "imx264"]),
+        ("skysim camera ne", ["new"]),
+        ("skysim camera new --row", ["--row-time"]),
+        ("skysim camera imx264 --se", ["--set"]),
+    ],
+)
+def test_a_shell_completes_names_and_options(typed: str, completed: list[str]) -> None:
     environment = os.environ | {
         "_SKYSIM_COMPLETE": "complete_bash",
-        "COMP_WORDS": "skysim run ptase",
-        "COMP_CWORD": "2",
+        "COMP_WORDS": typed,
+        "COMP_CWORD": str(len(typed.split()) - 1),
     }
     code = "import sys; sys.argv[0] = 'skysim'; from skysim.apps.cli.main import main; main()"
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
-    assert (done.stdout.split(), done.stderr) == (["ptase_2003"], "")
+    assert (done.stdout.split(), done.stderr) == (completed, "")
 
 
 def test_files_and_folders_complete_beside_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

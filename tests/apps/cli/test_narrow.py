@@ -1,11 +1,14 @@
 """Tables in a narrow terminal: columns are left out and named, numbers are never cut."""
 
 import re
+from pathlib import Path
 
 import pytest
 
 from skysim.apps.cli import terminal
 from skysim.core.types import FrameRow
+from skysim.experiments.tracker_comparison import TrackerScore
+from skysim.results.metrics import Summary
 
 TRIPLE = ("roll", "pitch", "yaw")
 
@@ -29,15 +32,52 @@ def row(frame: int) -> FrameRow:
     )
 
 
+def score(name: str) -> TrackerScore:
+    times = {"time_ms_median": 12.5, "time_ms_p95": 123.0}
+    errors = dict.fromkeys(
+        [f"{angle}_arcsec_{what}" for angle in ("cross", "roll") for what in ("median", "worst")], 1234.5
+    )
+    return TrackerScore(name, 400, Summary(0.951, 0.925, 0.97, 400), 3, 12, 0, **errors, **times, refusals={})
+
+
+@pytest.mark.parametrize("width", [80, 100, 240])
+def test_a_scoreboard_fits_the_terminal_and_keeps_what_counts(
+    width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(terminal, "terminal_width", lambda: width)
+    terminal.print_scores([score("own"), score("somebody_else")], Path("out/scoreboard"))
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= width
+    kept = next(line for line in lines if line.startswith("what"))
+    assert re.search(r"frames +right % .*wrong +refused +failed +cross ″ .*roll ″", kept)
+    assert ("95 % ms" in kept) == (width == 240)
+    assert not any("…" in line for line in lines)
+
+
+def test_the_summary_of_a_run_fits_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(terminal, "terminal_width", lambda: 80)
+    errors = {f"{angle}_arcsec_{what}": 1234.5 for angle in ("cross", "roll") for what in ("median", "worst")}
+    stages = dict.fromkeys(["render", "detector", "detect", "centroid", "identify", "solve"], 12.34)
+    motion = {"pointing_deg_worst": 0.0687, "pointing_deg_end": 0.069, "torque_nm_worst": 0.0757, "imu_deg_worst": 1.0}
+    motion |= {"imu_deg_end": 0.005, "gyro_saturated_s": 0.0}
+    run = {"solved": 60, "frames": 60, "wrong": 0, "stages_ms": stages, "flight": motion, "report": "out/x/report.html"}
+    terminal.print_summary(run | errors)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert [line[:8] for line in lines if "IMU" in line or "pointing" in line] == ["motion: ", " " * 8]
+
+
 @pytest.mark.parametrize(("width", "left_out"), [(80, 4), (110, 1), (240, 0)])
 def test_the_rows_of_a_run_fit_the_terminal(
     width: int, left_out: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(terminal, "terminal_width", lambda: width)
     terminal.print_rows([row(0), row(1)], TRIPLE, [10.0, 10.0])
-    lines = capsys.readouterr().out.splitlines()
-    named = [line for line in lines if line.startswith("in the report")]
-    assert sum(len(line.partition(": ")[2].split(", ")) for line in named) == left_out
+    out = capsys.readouterr().out
+    lines, named = out.splitlines(), " ".join(out.split()).partition("in a wider terminal: ")[2]
+    assert len(named.split(", ") if named else []) == left_out
     table = [line for line in lines if "solved" in line]
     assert len(table) == 2
     for line in table:

@@ -12,7 +12,7 @@ from study_stores import done
 
 from skysim.experiments.study import loader, store
 from skysim.experiments.study.analysis import answer
-from skysim.experiments.study.analysis.table import PointRow, table
+from skysim.experiments.study.analysis.table import PointRow, format_summary, table
 from skysim.experiments.study.plan import Study
 from skysim.experiments.study.report import overview, page
 from skysim.results import metrics
@@ -137,6 +137,32 @@ def test_the_checks_are_made_at_every_level_and_say_where_they_found_something(t
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(
+    ("texts", "told"),
+    [
+        (["12 px of 3"] * 3, "12 px of 3"),
+        (["12 px of 3", "13 px of 3", "12 px of 3"], "12 px of 3 [a = 1; with other numbers at all others]"),
+        (["12 px of 3", "13 px of 3"], "12 px of 3 [a = 1; a = 2]"),
+    ],
+)
+def test_a_finding_that_differs_in_its_numbers_is_told_once(texts: list[str], told: str) -> None:
+    at = [(text, f"a = {n}") for n, text in enumerate(texts, 1)]
+    assert overview.finding_text(at, checked=3) == told
+
+
+def test_a_rounding_error_of_zero_is_zero() -> None:
+    assert format_summary(Summary(4.5e-13, 3e-13, 4.6e-13, 9)) == "0"
+    assert format_summary(Summary(4.5e-8, 3e-13, 4.6e-3, 9)) == "4.5e-08 (0..0.0046)"
+
+
+def test_findings_of_many_levels_are_few(tmp_path: Path) -> None:
+    """Three widths of LEDs, all of them too wide: one warning, not three that differ in their numbers."""
+    sizes = {"key": "light.led.disk_diameter", "values": ["20 mm", "25 mm", "30 mm"]}
+    found = overview.overview(loaded(tmp_path, trial={"kind": "frames"}, factors={"size": sizes})).findings
+    (wide,) = [one for one in found if "px wide; local treats" in one]
+    assert wide.endswith("[first levels; with other numbers at all others]")
+
+
 def test_a_report_begins_with_scene_findings_and_answers(tmp_path: Path) -> None:
     plan = loaded(tmp_path, figures=[{"kind": "map", "value": "stars_least"}])
     assert done(plan, tmp_path / "study.sqlite").failed == 0

@@ -140,6 +140,15 @@ def test_a_study_says_the_rate_at_which_95_percent_are_identified() -> None:
     assert few[0].endswith("(95 %: below 4; 12 more trials at each level are needed).")
 
 
+def test_a_level_of_the_sentence_has_its_unit() -> None:
+    factors = STUDY["factors"] | {"chain": {"key": "exposure.time", "values": ["0.5 ms", "5 ms"]}}
+    study = Study.model_validate(STUDY | {"factors": factors})
+    said = thresholds.sentences(
+        study.thresholds[0], study, lines_of(study, {"0.5 ms": [1.0] * 8, "5 ms": [1.0] * 8}, 60)
+    )
+    assert [one.partition(":")[0] for one in said] == ["chain = 0.5 ms", "chain = 5 ms"]
+
+
 def test_its_interval_is_that_of_as_many_independent_trials_as_there_are() -> None:
     """A point without trials is left out; two levels are the least."""
     study = Study.model_validate(STUDY)

@@ -1,4 +1,4 @@
-"""Commands `skysim scenes`, `catalog`, `export` and `camera`."""
+"""Commands `skysim scenes`, `catalog` and `export`."""
 
 from __future__ import annotations
 
@@ -116,43 +116,3 @@ def export(
         print(path)
     if len(written) > 10:
         print(f"and {len(written) - 10} more files in {out or folder}")
-
-
-def camera(
-    file: Annotated[
-        Path,
-        typer.Argument(metavar="FILE", help="Scene or camera file, name of a scene, or OpenCV calibration (YAML)."),
-    ],
-    out: Annotated[
-        Path | None, typer.Option(help="Also write the calibration to this file, in OpenCV's YAML format.")
-    ] = None,
-    set_: Overrides = None,
-    json: Json = False,
-) -> None:
-    """Show a camera's calibration: focal length, principal point and distortion. Optionally write it for OpenCV."""
-    import dataclasses
-
-    from skysim.core import files
-    from skysim.core.yaml_reader import parse_overrides
-    from skysim.scene import loader, opencv_calibration
-
-    if opencv_calibration.looks_like_calibration(file):
-        calibration = opencv_calibration.read(file)
-    elif set_:
-        calibration = loader.load(file, parse_overrides(set_)).camera.calibration()
-    else:
-        calibration = loader.load_camera(loader.find(str(file))).calibration()
-    if out:
-        files.make_folder(out.parent)
-        files.write_text(out, opencv_calibration.text(calibration))
-    if json:
-        print_json(dataclasses.asdict(calibration))
-        return
-    x, y = calibration.center_px
-    coefficients = zip(opencv_calibration.COEFFICIENTS, calibration.distortion, strict=True)
-    print(f"size             {calibration.width_px} x {calibration.height_px} px")
-    print(f"focal length     {calibration.focal_px:.6g} px")
-    print(f"principal point  {x:.6g}, {y:.6g} px (the center of the first pixel is 0, 0)")
-    print("distortion       " + ", ".join(f"{name} {value:g}" for name, value in coefficients))
-    if out:
-        print(f"{out}: for OpenCV, skysim solve --camera and the scene key camera.calibration")

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skysim.apps.cli.options import Json
+from skysim.apps.cli.options import Json, OpenReport
 from skysim.apps.cli.terminal import colored, print_json, print_list, print_table, progress_callback
+from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -30,9 +31,12 @@ def reproduce(
         Path | None,
         typer.Option(help="Also write a Markdown page with its images beside it, as docs/findings/papers.md."),
     ] = None,
+    open_: OpenReport = False,
     json: Json = False,
 ) -> None:
     """Repeat the experiments of papers and compare the published numbers with ours."""
+    if open_ and not report:
+        raise InputError("--open: has no effect without --report; allowed: --report --open")
     if not ids:
         from skysim.experiments.papers.published import experiments
 
@@ -58,6 +62,8 @@ def reproduce(
     if report:
         written.append(files.make_folder(out) / "report.html")
         page.write_html(written[-1], reproductions, arguments)
+        if open_:
+            typer.launch(str(written[-1]))
     if markdown:
         files.make_folder(markdown.parent)
         written.append(markdown)

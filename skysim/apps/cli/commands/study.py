@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skysim.apps.cli.options import Json, Out, Overrides, Programs, complete_study, output_folder
+from skysim.apps.cli.options import Json, OpenReport, Out, Overrides, Programs, complete_study, output_folder
 from skysim.apps.cli.study_summary import (
     print_answers,
     print_points,
@@ -63,6 +63,7 @@ def run(
     scheduler: Scheduler = "",
     set_: Overrides = None,
     program: Programs = None,
+    open_: OpenReport = False,
     json: Json = False,
 ) -> None:
     """Run a study, or a search if called as `optimize`, that has no store yet."""
@@ -78,7 +79,7 @@ def run(
         raise InputError(f"{plan.path}: has no key optimize; allowed: skysim study run")
     if not search and plan.study.optimize is not None:
         raise InputError(f"{plan.path}: has the key optimize; allowed: skysim study optimize")
-    run_and_report(plan, study, out, create_engine(engine, workers, scheduler), overrides, json)
+    run_and_report(plan, study, out, create_engine(engine, workers, scheduler), overrides, json, open_)
 
 
 @app.command()
@@ -90,13 +91,14 @@ def resume(
     scheduler: Scheduler = "",
     failed: Annotated[bool, typer.Option("--failed", help="Repeat failed trials too.")] = False,
     program: Programs = None,
+    open_: OpenReport = False,
     json: Json = False,
 ) -> None:
     """Continue a study or a search that was stopped or killed, or that used up its budget."""
     start_workers(engine)
     plan, overrides = load_stored_plan(study, out, program or [])
     trial_engine = create_engine(engine, workers, scheduler)
-    run_and_report(plan, study, out, trial_engine, overrides, json, resumed=True, repeat_failed=failed)
+    run_and_report(plan, study, out, trial_engine, overrides, json, open_, resumed=True, repeat_failed=failed)
 
 
 @app.command()
@@ -115,10 +117,10 @@ def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
 
 
 @app.command()
-def report(study: StudyArg, out: Out = None, json: Json = False) -> None:
+def report(study: StudyArg, out: Out = None, open_: OpenReport = False, json: Json = False) -> None:
     """Write the report of a study, finished or not, and print its table."""
     plan, overrides = load_stored_plan(study, out)
-    write_report(plan, study, out, overrides, json)
+    write_report(plan, study, out, overrides, json, open_)
 
 
 @app.command()
@@ -235,6 +237,7 @@ def run_and_report(
     engine: Engine,
     overrides: dict[str, str],
     json: bool,
+    open_: bool,
     resumed: bool = False,
     repeat_failed: bool = False,
 ) -> None:
@@ -264,7 +267,7 @@ def run_and_report(
         print_error(f"{counts['done']} of {total} trials done within the budget; continue: {resume_command}")
     if counts["failed"]:
         print_error(f"{counts['failed']} trials failed; list them: {command(study, out, 'status')}")
-    write_report(plan, study, out, overrides, json)
+    write_report(plan, study, out, overrides, json, open_)
 
 
 @contextmanager
@@ -277,8 +280,8 @@ def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
         raise
 
 
-def write_report(plan: Plan, study: str, out: Path | None, overrides: dict[str, str], json: bool) -> None:
-    """Write the HTML report and print the table of results."""
+def write_report(plan: Plan, study: str, out: Path | None, overrides: dict[str, str], json: bool, open_: bool) -> None:
+    """Write the HTML report, print the table of results, and open the report in the browser if `open_`."""
     from skysim.experiments.study.analysis import answer, table
     from skysim.experiments.study.report import page
     from skysim.experiments.study.report.overview import overview
@@ -294,6 +297,8 @@ def write_report(plan: Plan, study: str, out: Path | None, overrides: dict[str, 
         page.write_page(path, stored, plan.study, repeat, shown, **texts, **analysis(plan, stored))
         lines = table.select_responses(lines, plan.study.responses)
         progress = study_status(plan, stored)
+    if open_:
+        typer.launch(str(path))
     if json:
         points = table.to_columns(lines)
         print_json(progress | {"report": str(path), "points": points, "answers": answers, "findings": about.findings})

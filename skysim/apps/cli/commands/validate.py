@@ -14,9 +14,9 @@ import typer
 from skysim.apps.cli.options import Json, Overrides, SceneArg, load, with_location
 from skysim.apps.cli.terminal import print_check, print_error, print_json
 from skysim.core.errors import InputError
+from skysim.scene.data_sheet.sheet import PLACEHOLDER_LENS
 
 KINDS = ("scene", "study")
-PLACEHOLDER_LENS = {"focal_length": "1 m", "f_number": 1.0}  # because a camera preset has no lens
 
 
 class Verdict(NamedTuple):
@@ -33,7 +33,7 @@ def validate(
         list[Path] | None,
         typer.Argument(
             metavar="FILES",
-            help="Scenes and studies (YAML files or names), cameras (YAML, also of OpenCV), vehicles (MJCF),"
+            help="Scenes, studies and cameras (YAML files or names), calibrations of OpenCV (YAML), vehicles (MJCF),"
             " catalogs and LED maps (ECSV).",
         ),
     ] = None,
@@ -41,9 +41,9 @@ def validate(
     json: Json = False,
 ) -> None:
     """Check files: keys, units, consistency, and whether a scene can be set up. Exit code 2 if one is invalid."""
-    from skysim.apps.cli.commands import json_schema
-
     if schema is not None:
+        from skysim.apps.cli.commands import json_schema
+
         if schema not in KINDS:
             raise InputError(f"--schema {schema}: allowed: {', '.join(KINDS)}")
         print_json(json_schema.json_schema(schema))
@@ -93,7 +93,7 @@ def describe_file(path: Path) -> tuple[str, tuple[str, ...]]:
 
     path = path if path.suffix else find_shipped(path)
     if path.suffix not in (".yaml", ".yml", ".ecsv", ".xml"):
-        raise InputError(f"{path}: allowed: .yaml, .ecsv, .xml or the name of a scene or a study")
+        raise InputError(f"{path}: allowed: .yaml, .ecsv, .xml or the name of a scene, a study or a camera")
     if not is_file(path):  # reading a named pipe would block
         raise InputError(f"{path}: not a regular file")
     if path.suffix == ".ecsv":
@@ -122,14 +122,12 @@ def describe_file(path: Path) -> tuple[str, tuple[str, ...]]:
 
 
 def find_shipped(path: Path) -> Path:
-    """Path of the shipped study or scene of this name. Raises InputError with the allowed names."""
-    from skysim.experiments.study import plan
-    from skysim.scene import loader
+    """Path of the shipped scene, study or camera of this name. Raises InputError with the names of the scenes."""
+    from skysim.core.paths import DATA, SCENES, STUDIES
+    from skysim.core.yaml_reader import find_file
 
-    try:
-        return plan.find(str(path))
-    except InputError:
-        return loader.find(str(path))
+    names = (folder / f"{path}.yaml" for folder in (STUDIES, DATA / "cameras"))
+    return next((file for file in names if file.is_file()), None) or find_file(str(path), SCENES, "scene")
 
 
 def check_scene(path: Path) -> tuple[str, tuple[str, ...]]:

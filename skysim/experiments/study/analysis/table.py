@@ -16,6 +16,7 @@ from skysim.results.metrics import Summary
 LONG_QUANTITY = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
 
 
+ROUNDING = 1e-9  # a smaller response is the rounding error of 0
 MIN_VALUES = 5  # fewer values of more trials are few
 
 
@@ -80,11 +81,12 @@ def format_summary(summary: Summary) -> str:
     """Text of a statistic with its interval, or how many values more it needs to have one."""
     if np.isnan(summary.value):
         return "-"
+    value, low, high = (0.0 if abs(one) < ROUNDING else one for one in summary[:3])
     if summary.needs:
-        return f"{summary.value:.3g} (needs {summary.needs} more)"
-    if np.isnan(summary.low) or summary.low == summary.high:
-        return f"{summary.value:.3g}"
-    return f"{summary.value:.3g} ({summary.low:.3g}..{summary.high:.3g})"
+        return f"{value:.3g} (needs {summary.needs} more)"
+    if np.isnan(low) or low == high:
+        return f"{value:.3g}"
+    return f"{value:.3g} ({low:.3g}..{high:.3g})"
 
 
 def format_response(row: PointRow, name: str) -> str:

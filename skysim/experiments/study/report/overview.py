@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ from skysim.scene.scene import Scene
 from skysim.simulation import checks
 from skysim.simulation.testbed import Testbed, build_testbed
 
+NUMBER = re.compile(r"\d[\d.]*")
 MAX_CHECKED = 8  # scenes that are checked: building one takes up to a second
 
 
@@ -38,7 +40,7 @@ class Overview(NamedTuple):
 def overview(plan: Plan) -> Overview:
     """The overview of a study; scenes that cannot be built are left out, as their trials tell why."""
     rows: list[tuple[str, str]] = []
-    found: dict[str, list[str]] = {}
+    found: dict[str, list[tuple[str, str]]] = {}
     checked, may_be_ambiguous = 0, False
     for levels, point in checked_points(plan):
         if checked == MAX_CHECKED:
@@ -53,9 +55,18 @@ def overview(plan: Plan) -> Overview:
         may_be_ambiguous |= may_report_ambiguity(scene)
         rows = rows or scene_rows(plan, testbed)
         for line in lines:
-            found.setdefault(line, []).append(levels)
-    findings = [line if len(at) == checked else f"{line} [{'; '.join(at)}]" for line, at in found.items()]
-    return Overview(rows, findings, may_be_ambiguous)
+            found.setdefault(NUMBER.sub("#", line), []).append((line, levels))
+    return Overview(rows, [finding_text(at, checked) for at in found.values()], may_be_ambiguous)
+
+
+def finding_text(at: list[tuple[str, str]], checked: int) -> str:
+    """One finding, which differs in its numbers at some levels: the first one, and the levels at which it was found."""
+    (line, first), others = at[0], [levels for _, levels in at[1:]]
+    if len(at) == checked and len({text for text, _ in at}) == 1:
+        return line
+    if len(at) == checked:
+        return f"{line} [{first}; with other numbers at all others]"
+    return f"{line} [{'; '.join([first, *others])}]"
 
 
 def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:

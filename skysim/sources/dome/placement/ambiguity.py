@@ -54,7 +54,12 @@ class Ambiguity(NamedTuple):
 
 
 def field_ambiguity(
-    place_m: Floats, height_m: float, tilt_rad: float, radius_rad: float, coincidence_m: float
+    place_m: Floats,
+    height_m: float,
+    tilt_rad: float,
+    radius_rad: float,
+    coincidence_m: float,
+    least: float = 0.0,
 ) -> Ambiguity:
     """For every LED that the boresight can reach, the largest fraction of its field that another attitude also shows.
 
@@ -62,13 +67,14 @@ def field_ambiguity(
     height_m   : of the entrance pupil above the bearing, along the boresight (its lateral offset is neglected)
     tilt_rad   : fields are centered on the LEDs within this angle from the zenith;  radius_rad : of the field, round
     coincidence_m : two LEDs coincide if they are nearer than this after one field is laid on the other
+    least      : fractions below are not searched, which is much faster, and returned as this
     One center LED is laid on another and the field is rotated about it. For a camera on its lever arm that is a
     rotation about the bearing. The rotations tried are those that bring a second LED to coincide. A field is also
     laid on itself, rotated. Coincidence is judged in the camera's perspective, so on a dome that is not a sphere the
     fields differ.
     """
     fields = fields_about(place_m, height_m, tilt_rad, radius_rad, coincidence_m)
-    fraction, other = most_similar(fields)
+    fraction, other = most_similar(fields, least)
     return Ambiguity(fields.center, fields.center[other], fraction)
 
 
@@ -93,10 +99,10 @@ def fields_about(place_m: Floats, height_m: float, tilt_rad: float, radius_rad: 
 
 
 @jit
-def most_similar(fields: Fields) -> tuple[Floats, Ints]:
-    """(C,) greatest fraction of each field that another field shows too, and (C,) the index of that field."""
+def most_similar(fields: Fields, least: float) -> tuple[Floats, Ints]:
+    """(C,) greatest fraction of each field that another field shows too, at least `least`, and (C,) that field."""
     count = len(fields.center)
-    fraction, other = np.zeros(count), np.arange(count)
+    fraction, other = np.full(count, least), np.arange(count)
     for i in range(count):
         for j in range(i, count):
             larger = 1 + max(fields.first[i + 1] - fields.first[i], fields.first[j + 1] - fields.first[j])

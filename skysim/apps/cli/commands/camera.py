@@ -1,0 +1,251 @@
+"""Commands `skysim camera`: list the presets, show a camera, write one from the numbers of a data sheet."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from skysim.apps.cli.options import Json, Overrides, complete_scene
+from skysim.apps.cli.terminal import print_error, print_json, print_list, terminal_width
+from skysim.core.errors import InputError, printable, unknown_name
+from skysim.scene.data_sheet.questions import QUESTIONS
+from skysim.scene.data_sheet.sheet import PLACEHOLDER_LENS, option
+
+if TYPE_CHECKING:
+    from skysim.scene.data_sheet.sheet import Sheet
+    from skysim.scene.opencv_calibration import Calibration
+
+
+def complete_camera(incomplete: str) -> list[str]:
+    """Names of camera presets, scenes and YAML files that begin with what was typed."""
+    from skysim.core.paths import DATA
+
+    names = {path.stem for path in (DATA / "cameras").glob("*.yaml") if path.stem.startswith(incomplete)}
+    return sorted(names | set(complete_scene(incomplete)))
+
+
+class CameraGroup(TyperGroup):
+    """`skysim camera FILE` is short for `skysim camera show FILE`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Insert `show` before arguments that name no subcommand."""
+        words = [word for word in args if not word.startswith("-")]
+        if words and args[0] not in self.commands:
+            args = ["show", *args]
+        return super().parse_args(ctx, args)
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
+        """Subcommands, and what `show` takes."""
+        item = type(super().shell_complete(ctx, "")[0])  # the class of typer's own parser or of click
+        names = [] if incomplete.startswith("-") else complete_camera(incomplete)
+        return [*super().shell_complete(ctx, incomplete), *map(item, names)]
+
+
+app = typer.Typer(
+    cls=CameraGroup,
+    invoke_without_command=True,
+    help="Show a camera: field of view, arcseconds a pixel, calibration. Make one from a data sheet.",
+)
+
+
+@app.callback()
+def cameras(context: typer.Context, json: Json = False) -> None:
+    """List the camera presets; with a file or a name, show that camera (`skysim camera show`)."""
+    if context.invoked_subcommand:
+        return
+    from skysim.scene import loader
+
+    listed = [preset_entry(path) for path in sorted(loader.PRESETS.glob("*.yaml"))]
+    width = terminal_width()
+    print_list(
+        listed, json, lambda entry: "{name:11s} {size:15s} {pixel:8s} {shutter:10s} {what}".format(**entry)[:width]
+    )
+
+
+def preset_entry(path: Path) -> dict[str, str]:
+    """Name, size, pitch, shutter and the first words of the description of a preset."""
+    from skysim.core.yaml_reader import read_yaml
+
+    tree, text = read_yaml(path)
+    camera = tree["camera"]
+    comment = " ".join(line.removeprefix("#") for line in text.splitlines() if line.startswith("#"))
+    return {
+        "name": path.stem,
+        "size": f"{camera['width_px']} x {camera['height_px']} px",
+        "pixel": camera["pixel"],
+        "shutter": camera["shutter"]["kind"],
+        "what": printable(comment.replace("(", ",").replace(":", ",").partition(",")[0]),
+        "file": str(path),
+    }
+
+
+@app.command("show")
+def camera_show(
+    file: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE",
+            help="Scene, camera file, preset (data/cameras) or OpenCV calibration (YAML): a file or a name.",
+            autocompletion=complete_camera,
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Also write the calibration to this file, in OpenCV's YAML format.")
+    ] = None,
+    set_: Overrides = None,
+    json: Json = False,
+) -> None:
+    """Show a camera: field of view, arcseconds a pixel, focal length, distortion. Optionally write it for OpenCV.
+
+    `skysim camera FILE` does the same.
+    """
+    import dataclasses
+
+    from skysim.core import files
+    from skysim.scene import opencv_calibration
+
+    lens, body = read_camera(file, set_)
+    if lens is None and out:
+        raise InputError(f"--out {out}: {file} has no lens; allowed: --set camera.focal_length='16 mm'")
+    if lens is not None and out:
+        files.make_folder(out.parent)
+        files.write_text(out, opencv_calibration.text(lens))
+    if json:
+        known = dataclasses.asdict(lens) | {"field_deg": lens.field_deg, "arcsec_px": lens.arcsec_px} if lens else {}
+        print_json(body | known)
+        return
+    print("size             {width_px} x {height_px} px".format(**body))
+    if lens is None:
+        print("field of view    no lens: add --set camera.focal_length='16 mm'")
+        return
+    x, y = lens.center_px
+    coefficients = zip(opencv_calibration.COEFFICIENTS, lens.distortion, strict=True)
+    print(f"field of view    {lens.field_text()}")
+    print(f"focal length     {lens.focal_px:.6g} px")
+    print(f"principal point  {x:.6g}, {y:.6g} px (the center of the first pixel is 0, 0)")
+    print("distortion       " + ", ".join(f"{name} {value:g}" for name, value in coefficients))
+    if out:
+        print(f"{out}: for OpenCV, skysim solve --camera and the scene key camera.calibration")
+
+
+def read_camera(name: str, overrides: list[str] | None) -> tuple[Calibration | None, dict[str, int]]:
+    """The calibration, None without a lens, and the chip's size: of a scene, a camera, a preset or an OpenCV file."""
+    from skysim.core.yaml_reader import parse_overrides
+    from skysim.scene import loader, opencv_calibration
+
+    if opencv_calibration.looks_like_calibration(Path(name)):
+        if overrides:
+            raise InputError(
+                f"--set {overrides[0]}: has no effect: {name} is a calibration; allowed: a scene, a camera"
+            )
+        lens = opencv_calibration.read(Path(name))
+        return lens, {"width_px": lens.width_px, "height_px": lens.height_px}
+    values = parse_overrides(overrides)
+    if not Path(name).suffix and name not in (known := loader.list_cameras() + loader.list_scenes()):
+        raise InputError(f"{unknown_name('camera', name, known)}, or a .yaml file")
+    path = loader.preset_path(name) if name in loader.list_cameras() else loader.find(name)
+    tree = loader.read(path)[0]
+    alone = tree.keys() <= {"camera", "schema"} and isinstance(tree.get("camera"), dict)
+    if values and not alone:
+        camera = loader.load(path, values).camera
+    else:
+        camera = loader.load_camera(path, PLACEHOLDER_LENS if alone else None, values)
+    has_lens = not alone or "camera.focal_length" in values or "focal_length" in tree["camera"]
+    return camera.calibration() if has_lens else None, {"width_px": camera.width_px, "height_px": camera.height_px}
+
+
+def sheet_option(name: str) -> Any:
+    """The option of a question of the data sheet."""
+    question = QUESTIONS[name]
+    return typer.Option(f"--{option(name)}", metavar="TEXT", help=f"{question.ask}: {question.where}.")
+
+
+Answer = str | None
+
+
+@app.command("new")
+def camera_new(
+    context: typer.Context,
+    pixels: Annotated[Answer, sheet_option("pixels")] = None,
+    pitch: Annotated[Answer, sheet_option("pitch")] = None,
+    focal_length: Annotated[Answer, sheet_option("focal_length")] = None,
+    f_number: Annotated[Answer, sheet_option("f_number")] = None,
+    transmission: Annotated[Answer, sheet_option("transmission")] = None,
+    blur: Annotated[Answer, sheet_option("blur")] = None,
+    shutter: Annotated[Answer, sheet_option("shutter")] = None,
+    row_time: Annotated[Answer, sheet_option("row_time")] = None,
+    quantum_efficiency: Annotated[Answer, sheet_option("quantum_efficiency")] = None,
+    bits: Annotated[Answer, sheet_option("bits")] = None,
+    black_level: Annotated[Answer, sheet_option("black_level")] = None,
+    full_well: Annotated[Answer, sheet_option("full_well")] = None,
+    gain: Annotated[Answer, sheet_option("gain")] = None,
+    read_noise: Annotated[Answer, sheet_option("read_noise")] = None,
+    dark_current: Annotated[Answer, sheet_option("dark_current")] = None,
+    prnu: Annotated[Answer, sheet_option("prnu")] = None,
+    name: Annotated[str, typer.Option(help="Name of camera, lens and data sheets, for the file's first line.")] = "",
+    out: Annotated[Path, typer.Option(help="The file to write, for the key camera.preset.")] = Path("camera.yaml"),
+    json: Json = False,
+) -> None:
+    """Write a camera file from the numbers of a data sheet: asks for each; with options, only those are used.
+
+    Numbers that the data sheet does not state are assumed; the file and the output name them.
+    """
+    from skysim.core import files
+    from skysim.scene.data_sheet import sheet
+
+    if out.suffix not in (".yaml", ".yml") or out.exists():
+        raise InputError(f"--out {out}: {'exists' if out.exists() else 'no .yaml file'}; allowed: a new .yaml file")
+    answers = {key: context.params[key] for key in QUESTIONS if context.params[key] is not None}
+    if not answers:
+        answers = ask_all()
+    filled = sheet.fill(answers)
+    files.make_folder(out.parent)
+    files.write_text(out, sheet.text(filled, name or out.stem))
+    if json:
+        print_json({"file": str(out), "missing": [one._asdict() for one in filled.missing]})
+    else:
+        print_new(out, filled)
+
+
+def ask_all() -> dict[str, str]:
+    """Ask for each number of the data sheet; a wrong answer is asked again, an empty one is not stated."""
+    from skysim.scene.data_sheet import sheet
+
+    print("Numbers of the data sheets of camera and lens, with their units. Press Enter for what is not stated.")
+    answers: dict[str, str] = {}
+    for name, question in QUESTIONS.items():
+        required = name in sheet.PLACEHOLDERS
+        if not required and name not in sheet.outstanding(answers):
+            continue  # of a lens or a shutter that this camera does not have
+        assumed = "" if required else sheet.outstanding(answers)[name].assumed or "left out"
+        print(f"\n{question.ask}\n  where: {question.where}" + (f"\n  not stated: {assumed}" if assumed else ""))
+        while True:
+            text = typer.prompt(f"  {option(name)}", default="", show_default=False).strip()
+            try:
+                if text:
+                    sheet.outstanding(answers | {name: text})
+                    answers[name] = text
+                elif required:
+                    raise InputError(f"{option(name)}: required")
+                break
+            except InputError as error:
+                print_error(str(error))
+    return answers
+
+
+def print_new(path: Path, filled: Sheet) -> None:
+    """Print what a new camera file assumes, and how to use it."""
+    lens, body = read_camera(str(path), None)
+    print("{path}: {width_px} x {height_px} px".format(path=path, **body) + (f"; {lens.field_text()}" if lens else ""))
+    if filled.missing:
+        print(f"not stated, and assumed in {path}:" if filled.missing else "")
+    for one in filled.missing:
+        name = one.name.replace("_", " ")
+        line = f"{name:19s}{one.assumed or 'left out'}: {one.consequence}"
+        width = min(max(terminal_width(), 40), 100)
+        print(textwrap.fill(line, width, initial_indent="  ", subsequent_indent=" " * 21, break_on_hyphens=False))
+    print(f"in a scene: camera: {{preset: {path}}}; skysim camera {path} shows it")

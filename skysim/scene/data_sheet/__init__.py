@@ -1,0 +1,1 @@
+"""A camera file from the numbers of a data sheet, for `skysim camera new`."""

@@ -1,0 +1,155 @@
+"""A camera file from the numbers of a data sheet: what to ask, and what is assumed where the sheet is silent.
+
+Answers are texts as a user types them. The file is a preset (`camera.preset`); each value has a comment: [S1] if the
+data sheet states it, otherwise `assumed` with the reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from skysim.core.errors import InputError, printable
+from skysim.scene.data_sheet.questions import QUESTIONS, REQUIRED, Values
+
+CURVES = {"interline": "interline", "frame_transfer": "thick_ccd"}  # shapes of the quantum efficiency by shutter
+PLACEHOLDERS = {"pixels": "1000x1000", "pitch": "5 um"}  # to check an answer before these two are given
+PLACEHOLDER_LENS = {"focal_length": "1 m", "f_number": 1.0}  # to validate a camera without a lens
+SI = {"pixel": " m", "focal_length": " m", "shutter.row_time": " s"}  # units of the limits in messages
+COMMENT_COLUMN = 34
+
+
+class Line(NamedTuple):
+    """One value of the file with its comment."""
+
+    key: str
+    value: Any
+    comment: str
+
+
+class Missing(NamedTuple):
+    """A number that is not stated: what is assumed (empty: the key is left out), and the consequence."""
+
+    name: str
+    assumed: str
+    consequence: str
+
+
+class Sheet(NamedTuple):
+    """The values of a camera file, and what the data sheet does not state."""
+
+    lines: list[Line]
+    missing: list[Missing]
+
+
+def fill(answers: Mapping[str, str]) -> Sheet:
+    """The camera of some answers, with assumptions for the rest. Raises InputError with the option's name."""
+    values = {name: parsed(name, text) for name, text in answers.items()}
+    missing, comments = [], dict.fromkeys(values, "[S1]")
+    for name, question in QUESTIONS.items():
+        skipped = question.skipped(values)
+        if skipped and name in values:
+            raise InputError(f"--{option(name)}: has no effect {skipped}")
+        if skipped or name in values:
+            continue
+        if name in REQUIRED:
+            raise InputError(f"--{option(name)}: missing; {question.ask}: {question.where}")
+        guess = question.assume(values)
+        if guess is not None:
+            values[name], comments[name] = guess.value, f"assumed: {guess.why}"
+        text = f"{guess.value} ({guess.why})" if guess else ""
+        missing.append(Missing(name, text, question.consequence))
+    sheet = Sheet(list(lines_of(values, comments)), missing)
+    check(sheet, answers)
+    return sheet
+
+
+def outstanding(answers: Mapping[str, str]) -> dict[str, Missing]:
+    """What some answers leave open, by name; pixels and pitch may still be missing. Raises InputError as `fill`."""
+    return {one.name: one for one in fill(PLACEHOLDERS | dict(answers)).missing}
+
+
+def option(name: str) -> str:
+    return name.replace("_", "-")
+
+
+def parsed(name: str, text: str) -> Any:
+    """The value of an answer. Raises InputError."""
+    try:
+        return QUESTIONS[name].parse(text)
+    except ValueError as error:
+        raise InputError(f"--{option(name)}: {printable(text)[:40]!r}: {error}") from None
+
+
+def lines_of(values: Values, comments: Mapping[str, str]) -> Iterator[Line]:
+    """The lines of the file in the order of the questions, with what is needed and not asked."""
+    for name, question in QUESTIONS.items():
+        if name not in values:
+            continue
+        if name == "blur":
+            yield Line("psf.kind", "gaussian", "assumed")
+        if name == "quantum_efficiency":
+            curve = CURVES.get(values["shutter"], "cmos")
+            yield Line("detector.quantum_efficiency.curve", curve, "assumed: the shape")
+        several = values[name] if len(question.keys) > 1 else (values[name],)
+        yield from (Line(key, value, comments[name]) for key, value in zip(question.keys, several, strict=True))
+        if name == "dark_current":
+            yield Line("detector.dark_temperature_c", 25, "assumed: room temperature")
+
+
+def tree_of(lines: list[Line]) -> dict[str, Any]:
+    """The section `camera` as nested mappings."""
+    tree: dict[str, Any] = {}
+    for line in lines:
+        *parents, last = line.key.split(".")
+        section = tree
+        for parent in parents:
+            section = section.setdefault(parent, {})
+        section[last] = line.value
+    return tree
+
+
+def check(sheet: Sheet, answers: Mapping[str, str]) -> None:
+    """Validate the camera. Raises InputError that begins with the option of the first wrong answer."""
+    from pydantic import ValidationError
+
+    from skysim.core.yaml_reader import yaml_keys
+    from skysim.scene.camera import CameraConfig
+
+    tree = tree_of(sheet.lines)
+    try:
+        CameraConfig.model_validate(PLACEHOLDER_LENS | tree)
+    except ValidationError as error:
+        faults = [(".".join(map(str, yaml_keys(one["loc"], tree, False))), one["msg"]) for one in error.errors()]
+        raise InputError(blame(faults, answers)) from None
+
+
+def blame(faults: list[tuple[str, str]], answers: Mapping[str, str]) -> str:
+    """The message of the first fault, key and pydantic's message, that is of an answer; otherwise of the first."""
+    for name, text in answers.items():
+        for key, message in faults:
+            keys = QUESTIONS[name].keys
+            if key in keys or keys[0].rpartition(".")[2] in message:  # a validator of a section names the key
+                limit = message.removeprefix("Value error, ").replace("Input should be", "allowed:") + SI.get(key, "")
+                return f"--{option(name)}: {printable(text)[:40]!r}: {limit}"
+    return f"camera: {faults[0][1].removeprefix('Value error, ')}"
+
+
+def text(sheet: Sheet, name: str) -> str:
+    """The file: YAML with a comment at each value."""
+    lines = [
+        f"# {printable(name)}. Written by `skysim camera new`.",
+        "# [S1] the data sheets of camera and lens. A value marked `assumed` is not stated there.",
+        *(f"# Not stated: {one.name}; {one.consequence}." for one in sheet.missing if not one.assumed),
+        "camera:",
+    ]
+    open_: list[str] = []
+    for line in sheet.lines:
+        *parents, last = line.key.split(".")
+        depth = next((n for n, pair in enumerate(zip(open_, parents, strict=False)) if pair[0] != pair[1]), len(open_))
+        lines += [f"{'  ' * (n + 1)}{parents[n]}:" for n in range(min(depth, len(parents)), len(parents))]
+        open_ = parents
+        value = f'"{line.value}"' if isinstance(line.value, str) and " " in line.value else line.value
+        written = f"{'  ' * (len(parents) + 1)}{last}: {value}"
+        lines.append(f"{written.ljust(COMMENT_COLUMN)} # {line.comment}")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,86 @@
+"""Fields of an LED dome that look like another one: a regular layout is ambiguous however accurate its survey.
+
+Two fields are alike if ALIKE of the LEDs of the larger coincide when one is laid on the other, within SIGMAS standard
+deviations of an image position (survey and centroid); `placement.ambiguity` tries every pair and rotation. The share of
+such fields predicts that of the frames that `led_pairs` refuses as ambiguous without a prior: over Fibonacci,
+geodesic, tape and Poisson layouts and surveys of 0.05 to 1 mm to a tenth where it is above a half.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from skysim.scene.layouts import FibersConfig, LcdConfig
+from skysim.scene.light import DomeConfig
+from skysim.simulation.checks import attitudes
+from skysim.simulation.checks.detection import Context, centroid_variance
+from skysim.simulation.checks.expected_error import Independent, believed_sigma_px
+from skysim.simulation.checks.facts import Fact, Samples, short
+from skysim.sources.dome.placement.ambiguity import field_ambiguity
+
+ALIKE = 0.9  # fraction of coincident LEDs
+BELOW = ALIKE - 1e-9
+SIGMAS = 2.0  # within which two LEDs coincide
+MAX_ALIKE = 0.05  # share of the fields that gives no warning
+MAX_FIELDS = 800  # that are compared with each other, those at the least tilts: some 0.2 s
+MIN_LEDS = 5  # in a field, on average: with fewer, any two fields are alike
+
+
+class Lookalike(NamedTuple):
+    """The share of the fields that look like another one, how many were compared, and what coincides, m."""
+
+    share: float
+    fields: int
+    coincidence_m: float
+
+
+def of(context: Context, samples: Samples) -> Lookalike | None:
+    """The fields of a dome, each about an LED within the greatest tilt; None for few LEDs, or stars."""
+    testbed, camera = context.testbed, context.camera.optics.camera
+    mean = float(samples.reach.counts().mean())
+    if not isinstance(testbed.scene.light, DomeConfig) or mean < MIN_LEDS:
+        return None
+    sigma_px = [
+        believed_sigma_px(view, Independent(centroid_variance(view, context)), context)
+        for view in samples.reach.used
+        if len(view)
+    ]
+    distance_m = float(np.median(samples.reach.joined("distance_m")))
+    coincidence_m = SIGMAS * float(np.median(np.concatenate(sigma_px))) * distance_m / camera.focal_px
+    place_m = context.beliefs.lights.place[:, :3]
+    zenith_rad = np.sort(np.arctan2(np.hypot(*place_m.T[:2]), place_m[:, 2]))
+    tilt_rad = attitudes.greatest_tilt_rad(testbed.scene, samples.frames.attitudes)
+    found = field_ambiguity(
+        place_m,
+        float(np.linalg.norm(testbed.mount.camera_body_m)),
+        min(tilt_rad, float(zenith_rad[MAX_FIELDS - 1])) if len(zenith_rad) >= MAX_FIELDS else tilt_rad,
+        math.atan(math.sqrt(camera.width_px * camera.height_px / math.pi) / camera.focal_px),
+        coincidence_m,
+        BELOW,
+    )
+    return Lookalike(float((found.fraction > BELOW).mean()), len(found.led), coincidence_m) if len(found.led) else None
+
+
+def fact(found: Lookalike) -> Fact:
+    """How many fields look like another one."""
+    share = f"{100 * found.share:.0f} % of {found.fields}" if found.share else f"none of {found.fields}"
+    text = f"{share}: {100 * ALIKE:.0f} % of the LEDs coincide within {short(1e3 * found.coincidence_m, 2)} mm"
+    return Fact("fields alike", [text], found._asdict())
+
+
+def finding(found: Lookalike, light: DomeConfig) -> str:
+    """Warn where many fields look like another one."""
+    if found.share <= MAX_ALIKE:
+        return ""
+    points = light.layout.points if isinstance(light.layout, FibersConfig | LcdConfig) else light.layout
+    key = "light.layout.kind" if points is light.layout else "light.layout.points.kind"
+    random = points.kind in ("poisson_disk", "random", "optimized")
+    change = "add LEDs" if random else "change it to poisson_disk"
+    return (
+        f"{key}: {100 * found.share:.0f} % of the fields look like another one to"
+        f" {short(1e3 * found.coincidence_m, 2)} mm, so that a tracker without a prior refuses them as ambiguous;"
+        f" {change}, lower tracker.survey.led_sigma, or take a shorter camera.focal_length"
+    )
