@@ -1,13 +1,18 @@
 """Mutation score: the share of small changes of the code that the tests notice.
 
-`python -m benchmarks.mutants [COUNT] [SEED] [--again]`. COUNT places are drawn uniformly from all that cosmic-ray's
-operators can change in PACKAGES (numbers, operators, comparisons, conditions, loops), and one change of each. Left out
-are type annotations, decorators, errors' messages (whole raise statements and f-strings) and __init__.py.
+`python -m benchmarks.mutants [COUNT] [SEED] [--again] [--control]`. COUNT places are drawn uniformly from all that
+cosmic-ray's operators can change in PACKAGES (numbers, operators, comparisons, conditions, loops), and one change of
+each. Left out are type annotations, decorators, errors' messages (whole raise statements and f-strings) and
+__init__.py.
 
-Every mutant is tested in a copy, out/mutants/tree: by the tests that import its module, then by those that import what
-imports it and so on, as many as take BUDGET_S. It is killed if a test fails, or if they take more than three times as
-long as without it. Results are added to out/mutants/SEED.jsonl, and a run that was stopped goes on. --again tries the
-survivors of that file once more, after tests were added.
+The tests run once without a mutant, and what each enters is noted. A mutant is tested, in a copy, by the tests that
+enter the changed function, nearest file first, up to BUDGET_S; if these take less than OTHERS_S, others of near files
+fill it. benchmarks/mutant_tests.py runs them, in a process forked after all imports. A change outside of functions is
+tested in a process that imports all packages anew. A mutant is killed if a test fails, crashes, or takes 60 s and ten
+times its time.
+
+Results are added to out/mutants/SEED.jsonl, and a run that was stopped goes on. --again tries the survivors of that
+file once more, after tests were added. --control draws and tests places without the change: all must survive.
 """
 
 from __future__ import annotations
@@ -293,6 +298,13 @@ def try_mutant(mutant: dict[str, Any], tests: Tests) -> dict[str, Any]:
     return mutant | facts | {"seconds": round(time.monotonic() - began_s, 1)}
 
 
+def use_copy() -> None:
+    """Import the packages from the copy, and the benchmarks, which imported them from elsewhere, once more."""
+    for name in [name for name in sys.modules if name.split(".")[0] in ("benchmarks", "skysim", "estimator")]:
+        del sys.modules[name]
+    sys.path.insert(0, str(TREE))
+
+
 def copy_tree() -> None:
     """Bring the copy up to date; unchanged files keep their time stamps, for which numba keeps compiled code."""
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
@@ -316,7 +328,7 @@ def main() -> None:
         os.execve(sys.executable, [sys.executable, "-m", "benchmarks.mutants", *sys.argv[1:]], environment())
     OUT.mkdir(parents=True, exist_ok=True)
     copy_tree()
-    sys.path.insert(0, str(TREE))
+    use_copy()
     results, tests, drawn = OUT / f"{seed}{CONTROL}.jsonl", Tests(), draw(count, seed)
     lines = results.read_text().splitlines() if results.exists() else []
     done = {key_of(result): result for result in map(json.loads, lines)}  # of a mutant that was tried again, the last
