@@ -12,7 +12,8 @@ tested in a process that imports all packages anew. A mutant is killed if a test
 times its time.
 
 Results are added to out/mutants/SEED.jsonl, and a run that was stopped goes on. --again tries the survivors of that
-file once more, after tests were added. --control draws and tests places without the change: all must survive.
+file once more, with more tests and those that were added. --control tests the places without the change: all must
+survive.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ PACKAGES = {  # where the tests of each are
     "skysim/dynamics": ("dynamics",),
 }
 USERS = ("simulation", "tracking", "results")  # tests of the packages that use them
-BUDGET_S, OTHERS_S = 90.0, 30.0  # of tests that enter the changed function, and of others if these are few
+# Of tests that enter the changed function, and of others if these are few: at first, and for survivors once more.
+BUDGET_S, OTHERS_S = (90.0, 30.0) if "--again" in sys.argv else (20.0, 5.0)
 # Operators that are left out: bits of floating-point numbers, which raise TypeError, so any test notices; decorators,
 # which are the compiler's; and two that need arguments.
 LEFT_OUT = re.compile(r"_(Bit\w+|LShift|RShift|Invert)$|Decorator|Variable")
@@ -148,7 +150,7 @@ class Tests:
         return self.requests.recv()
 
     def chosen(self, module: str, keys: list[Key]) -> list[str]:
-        """Tests that enter one of these functions, nearest first, then others of the nearest files up to 30 s."""
+        """Tests that enter one of these functions, nearest first, then others of the nearest files."""
         steps = importers(module)
         own = tuple(
             f"tests/{name}/" for package in PACKAGES if module.startswith(package) for name in PACKAGES[package]
