@@ -443,6 +443,27 @@ def test_saa_s_best_must_be_1e5_times_as_likely_as_what_contradicts_it(ratio: fl
     assert (pool.best_match() is not None) == accepted
 
 
+@pytest.mark.parametrize(("limit", "tried"), [(3, 3), (1000, 2 + SAA.RIVAL_PAIRS), (10**6, 2 + SAA.RIVAL_PAIRS)])
+def test_saa_tries_rival_pairs_once_its_best_is_significant_and_never_too_many(limit: int, tried: int) -> None:
+    """The second pair's best is significant."""
+    rays, _, _, index, _ = field(0)
+    unknown, gates = np.full(len(rays), np.nan), Gates(1e-4, 1e-4, np.inf, 0.0)
+    stars, added = SearchInput(rays, unknown, index.vectors, np.full(60, np.nan), index.cells, gates), []
+
+    class Pool:
+        count = 0
+        log10_chance = property(lambda _: -9.0 if len(added) == 2 else 0.0)
+
+        def add(self, primary: Primary, _: object) -> None:
+            added.append(primary)
+
+    pool = Pool()
+    pool.stars = stars
+    SAA._test_pairs(pool, index, Options(max_triangles=limit, base_stars=len(rays)))
+    assert len(list(SAA._primary_pairs(stars, len(rays), index.max_angle_rad))) > tried
+    assert len(added) == tried
+
+
 @pytest.mark.parametrize(("share", "matched"), [(0.5, False), (0.49, True)])
 def test_fialho_s_match_has_more_than_its_share_of_the_observed_stars(share: float, matched: bool) -> None:
     """Of twice as many lights as there are stars, all stars match."""
