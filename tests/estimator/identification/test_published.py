@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -472,3 +473,36 @@ def test_fialho_s_match_has_more_than_its_share_of_the_observed_stars(share: flo
     options = FIALHO.search_options(TOLERANCE_RAD, Options(epsilon_mag=0.1), share, True, False)
     match = FIALHO._direct_match(np.vstack([rays, strays]), index, np.arange(3), rows[:3], options, 1)
     assert len(match.observed) == (len(rays) if matched else 0)
+
+
+@pytest.mark.parametrize(("triangles", "checks", "tried"), [(10**6, 10**6, None), (5, 10**6, 5), (10**6, 20, 3)])
+def test_fialho_tries_every_wide_triangle_once_up_to_its_limits(
+    triangles: int, checks: int, tried: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each triangle takes seven checks and is no match; the brightest comes first."""
+    rays, _, _, index, _ = field(1)
+    asked: list[tuple[int, ...]] = []
+
+    def no_triplet(*told: object) -> object:
+        asked.append(tuple(told[3]))
+        told[5][1] += 7
+        return FIALHO.no_match()
+
+    monkeypatch.setattr(FIALHO, "triplets", no_triplet)
+    options = FIALHO.search_options(TOLERANCE_RAD, Options(epsilon_mag=0.1), 0.5, True, True)
+    options = options._replace(triangles=triangles, checks=checks, base=6)
+    assert len(FIALHO.search(rays, np.full(len(rays), np.nan), index, options).observed) == 0
+    wide = [
+        corners
+        for corners in itertools.combinations(range(6), 3)
+        if shortest_side_rad(rays[list(corners)]) >= FIALHO.MIN_SIDE_FRACTION * index.max_angle_rad
+    ]
+    assert len(wide) > 5
+    assert asked[0] == wide[0]
+    assert len(set(asked)) == len(asked) == (tried or len(wide))
+    assert set(asked) <= set(wide)
+
+
+def shortest_side_rad(corners: Floats) -> float:
+    """The shortest side of a triangle, rad."""
+    return float(np.arccos(np.sum(corners * np.roll(corners, 1, axis=0), axis=1)).min())
