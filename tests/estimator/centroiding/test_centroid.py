@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from interpreted import interpreted
 from scipy import ndimage
 from scipy.special import erf, j1
 
@@ -122,6 +123,21 @@ def test_the_center_of_gravity_of_a_disk_is_its_middle(radius: float) -> None:
     aliased = np.sum(2 * np.abs(j1(z)) / z / (np.pi * n))
     np.testing.assert_allclose(found.xy_px, [[x, y]], rtol=0, atol=aliased + 1e-4)
     assert found.flux[0] == pytest.approx(200 * np.pi * radius**2, rel=1e-3)
+
+
+@pytest.mark.parametrize("light", [0.5, 1.0, 2.0, -1.0])
+def test_any_light_but_zero_has_a_center_of_gravity(light: float) -> None:
+    """A quarter and three quarters of it in two pixels, on a sky of zero; none at all is of no place."""
+    moments = interpreted("estimator.centroiding.moments")
+    image, sky = np.zeros((9, 9)), np.zeros((3, 3))
+    image[4, 3:5] = light * np.array([0.25, 0.75])
+    boxes = np.array([[3, 4, 4, 4]])
+    x, y, sigma, flux = moments.center_of_gravity(image, boxes, sky, sky + 1.0, 1.0)[0]
+    assert (x, y, flux) == (3.75, 4.0, light)
+    assert sigma > 0
+    x, y, sigma, flux = moments.center_of_gravity(0 * image, boxes, sky, sky + 1.0, 1.0)[0]
+    assert np.isnan([x, y, sigma]).all()
+    assert flux == 0
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.4, 0.5])
