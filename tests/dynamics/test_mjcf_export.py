@@ -457,3 +457,15 @@ def test_all_colors_are_within_zero_and_one() -> None:
         assert len(colors)
         assert colors.min() >= 0
         assert colors.max() <= 1
+
+
+def test_the_tilt_stop_is_hidden_and_no_hardware_is() -> None:
+    scene, vehicle, sources = dome_lab()
+    model, _ = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
+    tendons = [(model.tendon(k).name, model.tendon_group[k]) for k in range(model.ntendon)]
+    sites = [(model.site(k).name, model.site_group[k]) for k in range(model.nsite)]
+    for named in (tendons, sites):
+        stop = [group == mjcf_export.GROUP_HIDDEN for name, group in named if name.startswith("tilt_stop")]
+        assert stop
+        assert all(stop)
+        assert not any(group == mjcf_export.GROUP_HIDDEN for name, group in named if not name.startswith("tilt_stop"))
