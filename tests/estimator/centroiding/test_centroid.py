@@ -278,3 +278,19 @@ def test_a_saturated_disk_is_placed_by_its_edge() -> None:
     # 120 numbers give it to 13 %. Which pixels at the edge are full is left to the noise, and they are not weighed:
     # half as much again, which `see` covers with what it adds for saturation.
     assert 0.6 < np.mean((np.array(off) / np.array(sigma)[:, None]) ** 2) < 2.0
+
+
+def test_the_disk_fit_gives_place_flux_and_radius_of_a_blurred_disk() -> None:
+    """Without noise, on a sky of 50; by the interpreter, which refuses what is beyond an array."""
+    fit = interpreted("estimator.centroiding.disk_fit")
+    radius, x, y = 4.0, 15.3, 14.8
+    light = 100 * ndimage.gaussian_filter(disk((31, 31), x, y, radius), 0.6)
+    area, sky = np.array([int(np.pi * radius**2)]), np.full((3, 3), 50.0)
+    boxes = np.array([[11, 10, 20, 19]])
+    place, flux = np.array([[15.0, 15.0]]), np.array([light.sum()])
+    row = fit.fit_all(light + 50, place, flux, area, boxes, sky, sky / 50, 1.0, np.inf)[0]
+    assert row[:2] == pytest.approx([x, y], abs=0.02)  # pixels are not narrow beside the edge
+    assert 0 < row[2] < 0.05
+    assert row[3] == pytest.approx(light.sum(), rel=0.01)
+    # The blur's and the pixel's variance moves the half level of a curved edge inward by half of it over the radius.
+    assert row[4] == pytest.approx(radius - (0.6**2 + 1 / 12) / (2 * radius), rel=3e-3)

@@ -104,6 +104,15 @@ def test_each_catalog_star_of_the_field_that_is_not_seen_costs_its_penalty(name:
         assert charged - free == pytest.approx(0.07 * missing, abs=1e-12)
 
 
+def test_the_tail_of_chance_matches_is_the_binomial_s_down_to_the_least_number() -> None:
+    """Beyond 1e-300, which doubles hardly hold, it stays there: a finite evidence."""
+    chance = interpreted("estimator.identification.chance")
+    for trials, hits, p in ((10, 4, 0.01), (30, 12, 1e-4), (5, 5, 0.3), (40, 1, 1e-3)):
+        wanted = stats.binom.logsf(hits - 1, trials, p) / np.log(10)
+        assert chance.log10_tail(trials, hits, p) == pytest.approx(wanted, abs=1e-9)
+    assert chance.log10_tail(200, 200, 1e-5) == -300
+
+
 def test_a_match_counts_as_the_binomial_tail_of_its_gates() -> None:
     """Three of five random directions: their gates cover a share p of the sky of the catalog's local density."""
     rays, _, rows, index, _ = field(1)
