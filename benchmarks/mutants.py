@@ -1,41 +1,54 @@
 """Mutation score: the share of small changes of the code that the tests notice.
 
-`python -m benchmarks.mutants [COUNT] [SEED] [--again]`. COUNT places are drawn uniformly from all that cosmic-ray's
-operators can change in PACKAGES (numbers, operators, comparisons, conditions, loops), and one change of each. Left out
-are type annotations, decorators, errors' messages (whole raise statements and f-strings) and __init__.py.
+`python -m benchmarks.mutants [COUNT] [SEED] [--again] [--control]`. COUNT places are drawn uniformly from all that
+cosmic-ray's operators can change in PACKAGES (numbers, operators, comparisons, conditions, loops), and one change of
+each. Left out are type annotations, decorators, errors' messages (whole raise statements and f-strings) and
+__init__.py.
 
-Every mutant is tested in a copy, out/mutants/tree: by the tests that import its module, then by those that import what
-imports it and so on, as many as take BUDGET_S. It is killed if a test fails, or if they take more than three times as
-long as without it. Results are added to out/mutants/SEED.jsonl, and a run that was stopped goes on. --again tries the
-survivors of that file once more, after tests were added.
+The tests run once without a mutant, and what each enters is noted. A mutant is tested, in a copy, by the tests that
+enter the changed function, nearest file first, up to BUDGET_S; if these take less than OTHERS_S, others of near files
+fill it. benchmarks/mutant_tests.py runs them, in a process forked after all imports. A change outside of functions is
+tested in a process that imports all packages anew. A mutant is killed if a test fails, crashes, or takes 60 s and ten
+times its time.
+
+Results are added to out/mutants/SEED.jsonl, and a run that was stopped goes on. --again tries the survivors of that
+file once more, with more tests and those that were added. --control tests the places without the change: all must
+survive.
 """
 
 from __future__ import annotations
 
 import ast
+import hashlib
 import json
+import marshal
 import os
 import re
-import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections import Counter, defaultdict
-from functools import cache, partial
+from functools import cache
+from multiprocessing import Pipe
 from pathlib import Path
 from random import Random
+from types import CodeType
 from typing import Any
-from xml.etree import ElementTree
 
 import cosmic_ray.plugins
+import numba
+import pytest
 from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
 
+from benchmarks.mutant_tests import BROKEN, OPTIONS, Key, Recorder, Server, forked, limit_s, nested, order
+
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "out" / "mutants"
-TREE, CACHE, SCRATCH, BASELINE = OUT / "tree", OUT / "cache", OUT / "scratch", OUT / "baseline.xml"
+TREE, CACHE, SCRATCH, BASELINE = OUT / "tree", OUT / "cache", OUT / "scratch", OUT / "baseline.json"
+CONTROL = "--control" * ("--control" in sys.argv)
 PACKAGES = {  # where the tests of each are
     "estimator": ("estimator",),
     "skysim/camera": ("camera",),
@@ -43,16 +56,18 @@ PACKAGES = {  # where the tests of each are
     "skysim/dynamics": ("dynamics",),
 }
 USERS = ("simulation", "tracking", "results")  # tests of the packages that use them
-BUDGET_S = 90.0
+# Of tests that enter the changed function, and of others if these are few: at first, and for survivors once more.
+BUDGET_S, OTHERS_S = (90.0, 30.0) if "--again" in sys.argv else (20.0, 5.0)
 # Operators that are left out: bits of floating-point numbers, which raise TypeError, so any test notices; decorators,
 # which are the compiler's; and two that need arguments.
 LEFT_OUT = re.compile(r"_(Bit\w+|LShift|RShift|Invert)$|Decorator|Variable")
 NO_PLACE = ("decorator", "raise_stmt", "fstring", "import_from", "tfpdef")
-PYTEST = ("-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not long and not browser")
 
 
 def is_left_out(node: Any) -> bool:
-    """Whether a parso node is in an annotation, a decorator, an error's message or an import."""
+    """Whether a parso node is in an annotation, a decorator, an error's message or an import, or cannot be changed."""
+    if node.type == "except_clause" and "." in node.get_code():  # cosmic-ray replaces plain names of exceptions only
+        return True
     while parent := node.parent:
         if parent.type in NO_PLACE:
             return True
@@ -105,6 +120,7 @@ def imports(file: str) -> frozenset[str]:
     return frozenset(file for file in files if file.count("/") > 1 and (TREE / file).exists())
 
 
+@cache
 def importers(module: str) -> dict[str, int]:
     """The module (0), the files that import it (1), those that import these (2), and so on; tests included."""
     files = [path for folder in (module.split("/")[0], "tests") for path in (TREE / folder).rglob("*.py")]
@@ -115,35 +131,68 @@ def importers(module: str) -> dict[str, int]:
     return steps
 
 
-def test_times_s() -> Counter[str]:
-    """Seconds that each file of tests takes without a mutant; the first call runs them and fills numba's cache."""
-    folders = [TREE / "tests" / name for names in (*PACKAGES.values(), USERS) for name in names]
-    if not BASELINE.exists():
-        command = [sys.executable, *PYTEST, f"--junitxml={OUT / 'baseline.part'}", *map(str, folders)]
-        subprocess.run(command, cwd=TREE, env=environment(CACHE), check=True)
-        (OUT / "baseline.part").rename(BASELINE)
-    times = Counter({str(path.relative_to(TREE)): 0.0 for folder in folders for path in folder.rglob("test_*.py")})
-    for case in ElementTree.parse(BASELINE).iter("testcase"):
-        times[case.get("classname", "").replace(".", "/") + ".py"] += float(case.get("time", 0))
-    return times
+class Tests:
+    """The tests of the packages: what each enters, the time that it takes, and a server that runs them on mutants."""
+
+    def __init__(self) -> None:
+        folders = [TREE / "tests" / name for names in (*PACKAGES.values(), USERS) for name in names]
+        files = sorted(str(path.relative_to(TREE)) for folder in folders for path in folder.rglob("test_*.py"))
+        self.recorded = record(files)
+        self.imported = set(map(tuple, self.recorded["imported"]))
+        self.times_s = Counter({name: test["time_s"] for name, test in self.recorded["tests"].items()})
+        self.requests, theirs = Pipe()
+        if not os.fork():
+            session(files, Server(TREE, theirs, self.recorded))
+            os._exit(0)
+
+    def ask(self, *request: Any) -> Any:
+        self.requests.send(request)
+        return self.requests.recv()
+
+    def chosen(self, module: str, keys: list[Key]) -> list[str]:
+        """Tests that enter one of these functions, nearest first, then others of the nearest files."""
+        steps = importers(module)
+        own = tuple(
+            f"tests/{name}/" for package in PACKAGES if module.startswith(package) for name in PACKAGES[package]
+        )
+
+        def distance(file: str) -> float:
+            return steps.get(file, 99) + 0.5 * (not file.startswith(own))
+
+        first = order(self.ask("tests_of", keys), distance, self.times_s, BUDGET_S)
+        rest = [name for name in self.times_s if name not in set(first) and distance(name.split("::")[0]) < 4]
+        return first + order(rest, distance, self.times_s, OTHERS_S - sum(self.times_s[name] for name in first))
 
 
-def tests_of(module: str, times_s: Counter[str]) -> tuple[list[str], float]:
-    """Files of tests for a module, those that import it in the fewest steps first, and the time that they take."""
-    own = tuple(f"tests/{name}/" for package in PACKAGES if module.startswith(package) for name in PACKAGES[package])
-    steps = importers(module)
-    files, total_s = [], 0.0
-    for file in sorted(times_s, key=lambda file: (steps.get(file, 99), not file.startswith(own), times_s[file])):
-        if not files or total_s + times_s[file] <= BUDGET_S:
-            files.append(file)
-            total_s += times_s[file]
-    return files, total_s
+def record(files: list[str]) -> dict[str, Any]:
+    """Run the tests of files that are new or changed since the last call; this fills numba's cache, too."""
+    old = json.loads(BASELINE.read_text()) if BASELINE.exists() else {"digests": {}, "imported": [], "tests": {}}
+    digests = {file: hashlib.sha1((TREE / file).read_bytes()).hexdigest() for file in files}
+    changed = [file for file in files if old["digests"].get(file) != digests[file]]
+    if not changed:
+        return old
+    part = OUT / "part.json"
+    forked(lambda: session(changed, Recorder(TREE, part)), 7200)
+    new = json.loads(part.read_text())
+    kept = {name: test for name, test in old["tests"].items() if name.split("::")[0] not in changed}
+    if new["failed"]:
+        print("left out, for they fail without a mutant:", *new["failed"], sep="\n  ")
+    merged = {"digests": digests, "imported": old["imported"] + new["imported"], "tests": kept | new["tests"]}
+    BASELINE.write_text(json.dumps(merged))
+    return merged
 
 
-def environment(compiled: Path) -> dict[str, str]:
-    """One thread, the tree's packages and this cache of compiled code."""
+def session(words: list[str], plugin: Any) -> str:
+    """Run pytest in the copy with one of the two plugins."""
+    os.chdir(TREE)
+    code = pytest.main([*OPTIONS, f"--basetemp={OUT / 'tmp'}", *words], plugins=[plugin])
+    return f"exit code {code}"
+
+
+def environment() -> dict[str, str]:
+    """One thread, the tree's packages and its cache of compiled code."""
     threads = {name: "1" for name in ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "PYTHONDONTWRITEBYTECODE")}
-    return os.environ | threads | {"PYTHONPATH": str(TREE), "NUMBA_CACHE_DIR": str(compiled)}
+    return os.environ | threads | {"PYTHONPATH": str(TREE), "NUMBA_CACHE_DIR": str(CACHE)}
 
 
 def forget(folder: Path, module: str) -> None:
@@ -157,51 +206,105 @@ def forget(folder: Path, module: str) -> None:
             path.unlink()
 
 
-def run_tests(files: list[str], limit_s: float) -> str:
-    """`survived`, `timeout`, or the first test that fails. The limit is of processor time: the machine may be busy."""
-    command = [sys.executable, *PYTEST, "--tb=no", *files]
-    process = subprocess.Popen(
-        command,
-        cwd=TREE,
-        env=environment(SCRATCH),
-        stdout=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        preexec_fn=partial(resource.setrlimit, resource.RLIMIT_CPU, (int(limit_s), int(limit_s) + 5)),
-    )
-    try:
-        said, _ = process.communicate(timeout=10 * limit_s)
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
-        return "timeout"
-    if process.returncode == -signal.SIGXCPU:
-        return "timeout"
-    if process.returncode in (4, 5):  # pytest's codes of a wrong command and of no tests
-        raise SystemExit(said)
-    lines = [line for line in said.splitlines() if line.startswith(("FAILED", "ERROR"))]
-    return "survived" if process.returncode == 0 else (lines or [f"exit code {process.returncode}"])[0][:200]
+def function_at(source: str, at: tuple[int, int]) -> ast.FunctionDef | None:
+    """The function, not one within another, whose body is at a place; None for the module's and a class's own lines."""
+    nodes: list[Any] = [ast.parse(source)]
+    while nodes:
+        node = nodes.pop()
+        if isinstance(node, ast.FunctionDef):
+            begin, end = node.body[0], (node.end_lineno, node.end_col_offset)
+            if (begin.lineno, begin.col_offset) <= at < end:
+                return node
+        elif isinstance(node, ast.Module | ast.ClassDef | ast.If):
+            nodes += node.body
+    return None
 
 
-def try_mutant(mutant: dict[str, Any], times_s: Counter[str]) -> dict[str, Any]:
+def first_line(function: ast.FunctionDef) -> int:
+    return min([function.lineno, *(one.lineno for one in function.decorator_list)])
+
+
+def functions_in(file: str, source: str) -> list[Key]:
+    nodes = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef))
+    return [(file, first_line(node), node.name) for node in nodes]
+
+
+def code_of(source: str, path: Path, function: ast.FunctionDef) -> tuple[Key, CodeType]:
+    """A function's code when the module's source is compiled, and its key."""
+    first = first_line(function)
+    module = compile(source, str(path), "exec", dont_inherit=True)
+    code = next(one for one in nested(module) if (one.co_firstlineno, one.co_name) == (first, function.name))
+    return (str(path.relative_to(TREE)), first, function.name), code
+
+
+def scratch_cache(module: str) -> None:
+    """A copy of the cache without what the change of a module outdates, for processes that import it anew."""
+    shutil.rmtree(SCRATCH, ignore_errors=True)
+    shutil.copytree(CACHE, SCRATCH, copy_function=os.link)
+    forget(SCRATCH, module)
+
+
+def try_module(names: list[str], tests: Tests) -> str:
+    """Outcome of tests in a process that imports all of the packages anew: the change is in no function's body."""
+
+    class Chosen:
+        def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+            by_name = {item.nodeid: item for item in items}
+            items[:] = [by_name[name] for name in names if name in by_name]
+
+        def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+            if report.failed:
+                outcomes.append(report.nodeid)
+
+        def pytest_runtest_logstart(self, nodeid: str) -> None:
+            signal.setitimer(signal.ITIMER_PROF, limit_s(tests.times_s[nodeid]))
+
+        def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+            if report.failed:
+                outcomes.append(report.nodeid)
+
+    outcomes: list[str] = []
+    numba.config.CACHE_DIR = str(SCRATCH)
+    signal.setitimer(signal.ITIMER_PROF, 200)
+    said = session(["-x", *dict.fromkeys(name.split("::")[0] for name in names)], Chosen())
+    return outcomes[0] if outcomes else "survived" if said == "exit code 0" else f"{BROKEN} {said}"
+
+
+def try_mutant(mutant: dict[str, Any], tests: Tests) -> dict[str, Any]:
     """Test one mutant; the module is put back, with the time stamp that compiled code is kept for."""
     path, began_s = TREE / mutant["file"], time.monotonic()
     source, stamp_ns = path.read_text(), path.stat().st_mtime_ns
     name, occurrence = mutant["how"]
-    mutated = mutate_code(source, cosmic_ray.plugins.get_operator(name)(), occurrence)
-    changed = next(pair for pair in zip(source.splitlines(), mutated.splitlines(), strict=False) if len(set(pair)) > 1)
-    files, total_s = tests_of(mutant["file"], times_s)
-    shutil.rmtree(SCRATCH, ignore_errors=True)
-    shutil.copytree(CACHE, SCRATCH, copy_function=os.link)
-    forget(SCRATCH, mutant["file"])
+    mutated = source if CONTROL else mutate_code(source, cosmic_ray.plugins.get_operator(name)(), occurrence)
+    lines = zip(source.splitlines(), mutated.splitlines(), strict=False)
+    old, new = next((pair for pair in lines if len(set(pair)) > 1), ("", ""))
+    function = function_at(source, (mutant["line"], mutant["column"]))
+    outcome = "import anew"
+    scratch_cache(mutant["file"])
     try:
         path.write_text(mutated)
-        outcome = run_tests(files, 120 + 3 * total_s)
+        if function and code_of(source, path, function)[0] not in tests.imported:
+            key, code = code_of(mutated, path, function)
+            names = tests.chosen(mutant["file"], [key])
+            outcome = tests.ask("try_code", key, marshal.dumps(code), names, SCRATCH)
+        if outcome == "import anew":
+            function = None
+            names = tests.chosen(mutant["file"], functions_in(mutant["file"], source))
+            outcome = forked(lambda: try_module(names, tests))
     finally:
         path.write_text(source)
         os.utime(path, ns=(stamp_ns, stamp_ns))
-    old, new = (line.strip() for line in changed)
-    return mutant | {"old": old, "new": new, "outcome": outcome, "seconds": round(time.monotonic() - began_s)}
+    if outcome.startswith(BROKEN) or not names:
+        raise SystemExit(f"{mutant}: {outcome}, {len(names)} tests")
+    facts = {"old": old.strip(), "new": new.strip(), "outcome": outcome, "tests": len(names), "fresh": function is None}
+    return mutant | facts | {"seconds": round(time.monotonic() - began_s, 1)}
+
+
+def use_copy() -> None:
+    """Import the packages from the copy, and the benchmarks, which imported them from elsewhere, once more."""
+    for name in [name for name in sys.modules if name.split(".")[0] in ("benchmarks", "skysim", "estimator")]:
+        del sys.modules[name]
+    sys.path.insert(0, str(TREE))
 
 
 def copy_tree() -> None:
@@ -223,15 +326,18 @@ def key_of(mutant: dict[str, Any]) -> tuple[Any, ...]:
 def main() -> None:
     words = [word for word in sys.argv[1:] if not word.startswith("-")]
     count, seed = (int(word) for word in (words + ["300", "1"][len(words) :]))
+    if os.environ.get("NUMBA_CACHE_DIR") != str(CACHE):  # before any import reads them
+        os.execve(sys.executable, [sys.executable, "-m", "benchmarks.mutants", *sys.argv[1:]], environment())
     OUT.mkdir(parents=True, exist_ok=True)
     copy_tree()
-    results, times_s, drawn = OUT / f"{seed}.jsonl", test_times_s(), draw(count, seed)
+    use_copy()
+    results, tests, drawn = OUT / f"{seed}{CONTROL}.jsonl", Tests(), draw(count, seed)
     lines = results.read_text().splitlines() if results.exists() else []
     done = {key_of(result): result for result in map(json.loads, lines)}  # of a mutant that was tried again, the last
     survivors = [result for result in done.values() if result["outcome"] == "survived"]
     left = [mutant for mutant in drawn if key_of(mutant) not in done]
     for mutant in survivors if "--again" in sys.argv else left:
-        result = done[key_of(mutant)] = try_mutant(mutant, times_s)
+        result = done[key_of(mutant)] = try_mutant(mutant, tests)
         with results.open("a") as file:
             file.write(json.dumps(result) + "\n")
         survived = sum(each["outcome"] == "survived" for each in done.values())

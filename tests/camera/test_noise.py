@@ -94,3 +94,14 @@ def test_a_guide_is_certain_exactly_where_every_mean_of_its_row_gives_one_count(
         assert certain.sum(axis=0).max() == 1
         wanted = np.where(certain.any(axis=0), certain.argmax(axis=0), noise.AMBIGUOUS)
         np.testing.assert_array_equal(guide[k], wanted)
+
+
+@pytest.mark.parametrize("mean", [10.0, 37.4, 1e3, 1e6])
+def test_procedure_f_is_the_poisson_law_and_nearly_its_hat(mean: float) -> None:
+    """py exp(px) to the next term of Stirling's series, 1 / (1680 k^7); by the interpreter."""
+    counts = np.unique(np.floor(mean + np.sqrt(mean) * np.linspace(-3, 3, 25)))
+    for k in counts[counts >= 0]:
+        px, py, fx, fy = noise._densities.py_func(mean, np.sqrt(mean), k)
+        law = stats.poisson.logpmf(k, mean)
+        assert px + np.log(py) == pytest.approx(law, rel=0, abs=1e-10 + 1e-14 * mean)
+        assert fy * np.exp(fx) == pytest.approx(np.exp(law), rel=0, abs=0.1 / mean)

@@ -168,6 +168,13 @@ def test_cross_term_of_the_rate_is_needed() -> None:
     np.testing.assert_allclose(rotvec_body_rate(phi, phi_rate)[0, 2], -(1 - np.cos(0.01)), rtol=1e-11)
 
 
+@pytest.mark.parametrize("angle", [1e-6, 3e-5, 0.99e-4, 1.01e-4, 1e-3])
+def test_the_rate_across_a_small_rotation_is_its_sine_s(angle: float) -> None:
+    """Across phi the rate's own part is sin a / a of it; the terms add up to it within rounding, below 1e-4 rad too."""
+    across = rotvec_body_rate(np.array([[angle, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]]))[0, 1]
+    assert 1 - across == pytest.approx(angle**2 / 6 - angle**4 / 120, rel=0, abs=3e-16)
+
+
 def test_the_mean_attitude_is_that_of_the_calm_body() -> None:
     calm = turning(10.0, rate=(0.0, 0.05, 0.0))
     shaken = shake(calm, (line(20.0), band(5.0, 50.0)), np.random.default_rng(12))

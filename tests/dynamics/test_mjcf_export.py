@@ -444,3 +444,33 @@ def test_a_film_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"film\.avi: unknown animation format '\.avi'; allowed: \.gif, \.webp"):
         picture.write_film(RED_TO_GREEN, tmp_path / "film.avi", fps=10.0)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("on_earth", [True, False])
+def test_the_backdrop_is_dim_and_space_is_black(on_earth: bool) -> None:
+    spec = mujoco.MjSpec()
+    mjcf_export.add_backdrop(spec, on_earth)
+    colors = np.array([spec.textures[0].rgb1, spec.textures[0].rgb2])
+    assert colors.min() >= 0
+    assert colors.max() < (0.25 if on_earth else 0.02)
+
+
+def test_all_colors_are_within_zero_and_one() -> None:
+    scene, vehicle, sources = dome_lab()
+    model, _ = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
+    for colors in (model.geom_rgba, model.mat_rgba, model.site_rgba):
+        assert len(colors)
+        assert colors.min() >= 0
+        assert colors.max() <= 1
+
+
+def test_the_tilt_stop_is_hidden_and_no_hardware_is() -> None:
+    scene, vehicle, sources = dome_lab()
+    model, _ = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
+    tendons = [(model.tendon(k).name, model.tendon_group[k]) for k in range(model.ntendon)]
+    sites = [(model.site(k).name, model.site_group[k]) for k in range(model.nsite)]
+    for named in (tendons, sites):
+        stop = [group == mjcf_export.GROUP_HIDDEN for name, group in named if name.startswith("tilt_stop")]
+        assert stop
+        assert all(stop)
+        assert not any(group == mjcf_export.GROUP_HIDDEN for name, group in named if not name.startswith("tilt_stop"))

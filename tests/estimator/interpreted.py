@@ -11,12 +11,13 @@ import pytest
 
 
 def interpreted(name: str) -> ModuleType:
-    """Import a second copy of a module of the estimator, and of all that it imports, without numba's compiler."""
+    """Import a second copy of a module, and of all of its package that it imports, without numba's compiler."""
+    root = name.split(".")[0]
     with pytest.MonkeyPatch.context() as patch:
-        for module in [one for one in sys.modules if one.split(".")[0] == "estimator"]:
+        for module in [one for one in sys.modules if one.split(".")[0] == root]:
             patch.delitem(sys.modules, module)
         patch.setattr(numba.config, "DISABLE_JIT", True)
         module = importlib.import_module(name)
-        for own in [one for one in sys.modules if one.split(".")[0] == "estimator"]:
+        for own in [one for one in sys.modules if one.split(".")[0] == root]:
             sys.modules.pop(own)
     return module

@@ -18,7 +18,7 @@ from skysim.simulation import exposure
 from skysim.simulation.testbed import Testbed, build_testbed, exposure_window, light_sources
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
-from skysim.sources.dome import display
+from skysim.sources.dome import display, surface
 from skysim.sources.dome.led import lit_moments_s
 from skysim.sources.photometry import SUN, Band, led_strength_e_s_sr, star_flux_e_s_m2
 
@@ -490,3 +490,14 @@ def assert_refused(name: str, overrides: dict[str, str], says: str) -> None:
         light_sources(loader.load(name, overrides), BAND)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("width_m", "fits"), [(0.5, True), (0.2, True), (0.2 - 1e-6, False)])
+def test_pixels_must_fit_the_surface_which_ends_with_them(width_m: float, fits: bool) -> None:
+    config = layouts.LcdConfig.model_validate(PANEL | {"pixels": [20, 15], "pitch": "1 cm"})
+    plane = surface.Plane(np.zeros(3), half_m=np.array([width_m / 2, 1.0]))
+    if fits:
+        np.testing.assert_allclose(display.panel_surface(config, plane).half_m, [0.1, 0.075], rtol=1e-15)
+        return
+    with pytest.raises(InputError, match=r"light.layout.pixels: need 0.2 m by 0.15 m; allowed"):
+        display.panel_surface(config, plane)

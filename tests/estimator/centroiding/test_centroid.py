@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from interpreted import interpreted
 from scipy import ndimage
 from scipy.special import erf, j1
 
@@ -123,6 +124,21 @@ def test_the_center_of_gravity_of_a_disk_is_its_middle(radius: float) -> None:
     aliased = np.sum(2 * np.abs(j1(z)) / z / (np.pi * n))
     np.testing.assert_allclose(found.xy_px, [[x, y]], rtol=0, atol=aliased + 1e-4)
     assert found.flux[0] == pytest.approx(200 * np.pi * radius**2, rel=1e-3)
+
+
+@pytest.mark.parametrize("light", [0.5, 1.0, 2.0, -1.0])
+def test_any_light_but_zero_has_a_center_of_gravity(light: float) -> None:
+    """A quarter and three quarters of it in two pixels, on a sky of zero; none at all is of no place."""
+    moments = interpreted("estimator.centroiding.moments")
+    image, sky = np.zeros((9, 9)), np.zeros((3, 3))
+    image[4, 3:5] = light * np.array([0.25, 0.75])
+    boxes = np.array([[3, 4, 4, 4]])
+    x, y, sigma, flux = moments.center_of_gravity(image, boxes, sky, sky + 1.0, 1.0)[0]
+    assert (x, y, flux) == (3.75, 4.0, light)
+    assert sigma > 0
+    x, y, sigma, flux = moments.center_of_gravity(0 * image, boxes, sky, sky + 1.0, 1.0)[0]
+    assert np.isnan([x, y, sigma]).all()
+    assert flux == 0
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.4, 0.5])
@@ -269,3 +285,19 @@ def test_a_saturated_disk_is_placed_by_its_edge() -> None:
     # 120 numbers give it to 13 %. Which pixels at the edge are full is left to the noise, and they are not weighed:
     # half as much again, which `see` covers with what it adds for saturation.
     assert 0.6 < np.mean((np.array(off) / np.array(sigma)[:, None]) ** 2) < 2.0
+
+
+def test_the_disk_fit_gives_place_flux_and_radius_of_a_blurred_disk() -> None:
+    """Without noise, on a sky of 50; by the interpreter, which refuses what is beyond an array."""
+    fit = interpreted("estimator.centroiding.disk_fit")
+    radius, x, y = 4.0, 15.3, 14.8
+    light = 100 * ndimage.gaussian_filter(disk((31, 31), x, y, radius), 0.6)
+    area, sky = np.array([int(np.pi * radius**2)]), np.full((3, 3), 50.0)
+    boxes = np.array([[11, 10, 20, 19]])
+    place, flux = np.array([[15.0, 15.0]]), np.array([light.sum()])
+    row = fit.fit_all(light + 50, place, flux, area, boxes, sky, sky / 50, 1.0, np.inf)[0]
+    assert row[:2] == pytest.approx([x, y], abs=0.02)  # pixels are not narrow beside the edge
+    assert 0 < row[2] < 0.05
+    assert row[3] == pytest.approx(light.sum(), rel=0.01)
+    # The blur's and the pixel's variance moves the half level of a curved edge inward by half of it over the radius.
+    assert row[4] == pytest.approx(radius - (0.6**2 + 1 / 12) / (2 * radius), rel=3e-3)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from interpreted import interpreted
@@ -317,3 +320,15 @@ def test_the_quick_check_counts_until_it_knows(dead: list[int], required: int, f
     detections = search.build_detections(rays, np.full(5, 1e-5), dome)
     gates, R_grid_from_cam = np.full(5, 1e-4), dome.grid.R_grid_from_lab
     assert PLAIN._quick_check(detections, dome, R_grid_from_cam, dome.median_radius_m, 0, 1, gates, required) == found
+
+
+def test_a_second_pair_is_the_first_that_shares_the_fewest_detections_with_the_best() -> None:
+    """Both ends matched before all else; then both new, then one, then none."""
+    rng = np.random.default_rng(4)
+    for matched in (2, 3, 4, 6):
+        pairs = rng.permutation(list(itertools.combinations(range(6), 2)))
+        best, rank = SimpleNamespace(observed=rng.permutation(6)[:matched]), int(rng.integers(len(pairs)))
+        unmatched = (~np.isin(pairs, best.observed)).sum(axis=1)
+        shared = np.isin(pairs, pairs[rank]).sum(axis=1)
+        wanted = np.lexsort([np.arange(len(pairs)), shared, unmatched])[0]
+        assert PLAIN._disjoint_pair(pairs, rank, best) == wanted

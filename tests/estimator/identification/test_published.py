@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -101,6 +102,15 @@ def test_each_catalog_star_of_the_field_that_is_not_seen_costs_its_penalty(name:
             PLAIN[name](rays[rows], index, TOLERANCE_RAD, missed_dex=dex, **known).log10_chance for dex in (0.0, 0.07)
         )
         assert charged - free == pytest.approx(0.07 * missing, abs=1e-12)
+
+
+def test_the_tail_of_chance_matches_is_the_binomial_s_down_to_the_least_number() -> None:
+    """Beyond 1e-300, which doubles hardly hold, it stays there: a finite evidence."""
+    chance = interpreted("estimator.identification.chance")
+    for trials, hits, p in ((10, 4, 0.01), (30, 12, 1e-4), (5, 5, 0.3), (40, 1, 1e-3)):
+        wanted = stats.binom.logsf(hits - 1, trials, p) / np.log(10)
+        assert chance.log10_tail(trials, hits, p) == pytest.approx(wanted, abs=1e-9)
+    assert chance.log10_tail(200, 200, 1e-5) == -300
 
 
 def test_a_match_counts_as_the_binomial_tail_of_its_gates() -> None:
@@ -443,6 +453,27 @@ def test_saa_s_best_must_be_1e5_times_as_likely_as_what_contradicts_it(ratio: fl
     assert (pool.best_match() is not None) == accepted
 
 
+@pytest.mark.parametrize(("limit", "tried"), [(3, 3), (1000, 2 + SAA.RIVAL_PAIRS), (10**6, 2 + SAA.RIVAL_PAIRS)])
+def test_saa_tries_rival_pairs_once_its_best_is_significant_and_never_too_many(limit: int, tried: int) -> None:
+    """The second pair's best is significant."""
+    rays, _, _, index, _ = field(0)
+    unknown, gates = np.full(len(rays), np.nan), Gates(1e-4, 1e-4, np.inf, 0.0)
+    stars, added = SearchInput(rays, unknown, index.vectors, np.full(60, np.nan), index.cells, gates), []
+
+    class Pool:
+        count = 0
+        log10_chance = property(lambda _: -9.0 if len(added) == 2 else 0.0)
+
+        def add(self, primary: Primary, _: object) -> None:
+            added.append(primary)
+
+    pool = Pool()
+    pool.stars = stars
+    SAA._test_pairs(pool, index, Options(max_triangles=limit, base_stars=len(rays)))
+    assert len(list(SAA._primary_pairs(stars, len(rays), index.max_angle_rad))) > tried
+    assert len(added) == tried
+
+
 @pytest.mark.parametrize(("share", "matched"), [(0.5, False), (0.49, True)])
 def test_fialho_s_match_has_more_than_its_share_of_the_observed_stars(share: float, matched: bool) -> None:
     """Of twice as many lights as there are stars, all stars match."""
@@ -451,3 +482,36 @@ def test_fialho_s_match_has_more_than_its_share_of_the_observed_stars(share: flo
     options = FIALHO.search_options(TOLERANCE_RAD, Options(epsilon_mag=0.1), share, True, False)
     match = FIALHO._direct_match(np.vstack([rays, strays]), index, np.arange(3), rows[:3], options, 1)
     assert len(match.observed) == (len(rays) if matched else 0)
+
+
+@pytest.mark.parametrize(("triangles", "checks", "tried"), [(10**6, 10**6, None), (5, 10**6, 5), (10**6, 20, 3)])
+def test_fialho_tries_every_wide_triangle_once_up_to_its_limits(
+    triangles: int, checks: int, tried: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each triangle takes seven checks and is no match; the brightest comes first."""
+    rays, _, _, index, _ = field(1)
+    asked: list[tuple[int, ...]] = []
+
+    def no_triplet(*told: object) -> object:
+        asked.append(tuple(told[3]))
+        told[5][1] += 7
+        return FIALHO.no_match()
+
+    monkeypatch.setattr(FIALHO, "triplets", no_triplet)
+    options = FIALHO.search_options(TOLERANCE_RAD, Options(epsilon_mag=0.1), 0.5, True, True)
+    options = options._replace(triangles=triangles, checks=checks, base=6)
+    assert len(FIALHO.search(rays, np.full(len(rays), np.nan), index, options).observed) == 0
+    wide = [
+        corners
+        for corners in itertools.combinations(range(6), 3)
+        if shortest_side_rad(rays[list(corners)]) >= FIALHO.MIN_SIDE_FRACTION * index.max_angle_rad
+    ]
+    assert len(wide) > 5
+    assert asked[0] == wide[0]
+    assert len(set(asked)) == len(asked) == (tried or len(wide))
+    assert set(asked) <= set(wide)
+
+
+def shortest_side_rad(corners: Floats) -> float:
+    """The shortest side of a triangle, rad."""
+    return float(np.arccos(np.sum(corners * np.roll(corners, 1, axis=0), axis=1)).min())

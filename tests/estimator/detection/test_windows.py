@@ -1,0 +1,58 @@
+"""Detection in windows, step by step, against scipy.ndimage; by the interpreter."""
+
+from __future__ import annotations
+
+import numpy as np
+from interpreted import interpreted
+from scipy import ndimage
+
+WINDOWS = interpreted("estimator.detection.windows")
+EIGHT = np.ones((3, 3), int)
+SKY = np.zeros((3, 3))  # level; its noise is 1
+
+
+def crowded(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """An image of blobs that touch all four edges, its filtered values and the labels of those above 3 sigma."""
+    rng = np.random.default_rng(seed)
+    image = np.where(rng.random((13, 17)) < 0.12, rng.uniform(20, 40, (13, 17)), 0.0)
+    image[[0, 0, 12, 12, 6, 6], [0, 8, 16, 5, 0, 16]] = 50.0
+    above = np.array([[WINDOWS.filtered(image, y, x) for x in range(17)] for y in range(13)])
+    return image, above, ndimage.label(above > WINDOWS.GROW_SIGMA, EIGHT)[0]
+
+
+def test_a_blob_is_all_that_is_connected_with_its_peak() -> None:
+    """Up to the first and the last row and column."""
+    touched = np.zeros(4, bool)
+    for seed in range(5):
+        image, _, label = crowded(seed)
+        for number in range(1, label.max() + 1):
+            y, x = np.nonzero(label == number)
+            box, total = np.empty(4, np.int64), np.empty(5)
+            WINDOWS._grow(image, x[0], y[0], SKY, SKY + 1, box, total)
+            light = image[y, x]
+            np.testing.assert_allclose(total, [len(x), light.sum(), light @ x, light @ y, light.max()], rtol=1e-12)
+            assert box.tolist() == [x.min(), y.min(), x.max(), y.max()]
+            touched |= [x.min() == 0, y.min() == 0, x.max() == 16, y.max() == 12]
+    assert touched.all()
+
+
+def test_each_window_gives_the_blob_of_its_brightest_pixel_once() -> None:
+    """Windows over the edges and outside of the frame too; where none is above the threshold there is no blob."""
+    rng, found, empty = np.random.default_rng(9), 0, 0
+    for seed in range(20):
+        image, above, label = crowded(seed)
+        center, half = rng.uniform(-4, [21, 17]), 2.0
+        x, y = np.meshgrid(np.arange(17), np.arange(13))
+        # A window's first pixel is its lower end rounded down, its last one the upper end rounded down.
+        low, high = np.maximum(center - half, 0).astype(int), np.minimum(center + half, [16, 12]).astype(int)
+        inside = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1]) & (above > 6)
+        boxes, _, count = WINDOWS._brightest(image, np.array([center, center]), half, SKY, SKY + 1, 6.0)
+        assert count == inside.any()
+        empty += count == 0
+        if count:
+            peak = np.unravel_index(np.where(inside, above, -1).argmax(), above.shape)
+            rows, columns = np.nonzero(label == label[peak])
+            assert boxes[0].tolist() == [columns.min(), rows.min(), columns.max(), rows.max()]
+            found += 1
+    assert found > 5
+    assert empty > 1
