@@ -228,7 +228,8 @@ QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
         name: lambda c, name=name: np.asarray(c[name])  # type: ignore[misc]
         for name in (
             *("nees", "stars", "detected", "matched", "centroid_px", "streak_px", "availability"),
-            *("filter_arcsec", "filter_worst_arcsec", "drift_arcsec", "time_ms"),
+            *("filter_arcsec", "filter_worst_arcsec", "drift_arcsec", "pointing_arcsec", "pointing_worst_arcsec"),
+            "time_ms",
         )
     },
 }

@@ -74,12 +74,14 @@ def table(log: Telemetry) -> Any:
 
     for name, attitude in (
         ("true", log.lab_from_body),
-        ("told", log.lab_from_ref),
+        ("commanded", log.lab_from_ref),
         ("imu", log.lab_from_imu),
         ("filter", log.lab_from_filter),
     ):
         if attitude is not None:
             add(name, euler_deg(attitude), EULER, "deg")
+    if (pointing := attitude_error_deg(log.lab_from_ref, log.lab_from_body)) is not None:
+        columns["pointing_error_deg"] = pointing
     add("rate", np.degrees(log.rate_body_rad_s), AXES, "deg_s")
     add("torque", log.torque_nm, AXES, "nm")
     add("disturbance", log.disturbance_nm, AXES, "nm")

@@ -17,6 +17,19 @@ TILT_CHECK_S = 0.05  # sampling interval of a maneuver when its tilt is checked
 ROUNDING = 1e-6  # relative
 
 
+def check_maneuver(testbed: Testbed) -> None:
+    """Raise InputError for a maneuver that a run would refuse; an external controller is started and ended."""
+    scene, start = testbed.scene, testbed.trajectory.lab_from_body[0]
+    if scene.motion.control is None:
+        return
+    reference = guidance.plan(scene.motion, start, testbed.profiles)
+    flight_computer = FlightComputer(scene, testbed.vehicle, reference, testbed.controllers)
+    try:
+        check_reference(reference, testbed, flight_computer)
+    finally:
+        flight_computer.close()
+
+
 def check_reference(reference: guidance.Reference, testbed: Testbed, flight_computer: FlightComputer) -> None:
     """Raise InputError for a maneuver beyond the tilt stop, the gyros' range or the actuators' torque.
 

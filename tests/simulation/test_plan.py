@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -388,3 +389,18 @@ def test_a_check_costs_a_fraction_of_a_second() -> None:
     for _ in range(2):
         build_tracker(bed("shefex2"))
     assert checked - began < 2 * (time.process_time() - checked)
+
+
+def test_a_profile_that_is_too_fast_is_refused_before_the_run(tmp_path: Path) -> None:
+    """Half a turn about z in two seconds: 2.5 rad/s^2, where the wheels give a hundredth of that."""
+    t_s = np.linspace(0, 2, 41)
+    yaw_deg = 90 * (1 - np.cos(np.pi * t_s / 2))
+    file = tmp_path / "fast.csv"
+    rows = [f"{t},0,0,{yaw}" for t, yaw in zip(t_s, yaw_deg, strict=True)]
+    file.write_text("\n".join(["t_s,roll_deg,pitch_deg,yaw_deg", *rows]))
+    changes = {"motion__start": "profile", "motion__maneuver": f"[{{kind: profile, file: {file}}}]"}
+    with pytest.raises(
+        InputError, match=r"motion\.maneuver\.0: profile: needs a torque of .* times what the"
+    ):
+        check(bed("simsat_slew", **changes))
+    check(bed("simsat_slew", motion__control="prescribed", filter="null", **changes))

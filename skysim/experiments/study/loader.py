@@ -39,6 +39,7 @@ HARDWARE_SEED = re.compile(r"(hardware_seed|survey\.(surface_)?seed)$")
 # Kinds of trial that measure a quantity; quantities that are not listed are measured by all.
 MEASURED_BY: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("availability", "filter_arcsec", "filter_worst_arcsec", "drift_arcsec"), ("flight",)),
+    **dict.fromkeys(("pointing_arcsec", "pointing_worst_arcsec"), ("flight",)),
     "streak_px": ("frames", "flight"),
 }
 

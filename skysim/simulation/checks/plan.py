@@ -13,6 +13,7 @@ from skysim.simulation.checks.expected_error import expected
 from skysim.simulation.checks.facts import FACTS, Fact, Sampled, Samples
 from skysim.simulation.checks.findings import FINDINGS
 from skysim.simulation.checks.views import views
+from skysim.simulation.reference_limits import check_maneuver
 from skysim.simulation.testbed import Testbed
 
 
@@ -29,8 +30,12 @@ class Check(NamedTuple):
 
 
 def check(testbed: Testbed) -> Check:
-    """Check the plan of a test bed whose motion need not be simulated. Raises InputError for unreadable files."""
+    """Check the plan of a test bed whose motion need not be simulated.
+
+    Raises InputError for unreadable files, and for a maneuver that a run would refuse.
+    """
     scene = testbed.scene
+    check_maneuver(testbed)
     first = [line for line in [dome.camera_outside_warning(scene, testbed.mount)] if line]
     if first:
         return Check([], first)  # all else assumes that the camera is inside

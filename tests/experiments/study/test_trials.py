@@ -13,7 +13,7 @@ from skysim.core.types import Trajectory
 from skysim.experiments.study import plan
 from skysim.experiments.study.execution import setups, trials
 from skysim.experiments.study.plan import CentroidTrial, FrameTrial, TrialSpec
-from skysim.simulation import exposure
+from skysim.simulation import exposure, run
 
 SKY = TrialSpec("shefex2", ".", 1, {}, {"kind": "centroids"}, True)
 DOME = TrialSpec("afit_simsat", ".", 1, {}, {"kind": "centroids"}, True)
@@ -182,6 +182,10 @@ def test_a_flights_filter_is_scored_at_every_tick():
     assert 0 < came.filter_arcsec < came.filter_worst_arcsec < 600
     assert came.availability == 1
     assert math.isfinite(came.drift_arcsec)
+    log = run.simulate_motion(trials.flight_testbed(ready, 5)).log
+    error = (log.lab_from_ref * log.lab_from_body.inv()).magnitude()
+    assert 0 < came.pointing_arcsec < came.pointing_worst_arcsec
+    assert came.pointing_worst_arcsec == pytest.approx(np.degrees(error.max()) * 3600, rel=1e-9)
 
 
 @pytest.mark.slow

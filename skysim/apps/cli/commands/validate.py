@@ -6,12 +6,14 @@ will show and how accurate its tracker will be.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, NamedTuple
 
 import typer
 
-from skysim.apps.cli.options import Json, Overrides, SceneArg, load, with_location
+from skysim.apps.cli.options import Json, Overrides, Programs, SceneArg, load, with_location
 from skysim.apps.cli.terminal import print_check, print_error, print_json
 from skysim.core.errors import InputError
 from skysim.scene.data_sheet.sheet import PLACEHOLDER_LENS
@@ -37,6 +39,7 @@ def validate(
             " catalogs and LED maps (ECSV).",
         ),
     ] = None,
+    program: Programs = None,
     schema: Annotated[str | None, typer.Option(help="Print the JSON Schema of a kind of file: scene or study.")] = None,
     json: Json = False,
 ) -> None:
@@ -50,7 +53,12 @@ def validate(
         return
     if not files:
         raise InputError("no files; give files, or --schema scene")
-    verdicts = [check_file(path) for path in files]
+    programs = {}
+    if program:
+        from skysim.tracking.external import process
+
+        programs = process.program_commands(program)
+    verdicts = [check_file(path, programs) for path in files]
     if json:
         print_json([verdict._asdict() for verdict in verdicts])
     for verdict in verdicts if not json else []:
@@ -62,15 +70,17 @@ def validate(
         raise typer.Exit(2)
 
 
-def check(scene: SceneArg, set_: Overrides = None, json: Json = False) -> None:
+def check(scene: SceneArg, program: Programs = None, set_: Overrides = None, json: Json = False) -> None:
     """Check a plan before its run: field, lights in it, image size, saturation, smear, focus, expected error, warnings.
 
     Nothing is simulated or rendered; everything is computed at sampled attitudes.
     """
     from skysim.simulation.checks import check as check_plan
     from skysim.simulation.testbed import build_testbed
+    from skysim.tracking.external import process
 
-    result = check_plan(build_testbed(load(scene, None, None, set_)))
+    loaded = load(scene, None, None, set_)
+    result = check_plan(build_testbed(loaded, process.program_commands(program)))
     findings = [with_location(finding) for finding in result.findings]
     if json:
         print_json(result._replace(findings=findings).as_dict())
@@ -78,15 +88,15 @@ def check(scene: SceneArg, set_: Overrides = None, json: Json = False) -> None:
         print_check(result.facts, findings)
 
 
-def check_file(path: Path) -> Verdict:
-    """Check one file; errors become the verdict's `fault`."""
+def check_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})) -> Verdict:
+    """Check one file; errors become the verdict's `fault`. programs : of trackers and controllers, by name"""
     try:
-        return Verdict(str(path), *describe_file(path))
+        return Verdict(str(path), *describe_file(path, programs))
     except (InputError, OSError) as error:
         return Verdict(str(path), fault=str(error))
 
 
-def describe_file(path: Path) -> tuple[str, tuple[str, ...]]:
+def describe_file(path: Path, programs: Mapping[str, str]) -> tuple[str, tuple[str, ...]]:
     """Return a description of the file and warnings. Raises InputError with one line."""
     from skysim.core.yaml_reader import is_file, read_yaml
     from skysim.scene import opencv_calibration
@@ -118,7 +128,7 @@ def describe_file(path: Path) -> tuple[str, tuple[str, ...]]:
 
         camera = load_camera(path, PLACEHOLDER_LENS)
         return f"a camera of {camera.width_px} x {camera.height_px} pixels", ()
-    return check_scene(path)
+    return check_scene(path, programs)
 
 
 def find_shipped(path: Path) -> Path:
@@ -130,7 +140,7 @@ def find_shipped(path: Path) -> Path:
     return next((file for file in names if file.is_file()), None) or find_file(str(path), SCENES, "scene")
 
 
-def check_scene(path: Path) -> tuple[str, tuple[str, ...]]:
+def check_scene(path: Path, programs: Mapping[str, str]) -> tuple[str, tuple[str, ...]]:
     """Set up a scene without simulating its motion: vehicle, lights, tracker. Returns a description and warnings."""
     from skysim.scene import loader
     from skysim.simulation.checks import check as check_plan
@@ -138,7 +148,7 @@ def check_scene(path: Path) -> tuple[str, tuple[str, ...]]:
 
     scene = loader.load(path)
     try:
-        testbed = build_testbed(scene)
+        testbed = build_testbed(scene, programs)
         build_tracker(testbed)
         findings = check_plan(testbed).findings
     except InputError as error:

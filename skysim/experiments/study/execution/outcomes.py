@@ -15,7 +15,7 @@ from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core import quaternion
-from skysim.core.types import Floats, Truth
+from skysim.core.types import Floats, Telemetry, Truth
 from skysim.core.units import ARCSEC_RAD
 from skysim.results import metrics
 from skysim.scene.light import DomeConfig
@@ -41,6 +41,8 @@ class Outcome:
                of its frames solved correctly
     filter_arcsec, filter_worst_arcsec : angular error of a flight's filter, RMS and worst
     drift_arcsec : filter_arcsec of the last quarter of a flight minus that of the first quarter
+    pointing_arcsec, pointing_worst_arcsec : angle between a flight's attitude and the commanded one, RMS and worst;
+               NaN without a maneuver
     ambiguous : number of frames refused because another attitude fits the lights as well
     misidentified : number of frames solved with a light that is matched with a wrong star or LED, more than
                SAME_LIGHT_PX from the true image of that star or LED; NaN if the tracker does not name its lights
@@ -68,6 +70,8 @@ class Outcome:
     filter_arcsec: float = math.nan
     filter_worst_arcsec: float = math.nan
     drift_arcsec: float = math.nan
+    pointing_arcsec: float = math.nan
+    pointing_worst_arcsec: float = math.nan
     ambiguous: int = 0
     misidentified: float = math.nan
     roll_noise: float = math.nan
@@ -230,15 +234,21 @@ def directions(testbed: Testbed, lab_from_body: Floats, cam_from_lab: Floats) ->
 # Flights.
 
 
+def angles_arcsec(lab_from_other: Rotation | None, log: Telemetry, settle_s: float) -> Floats:
+    """(K,) angle between another attitude and the true one at the ticks from settle_s on; empty without the other."""
+    if lab_from_other is None:
+        return np.empty(0)
+    return np.asarray((lab_from_other * log.lab_from_body.inv()).magnitude()[log.t_s >= settle_s] / ARCSEC_RAD)
+
+
 def summarize_flight(testbed: Testbed, outcomes: list[Outcome], settle_s: float) -> Outcome:
     """Outcome of a flight trial from the outcomes of its frames and, with a filter, from its error at every tick."""
     solved = [outcome for outcome in outcomes if outcome.solved]
     x, y, roll = (rms([getattr(one, name) for one in solved]) for name in ("x_arcsec", "y_arcsec", "roll_arcsec"))
     good = [bool(one.solved and not one.wrong) for one in outcomes]
-    # (K,) angular error of the filter at the ticks from settle_s on; empty without a filter.
-    log, error = testbed.log, np.empty(0)
-    if log.lab_from_filter is not None:
-        error = (log.lab_from_filter * log.lab_from_body.inv()).magnitude()[log.t_s >= settle_s] / ARCSEC_RAD
+    log = testbed.log
+    error = angles_arcsec(log.lab_from_filter, log, settle_s)
+    pointing = angles_arcsec(log.lab_from_ref, log, settle_s)
     quarter = len(error) // 4
     limit = metrics.WRONG_RAD / ARCSEC_RAD
     worst = worst_frame(outcomes)
@@ -256,8 +266,10 @@ def summarize_flight(testbed: Testbed, outcomes: list[Outcome], settle_s: float)
         mean([one.matched for one in outcomes]),
         mean(error < limit) if len(error) else mean(good),
         rms(error),
-        float(error.max(initial=-np.inf)) if len(error) else math.nan,
+        float(error.max()) if len(error) else math.nan,
         rms(error[-quarter:]) - rms(error[:quarter]) if quarter else math.nan,
+        rms(pointing),
+        float(pointing.max()) if len(pointing) else math.nan,
         sum(one.ambiguous for one in outcomes),
         sum(one.misidentified for one in outcomes) if outcomes else math.nan,
         sum(one.roll_noise for one in outcomes) if outcomes else math.nan,
