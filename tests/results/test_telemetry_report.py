@@ -84,13 +84,13 @@ def test_a_flight_that_nobody_flew_has_no_figures() -> None:
 def test_the_table_has_what_the_flight_has_in_degrees() -> None:
     table = telemetry_report.table(full())
     np.testing.assert_allclose(table["true_yaw_deg"], 10 * T_S, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(table["told_yaw_deg"], 10 * T_S + 2, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(table["commanded_yaw_deg"], 10 * T_S + 2, rtol=0, atol=1e-12)
     np.testing.assert_allclose(table["imu_roll_deg"][-1], 0.5, rtol=0, atol=1e-12)
     np.testing.assert_allclose(table["rate_z_deg_s"], 10, rtol=0, atol=1e-12)
     np.testing.assert_allclose(table["wheel_2_rpm"], -200 * T_S * 30 / np.pi, rtol=1e-12)
     np.testing.assert_allclose(table["gimbal_1_deg"], T_S / DEG, rtol=1e-12)
     np.testing.assert_allclose(table["assumed_bias_z_deg_h"] - table["bias_z_deg_h"], 1, rtol=1e-9)
-    assert {"told_roll_deg", "imu_roll_deg", "wheel_1_rpm"}.isdisjoint(telemetry_report.table(bare()).colnames)
+    assert {"commanded_roll_deg", "imu_roll_deg", "wheel_1_rpm"}.isdisjoint(telemetry_report.table(bare()).colnames)
 
 
 def test_every_sample_of_the_imu_is_in_its_table() -> None:

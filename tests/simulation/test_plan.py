@@ -399,8 +399,6 @@ def test_a_profile_that_is_too_fast_is_refused_before_the_run(tmp_path: Path) ->
     rows = [f"{t},0,0,{yaw}" for t, yaw in zip(t_s, yaw_deg, strict=True)]
     file.write_text("\n".join(["t_s,roll_deg,pitch_deg,yaw_deg", *rows]))
     changes = {"motion__start": "profile", "motion__maneuver": f"[{{kind: profile, file: {file}}}]"}
-    with pytest.raises(
-        InputError, match=r"motion\.maneuver\.0: profile: needs a torque of .* times what the"
-    ):
+    with pytest.raises(InputError, match=r"motion\.maneuver\.0: profile: needs a torque of .* times what the"):
         check(bed("simsat_slew", **changes))
     check(bed("simsat_slew", motion__control="prescribed", filter="null", **changes))

@@ -35,12 +35,12 @@ def check(testbed: Testbed) -> Check:
     Raises InputError for unreadable files, and for a maneuver that a run would refuse.
     """
     scene = testbed.scene
-    check_maneuver(testbed)
     first = [line for line in [dome.camera_outside_warning(scene, testbed.mount)] if line]
     if first:
         return Check([], first)  # all else assumes that the camera is inside
     context = context_of(testbed)
     frames = attitudes.of_frames(testbed)
+    check_maneuver(testbed)
     reach = attitudes.within_reach(scene, testbed.mount, frames)
     samples = Samples(sampled(frames, context), sampled(reach, context))
     facts = [fact for build in FACTS if (fact := build(context, samples)) is not None]
