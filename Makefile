@@ -97,7 +97,7 @@ fuzz: fuzzer
 fuzzer: $(READY)
 	-$(BIN)/pip install --quiet --disable-pip-version-check -e '.[fuzz]'
 
-# How many of MUTANTS random small changes of the code the tests notice: docs/findings/mutants.md. It takes hours, and
+# How many of MUTANTS random small changes of the code the tests notice: docs/findings/mutants.md. It takes an hour, and
 # goes on where it was stopped; `AGAIN=--again` tries the survivors once more, after tests were added.
 MUTANTS ?= 300
 SEED ?= 1

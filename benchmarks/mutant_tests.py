@@ -18,7 +18,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
+from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numba
@@ -129,7 +129,7 @@ def compiled_names(function: FunctionType) -> Iterator[CPUDispatcher]:
     """Compiled functions that the names in a function's code stand for, in tables and modules too."""
     names = {name for code in nested(function.__code__) for name in code.co_names}
     values = [function.__globals__.get(name) for name in names]
-    values += [cell.cell_contents for cell in function.__closure__ or () if cell != type(cell)()]
+    values += [cell.cell_contents for cell in function.__closure__ or () if cell != CellType()]  # not an empty one
     for value in values:
         if isinstance(value, ModuleType):
             members = [vars(value).get(name) for name in names]

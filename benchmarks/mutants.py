@@ -172,6 +172,7 @@ def record(files: list[str]) -> dict[str, Any]:
     if not changed:
         return old
     part = OUT / "part.json"
+    part.unlink(missing_ok=True)
     forked(lambda: session(changed, Recorder(TREE, part)), 7200)
     new = json.loads(part.read_text())
     kept = {name: test for name, test in old["tests"].items() if name.split("::")[0] not in changed}

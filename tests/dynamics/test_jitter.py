@@ -72,11 +72,12 @@ def test_phases_are_at_random() -> None:
 
 @pytest.mark.parametrize("slope", [-6.0, -2.0, -1.0, 0.0, 3.0])
 def test_a_band_has_its_rms_and_keeps_within_its_edges(slope: float) -> None:
-    sines = SPECTRA["band"](band(2.0, 50.0, slope), np.random.default_rng(4))
+    sines = SPECTRA["band"](band(2.0, 49.0, slope), np.random.default_rng(4))
     rms = np.sqrt(np.sum(sines.sine_rad**2 + sines.cosine_rad**2, axis=0) / 2)
     np.testing.assert_allclose(rms, np.array(RMS) * ARCSEC, rtol=1e-12)
-    assert sines.omega_rad_s.min() / (2 * np.pi) >= 2.0
-    assert sines.omega_rad_s.max() / (2 * np.pi) <= 50.0
+    frequency_hz, piece = sines.omega_rad_s / (2 * np.pi), 24.5 ** (1 / len(sines.omega_rad_s))
+    assert 2.0 <= frequency_hz.min() <= 2.0 * piece
+    assert 49.0 / piece <= frequency_hz.max() <= 49.0
 
 
 @pytest.mark.long

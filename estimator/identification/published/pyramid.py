@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from estimator.catalog.pair_index import PairIndex, first_neighbor, pair_range
 from estimator.core.arrays import Floats
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
@@ -58,9 +59,11 @@ def pyramid(vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **optio
     The three catalog stars are from different groups of the index (patch boards). Observed triangles are tried in the
     paper's `smart` order, which changes all three stars soon, so that one false star costs little. A pyramid is only a
     hypothesis: its attitude must match so many observed stars that, over all hypotheses tried, less than 1e-5 matches
-    this good are expected by chance. Otherwise returns None.
+    this good are expected by chance. Otherwise returns None. Raises ImageError unless the tolerance is positive.
     """
     settings = Options(**options)
+    if not tolerance_rad > 0:
+        raise ImageError(f"pyramid: tolerance {tolerance_rad} rad; allowed: more than 0")
     if len(vectors_cam) < MIN_MATCHES:
         return None
     parameters = SearchOptions(

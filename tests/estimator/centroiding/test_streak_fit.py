@@ -293,3 +293,19 @@ def test_the_fit_s_model_is_the_integral_of_a_moving_gaussian() -> None:
         slope = (model(p + step)[0] - model(p - step)[0]) / 2e-5
         # Beyond five widths from an end the integral is cut off, at 3e-7 of the light.
         np.testing.assert_allclose(rows[n], slope, rtol=0, atol=1e-4 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize(
+    "start", [(0.2, 0.1, 0.3, 0.02), (2.5, -1.0, 0.0, 0.0), (0.0, 0.0, 6.0, 0.0), (0.0, 0.0, 0, 0.3)]
+)
+def test_a_fit_that_begins_some_pixels_off_comes_to_the_truth(start: tuple[float, float, float, float]) -> None:
+    """Of place, length and direction: where a first step would go too far it is shortened; almost without noise."""
+    plain = interpreted("estimator.centroiding.streak_fit")
+    y, x = (grid.ravel().astype(float) for grid in np.mgrid[:31, :41])
+    truth = np.array([20.3, 14.8, 50000.0, 9.0, 0.4, 0.8, 7.0])
+    rows, weight, out = np.ones((8, x.size)), np.empty(x.size), np.empty(8)
+    plain._rows(np.vstack([x, y, np.zeros(x.size)]), 1.0, 1e9, truth, rows, weight)
+    p = np.add(truth, [start[0], start[1], 0, start[2], start[3], 0.1, 0])
+    assert plain._fit(np.vstack([x, y, -rows[7]]), 1.0, 1e9, rows, weight, p, out)
+    wanted = [20.3, 14.8, 50000, 9 * np.cos(0.4), 9 * np.sin(0.4)]
+    np.testing.assert_allclose(out[:5], wanted, rtol=1e-4)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -255,6 +256,17 @@ def test_the_covariance_holds_a_lever_s_error():
     assert np.mean(nees) == pytest.approx(2, abs=3 * np.sqrt(4 / 60))
 
 
+def test_the_index_knows_the_errors_and_the_field_as_angles() -> None:
+    """Errors of LEDs and pupil over the least distance from the camera; the sensor's area in tangents squared."""
+    leds, lever = spread(60, OVAL, seed=1), Lever(LEVER.camera_body_m, LEVER.cam_from_body, 1e-3)
+    leds = replace(leds, sigma_m=2e-4)
+    dome = build_dome_index(leds, lever, CAMERA)
+    least_m = np.linalg.norm(leds.position_m, axis=1).min() - np.linalg.norm(LEVER.camera_body_m)
+    assert dome.lever_sigma == pytest.approx(1e-3 / least_m, rel=1e-12)
+    assert dome.led_sigma == pytest.approx(2e-4 / least_m, rel=1e-12)
+    assert dome.field_area == pytest.approx(1600 * 1200 / 8698.0**2, rel=1e-9)
+
+
 # ---- steps of the search, by the interpreter
 
 PLAIN = interpreted("estimator.identification.leds.search")
@@ -332,3 +344,15 @@ def test_a_second_pair_is_the_first_that_shares_the_fewest_detections_with_the_b
         shared = np.isin(pairs, pairs[rank]).sum(axis=1)
         wanted = np.lexsort([np.arange(len(pairs)), shared, unmatched])[0]
         assert PLAIN._disjoint_pair(pairs, rank, best) == wanted
+
+
+def test_a_pair_s_attitude_is_worth_its_volume_among_all_attitudes() -> None:
+    """The integral of a normal density of the three errors over the prior's volume: sqrt(det 2 pi P) / V."""
+    dome = build_dome_index(spread(60, OVAL, seed=1), LEVER, CAMERA)
+    rays = np.array([[0.05, 0.02, 1.0], [-0.04, 0.01, 1.0]])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    detections = search.build_detections(rays, np.array([1e-5, 2e-5]), dome)
+    across, apart = detections.sigma.min() / np.sqrt(2), np.hypot(0.09, 0.01)
+    covariance = np.diag([across, across, np.sqrt(2) * detections.sigma.min() / apart]) ** 2
+    wanted = np.log10(np.sqrt(np.linalg.det(2 * np.pi * covariance)) / dome.prior_volume)
+    assert PLAIN._attitude_dex(detections, dome, 0, 1) == pytest.approx(wanted, abs=1e-9)

@@ -82,6 +82,14 @@ def test_every_method_names_the_stars_and_gives_their_attitude(name: str, false:
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("tolerance_rad", [0.0, -1e-4, np.nan])
+def test_a_tolerance_must_be_positive(name: str, tolerance_rad: float) -> None:
+    rays, magnitude, _, index, _ = field(0)
+    with pytest.raises(ValueError, match=r"tolerance.*allowed: more than 0"):
+        PLAIN[name](rays, index, tolerance_rad, magnitude=magnitude, epsilon_mag=0.1)
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_no_method_takes_a_mirror_image(name: str) -> None:
     rays, magnitude, _, index, _ = field(0)
     match = PLAIN[name](rays * [-1, 1, 1], index, TOLERANCE_RAD, magnitude=magnitude, epsilon_mag=0.1)

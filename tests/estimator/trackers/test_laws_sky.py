@@ -11,6 +11,7 @@ from hypothesis import strategies as some
 from hypothesis.extra.numpy import arrays
 from laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, drawn, law, turn, units
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -293,3 +294,13 @@ def test_a_tracker_for_the_sky_has_the_stars_to_its_limit_as_seen_at_the_date(li
     chord = cKDTree(mean).query(tracker.stars.vectors[:20])[0]
     assert np.median(chord) < np.radians(20.6 / 3600)
     assert chord.max() > np.radians(1 / 3600)
+
+
+def test_chance_matches_are_counted_over_the_circles_of_the_predicted_stars() -> None:
+    """Binomial tail among the 15 brightest of 40 blobs, of 30 and of all; one stray in a circle at probability p."""
+    observed, radius_px, predicted = np.array([0, 2, 3, 5, 7, 11, 13, 35]), 3.0, 50
+    area = predicted * np.pi * radius_px**2 / (CAMERA.width_px * CAMERA.height_px)
+    tails = [stats.binom.logsf(hits - 3, count - 2, -np.expm1(-area)) for count, hits in ((15, 7), (30, 7), (40, 8))]
+    wanted = min(tails) / np.log(10) + np.log10(3 * 20)
+    found = star_tracker.log10_chance(observed, 40, predicted, radius_px, CAMERA, 20)
+    assert found == pytest.approx(wanted, abs=1e-9)
