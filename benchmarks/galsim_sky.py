@@ -171,7 +171,7 @@ def plate_solver_way(setup: CameraSetup) -> Ours:
     """The solver of `skysim solve FILE --fov DEG`."""
     fov_deg = float(np.degrees(setup.camera.fov_rad)) * (1 + setup.fov_error)
     solver = plate_solver.make_solver(fov_deg, None)
-    return lambda image, path: plate_solver.solve_array(image, solver, images.read_date_obs(path))[0].attitude
+    return lambda image, path: plate_solver.solve_array(image, solver, images.read_picture(path).date_utc)[0].attitude
 
 
 def calibrated_way(setup: CameraSetup) -> Ours:

@@ -36,6 +36,7 @@ from skysim.tracking import dome_map_file
 from skysim.tracking.external import interface
 
 START = datetime.datetime(2016, 12, 31)
+GZIP_MAGIC = b"\x1f\x8b"
 COLOR = ptase.Color(0.1, 0.2, 0.0)
 
 
@@ -81,14 +82,13 @@ def overrides(data: bytes) -> None:
 
 
 def fits(data: bytes) -> None:
-    path = write_file(data, "frame.fits")
-    rejects(lambda: images.monochrome(images.read_image(path)), InputError)
-    images.read_date_obs(path)
+    path = write_file(data, "frame.fits.gz" if data.startswith(GZIP_MAGIC) else "frame.fits")
+    rejects(lambda: images.monochrome(images.read_picture(path).pixels), InputError)
 
 
 def pictures(data: bytes) -> None:
     path = write_file(data, "frame.png")
-    rejects(lambda: images.monochrome(images.read_image(path)), InputError)
+    rejects(lambda: images.monochrome(images.read_picture(path).pixels), InputError)
 
 
 def catalogs(data: bytes) -> None:

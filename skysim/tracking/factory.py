@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from estimator.catalog import catalog
-from estimator.catalog.catalog import StarCatalog
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.dome_tracker import DomeTracker
@@ -20,13 +19,12 @@ from skysim.core.errors import InputError
 from skysim.core.types import Frame, Mount, Sources
 from skysim.scene.light import CollimatedDisplayConfig, DomeConfig
 from skysim.scene.scene import Scene
-from skysim.sources.catalog import require_catalog
 from skysim.sources.dome import display
 from skysim.tracking.external import adapter
 from skysim.tracking.external.adapter import ExternalTracker
 from skysim.tracking.external.function import FunctionTracker
 from skysim.tracking.external.interface import OWN
-from skysim.tracking.onboard_model import assumed_camera, assumed_dome, assumed_lever, surveyed_dome
+from skysim.tracking.onboard_model import assumed_camera, assumed_dome, assumed_lever, onboard_catalog, surveyed_dome
 from skysim.tracking.settings import assumed_settings
 
 UserTracker = ExternalTracker | FunctionTracker  # each frame must reach it once, in order
@@ -53,7 +51,7 @@ def build_tracker(scene: Scene, mount: Mount, sources: Sources, programs: Mappin
             return DomeTracker(camera, leds, lever, settings)
         except ImageError as error:
             raise InputError(f"light: the star tracker cannot use this dome: {error}") from None
-    stars = catalog.brighter_than(onboard_catalog(scene.tracker.catalog), scene.tracker.limit_mag)
+    stars = catalog.brighter_than(onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag)
     directions = catalog.apparent(stars, catalog.on_earth(scene.start_time))
     if isinstance(scene.light, CollimatedDisplayConfig):
         # The display's mounting defines where the stars are in the lab frame.
@@ -61,14 +59,6 @@ def build_tracker(scene: Scene, mount: Mount, sources: Sources, programs: Mappin
     if scene.tracker.name != OWN:
         return ExternalTracker.start(scene, camera, settings, adapter.star_map(stars, directions), programs)
     return StarTracker(camera, stars, directions, settings)
-
-
-def onboard_catalog(name: str) -> StarCatalog:
-    """The tracker's star catalog, by the estimator's own reader. Raises InputError."""
-    try:
-        return catalog.read(require_catalog("tracker.catalog", name))
-    except ImageError as error:
-        raise InputError(f"tracker.catalog: {error}") from None
 
 
 def solve_frame(estimator: Estimator, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:

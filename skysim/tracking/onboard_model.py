@@ -1,4 +1,4 @@
-"""The tracker's models of its camera, lever arm and dome: the true values with calibration and survey errors."""
+"""The tracker's models of its camera, lever arm, dome and sky: the true values with calibration and survey errors."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from estimator.attitude.dome_map import LedMap, Lever
+from estimator.catalog import catalog
 from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
 from skysim.core.types import Mount, Sources
 from skysim.scene.camera import CameraConfig
 from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
+from skysim.sources.catalog import require_catalog
 from skysim.sources.dome import surface, survey_errors
 from skysim.sources.dome.layouts import registry
 from skysim.tracking import dome_map_file
@@ -91,3 +94,14 @@ def assumed_camera(scene: Scene) -> Camera:
 def calibration(camera: CameraConfig) -> Camera:
     """The exact calibration of a camera, as the estimator's Camera."""
     return Camera(camera.width_px, camera.height_px, camera.focal_px, camera.center_px, camera.distortion)
+
+
+def onboard_catalog(key: str, name: str) -> catalog.StarCatalog:
+    """The tracker's star catalog, a name in data/catalogs/ or a file, by the estimator's own reader.
+
+    key : the scene's key or the option that gives it, for the message of InputError
+    """
+    try:
+        return catalog.read(require_catalog(key, name))
+    except ImageError as error:
+        raise InputError(f"{key}: {error}") from None

@@ -23,6 +23,12 @@ DOME_ALGORITHMS = {
     "identifier": "led_pairs",
     "solver": "rotation_only",
 }  # defaults under a dome; "default" under stars
+STAR_ALGORITHMS: dict[str, Mapping[str, object]] = {
+    "detector": DETECTORS,
+    "centroider": CENTROIDERS,
+    "identifier": IDENTIFIERS,
+    "solver": SOLVERS,
+}
 
 
 def assumed_settings(scene: Scene) -> Settings:
@@ -51,13 +57,10 @@ def assumed_settings(scene: Scene) -> Settings:
 
 def algorithm_tables(scene: Scene) -> dict[str, Mapping[str, object]]:
     """The algorithms by name that a scene's tracker may use, by stage."""
-    near = isinstance(scene.light, DomeConfig)
-    return {
-        "detector": DETECTORS,
-        "centroider": CENTROIDERS,
-        "identifier": NEAR_IDENTIFIERS if near else IDENTIFIERS,
-        "solver": NEAR_SOLVERS if near else SOLVERS,
-    }
+    near: dict[str, Mapping[str, object]] = {}
+    if isinstance(scene.light, DomeConfig):
+        near = {"identifier": NEAR_IDENTIFIERS, "solver": NEAR_SOLVERS}
+    return STAR_ALGORITHMS | near
 
 
 def algorithm_names(scene: Scene) -> dict[str, tuple[str, ...]]:

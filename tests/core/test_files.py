@@ -101,7 +101,7 @@ def test_the_header_tells_when_how_long_and_from_what(sky: Shot, written: Path) 
     # 0.1 s after the start the shutter opens, 20 ms later is the middle.
     middle = datetime.datetime(2012, 6, 22, 21, 0, 0, 120_000)
     assert datetime.datetime.fromisoformat(header["DATE-OBS"]) == middle
-    assert images.read_date_obs(written / "frame_0000.fits") == middle
+    assert images.read_picture(written / "frame_0000.fits").date_utc == middle
     assert (header["SCENE"], header["SEED"], header["FRAME"], header["SATURATE"]) == (
         "shefex2",
         2,
@@ -121,7 +121,7 @@ def test_a_scene_s_time_with_a_zone_is_told_as_utc(sky: Shot, start: str) -> Non
 
 
 def test_a_png_has_no_date(written: Path) -> None:
-    assert images.read_date_obs(written / "frame_0000.png") is None
+    assert images.read_picture(written / "frame_0000.png").date_utc is None
 
 
 def test_a_fits_file_is_standard(written: Path) -> None:
@@ -379,8 +379,7 @@ def test_a_few_flipped_bytes_give_an_image_or_one_line(written: Path, tmp_path: 
     path.write_bytes(data)
     outcome = []
     try:
-        outcome.append(images.read_image(path))
-        images.read_date_obs(path)
+        outcome.append(images.read_picture(path).pixels)
     except InputError as refusal:
         outcome.append(str(refusal))
     assert "\n" not in str(outcome[0]) or isinstance(outcome[0], np.ndarray)

@@ -36,7 +36,10 @@ def eager_first(items: Iterable[T]) -> Iterator[T]:
 
 def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> Iterator[T]:
     """Yield the items, with a progress bar on stderr that disappears at the end."""
-    with bar(quiet=quiet) as shown:
+    if quiet or not sys.stderr.isatty():  # without the time that it takes to import the bar
+        yield from items
+        return
+    with bar() as shown:
         yield from shown.track(items, total=total, description=printable(what))
 
 
@@ -301,7 +304,24 @@ def print_solutions(solutions: list[dict[str, Any]], out: Path) -> None:
         for a in solutions
     ]
     print_table("", headers, lines)
+    for solution in solutions:
+        print_remarks(solution)
     print(f"annotated images and solutions.json in {out}")
+
+
+def print_remarks(solution: dict[str, Any]) -> None:
+    """Print what `skysim solve` saw, tried and concludes, for a refused image; or what it assumed."""
+    if not solution["hint"]:
+        return
+    print(f"\n{printable(solution['file'])}: {printable(solution['status'])}")
+    if solution["ra_deg"] is None:
+        fields = " and ".join(f"{narrow:g}° to {wide:g}°" for narrow, wide in solution["tried_fov_deg"])
+        print(
+            f"  seen:   {solution['lights']} lights, the brightest pixel {solution['brightest_dn']:g} DN,"
+            f" the background {solution['background_dn']:g} DN\n"
+            f"  tried:  fields {fields} wide, stars to V {solution['catalog_limit_mag']:g}"
+        )
+    print(f"  {'likely' if solution['ra_deg'] is None else 'note'}: {printable(solution['hint'])}")
 
 
 def print_json(data: Any) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from skysim.core.errors import InputError
 from skysim.core.types import Mount
-from skysim.core.units import in_utc
+from skysim.core.utc import in_utc
 from skysim.dynamics.profiles import ccsds_aem, stk, table
 from skysim.dynamics.profiles.samples import Samples, check_samples
 from skysim.dynamics.profiles.spline import AttitudeSpline, fit_spline

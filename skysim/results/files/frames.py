@@ -37,16 +37,6 @@ def remove_results(folder: Path) -> None:
     shutil.rmtree(folder / ZARR, ignore_errors=True)
 
 
-def unique_paths(paths: list[Path]) -> list[Path]:
-    """The paths, with a number appended to every repeated one so that no file overwrites another."""
-    counts: dict[Path, int] = {}
-    unique = []
-    for path in paths:
-        number = counts[path] = counts.get(path, 0) + 1
-        unique.append(path.with_name(f"{path.stem}-{number}{path.suffix}") if number > 1 else path)
-    return unique
-
-
 def write_frame(folder: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
     """Write frame_NNNN.fits (16 bits, with a WCS header under the stars), .png (16 bits) and the truth as .ecsv."""
     stem = folder / f"frame_{frame.index:04d}"
@@ -66,6 +56,7 @@ def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
     header["SCENE"] = (scene.name, "scene")
     header["SEED"] = (scene.seed, "seed of every random stream")
     header["FRAME"] = (frame.index, "index of the frame")
+    header["ROWORDER"] = ("TOP-DOWN", "the first row is the highest")
     header["SATURATE"] = (frame.saturation_dn, "saturation [DN]")
     if isinstance(scene.light, StarsConfig):
         header.update(wcs.header(scene.camera, truth.cam_from_lab))

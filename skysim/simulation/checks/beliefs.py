@@ -30,8 +30,7 @@ from skysim.simulation.testbed import Testbed
 from skysim.sources.dome import display
 from skysim.sources.dome.survey_errors import led_covariance_m2
 from skysim.tracking import dome_map_file
-from skysim.tracking.factory import onboard_catalog
-from skysim.tracking.onboard_model import assumed_camera
+from skysim.tracking.onboard_model import assumed_camera, onboard_catalog
 from skysim.tracking.settings import assumed_settings
 
 REACH_PX = 7.0  # of neighbors
@@ -129,7 +128,7 @@ def known_lights(testbed: Testbed, camera: CameraModel) -> tuple[Sources, Floats
 def believed_stars(testbed: Testbed) -> StarCatalog:
     """The tracker's stars at their believed directions in lab axes, unresolved ones merged. Raises InputError."""
     scene = testbed.scene
-    stars = catalog.brighter_than(onboard_catalog(scene.tracker.catalog), scene.tracker.limit_mag)
+    stars = catalog.brighter_than(onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag)
     directions = catalog.apparent(stars, catalog.on_earth(scene.start_time))
     if isinstance(scene.light, CollimatedDisplayConfig):
         directions = display.lab_from_icrs(scene.light).apply(directions)

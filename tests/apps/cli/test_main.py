@@ -24,6 +24,7 @@ from skysim.scene import loader
 
 SHEFEX = SCENES / "shefex2.yaml"
 ANSWER = {
+    *("lights", "brightest_dn", "background_dn", "tried_fov_deg", "catalog_limit_mag", "hint"),
     "file",
     "status",
     "ra_deg",
@@ -228,9 +229,36 @@ def test_solve_leaves_out_a_header_s_date_that_cannot_be_and_says_so(
 def test_solve_writes_what_it_prints_and_a_picture(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
     ran = skysim("solve", rendered / "frame_0000.png", "--fov", "14.8", "--json", "--out", tmp_path)
     assert json.loads((tmp_path / "solutions.json").read_text()) == json.loads(ran.out)
-    assert {p.name for p in tmp_path.iterdir()} == {"solutions.json", "frame_0000.png.solved.png"}
-    height, width, channels = cv2.imread(str(tmp_path / "frame_0000.png.solved.png")).shape
+    assert {p.name for p in tmp_path.iterdir()} == {"solutions.json", "frame_0000.annotated.png"}
+    height, width, channels = cv2.imread(str(tmp_path / "frame_0000.annotated.png")).shape
     assert (height * 659, channels) == (width * 493, 3)
+
+
+@pytest.mark.slow
+def test_solve_takes_a_folder_and_says_why_a_picture_is_refused(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "night"
+    folder.mkdir()
+    frame = cv2.imread(str(rendered / "frame_0000.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(folder / "a.png"), frame)
+    cv2.imwrite(str(folder / "b.png"), frame[:, ::-1])
+    ran = skysim("solve", folder, "--fov", "14.8", "--out", tmp_path / "out")
+    assert (ran.code, ran.err) == (0, "")
+    assert ran.out.count("  likely: perhaps mirrored: it solves when flipped") == 1
+    assert f"{folder / 'b.png'}: no identification beyond chance\n  seen:   " in ran.out
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"solutions.json", "a.annotated.png", "b.annotated.png"}
+
+
+@pytest.mark.slow
+def test_solve_knows_the_catalogs_by_name(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
+    path = rendered / "frame_0000.png"
+    ran = skysim("solve", path, "--fov", "14.8", "--catalog", "gaia_v8.0", "--json", "--out", tmp_path)
+    assert json.loads(ran.out)[0]["catalog_limit_mag"] == 8.0
+    assert (
+        "--catalog: unknown catalog 'hip'; allowed: gaia_v8.0" in skysim("solve", path, "--catalog", "hip").one_line()
+    )
+    damaged = tmp_path / "x.ecsv"
+    damaged.write_text("stars")
+    assert f"--catalog: {damaged}: not a star catalog" in skysim("solve", path, "--catalog", damaged).one_line()
 
 
 @pytest.mark.slow
@@ -470,7 +498,7 @@ BAD_IMAGES: dict[str, tuple[Any, str]] = {
     "truncated PNG": (lambda at, r: cut(r / "frame_0000.png", at), "cannot be decoded"),
     "text": (lambda at, _: text_as_png(at), "cannot be decoded"),
     "missing": (lambda at, _: at / "nosuch.fits", "no such file"),
-    "a cube": (lambda at, r: as_fits(at, np.stack([frame_of(r)] * 3)), "(3, 493, 659)"),
+    "a cube": (lambda at, r: as_fits(at, np.stack([frame_of(r)] * 4)), "(4, 493, 659)"),
     "not an image": (lambda at, _: SHEFEX, "unknown image suffix; allowed: .fits"),
 }
 

@@ -168,6 +168,11 @@ def test_three_indexes_hold_the_pairs_that_there_are(rng: np.random.Generator, m
     for build in (pair_index.build, lambda *told: sky_index.build(told[0], mag, told[1])):
         made = answered(lambda: build(vectors, most_rad), ImageError)  # noqa: B023
         assert (len(made.pair) if made else 0) == (pairs if pairs >= 3 else 0)
+    if made:  # the sky index: every pair once, in the bin of its angle
+        angle = apart(vectors, vectors)[tuple(made.pair.T)]
+        in_bin = np.repeat(np.arange(len(made.first) - 1), np.diff(made.first))
+        assert np.abs(angle / made.bin_rad - in_bin - 0.5).max() < 0.5 + 1e-6
+        assert len({tuple(sorted(pair)) for pair in made.pair.tolist()}) == pairs
     known = pair_buckets.build_pair_catalog(vectors, mag, 0.01, (0.0, most_rad)) if pairs else None
     assert known is None or known.table[-1] == len(known.pair) == pairs
     assert sorted(spatial_grid.build(vectors).row.tolist()) == list(range(count))

@@ -28,10 +28,12 @@ from skysim.core.errors import InputError
 
 def solve(
     images: Annotated[
-        list[Path] | None, typer.Argument(metavar="IMAGES", help="FITS, PNG, TIFF, JPEG or BMP files.")
+        list[Path] | None,
+        typer.Argument(metavar="IMAGES", help="FITS, PNG, TIFF, JPEG, BMP files, or folders."),
     ] = None,
     fov: Annotated[
-        float | None, typer.Option(help="Horizontal field of view in degrees, to 5 %; default: 5 to 40 are searched.")
+        float | None,
+        typer.Option(help="Horizontal field of view in degrees, to 5 %; default: EXIF's, then 5 to 40 are searched."),
     ] = None,
     camera: Annotated[
         Path | None,
@@ -44,6 +46,10 @@ def solve(
     ] = None,
     time: Annotated[
         str | None, typer.Option(help="UTC at which the images were taken, 1900 to 2100, e.g. 2012-06-22T21:00:00.")
+    ] = None,
+    catalog: Annotated[
+        str | None,
+        typer.Option(help="Star catalog: a name in data/catalogs or a file; a deep one for fields of a few degrees."),
     ] = None,
     detector: Detector = None,
     centroider: Centroider = None,
@@ -59,19 +65,18 @@ def solve(
     from skysim.apps import plate_solver
     from skysim.core import files
     from skysim.core.images import grab_frame
-    from skysim.results.files import frames
 
     stages = selected_stages(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
-    settings = plate_solver.make_solver(fov, camera, time_utc=datetime_from_iso(time), stages=stages)
+    settings = plate_solver.make_solver(fov, camera, datetime_from_iso(time), stages, catalog)
     files.make_folder(out)
-    paths = list(images or ())
+    paths = plate_solver.pictures_in(images or ())
     if live is not None:
         paths.append(out / "live.png")
         files.write_image(paths[-1], grab_frame(live))
     if not paths:
-        raise InputError("no images; give files, or --live CAMERA")
-    annotated = frames.unique_paths([out / f"{path.name}.solved.png" for path in paths])
-    jobs = progress(list(zip(paths, annotated, strict=True)), len(paths), "solving", quiet=json)
+        raise InputError("no images; give files, folders, or --live CAMERA")
+    annotated = plate_solver.annotated_paths(out, paths)
+    jobs = progress(list(zip(paths, annotated, strict=True)), len(paths), "solving", quiet=json or len(paths) == 1)
     results = [plate_solver.solve_file(path, settings, image) for path, image in jobs]
     errors = [result["status"] for result in results if result.pop("bad_input")]
     warnings = [warning for result in results if (warning := result.pop("warning"))]

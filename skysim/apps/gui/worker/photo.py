@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import datetime
 import math
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.detection.detect import check_size
+from estimator.trackers.pipeline import Report
+from estimator.trackers.star_tracker import StarTracker
 from skysim.apps import plate_solver
 from skysim.apps.gui.messages import Light, TrackerResult, Triple
 from skysim.apps.gui.worker.workbench import (
@@ -33,8 +34,6 @@ from skysim.experiments.study.store import STORE
 from skysim.results import scoring, stretch
 from skysim.simulation.run import FrameResult
 
-SUFFIXES = (".fits", ".fit", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-
 
 @dataclass(frozen=True, slots=True)
 class Photo:
@@ -42,6 +41,7 @@ class Photo:
 
     names, true_deg : of its three angles, and their true values if known
     lights, prefix : true lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
+    hint : of a refused file the likely cause, of a solved one what was assumed
     """
 
     size_px: tuple[int, int]
@@ -53,25 +53,32 @@ class Photo:
     true_deg: Triple | None = None
     lights: tuple[Light, ...] = ()
     prefix: str = "HIP"
+    hint: str = ""
 
 
 PhotoPixels = tuple[Photo, NDArray]  # with the image's pixels
+# Ends of the names of image files, as a browser's file dialog takes them: ".gz" for ".fits.gz".
+SUFFIXES = tuple(dict.fromkeys(Path(suffix).suffix for suffix in images.IMAGE_SUFFIXES))
 
 
 def photo_from_file(name: str, data: bytes, fov_deg: float | None) -> PhotoPixels:
-    """Solve an uploaded file. Raises InputError if it is no readable image."""
-    suffix = Path(name).suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InputError(f"{Path(name).name}: allowed: {', '.join(SUFFIXES)}")
+    """Solve an uploaded file, as it is viewed. Raises InputError if it is no readable image."""
+    suffixes = [suffix for suffix in images.IMAGE_SUFFIXES if name.lower().endswith(suffix)]
+    if not suffixes:
+        raise InputError(f"{Path(name).name}: allowed: {', '.join(images.IMAGE_SUFFIXES)}")
+    solver = plate_solver.make_solver(fov_deg, None)
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"upload{suffix}"
+        path = Path(folder) / f"upload{max(suffixes, key=len)}"
         path.write_bytes(data)
         try:
-            image = images.monochrome(images.read_image(path))
-            date_utc, _ = plate_solver.validated_date(images.read_date_obs(path))
+            picture = plate_solver.load_picture(path, solver)
         except InputError as error:
             raise InputError(str(error).replace(str(path), Path(name).name)) from None
-    return solve_photo(image, fov_deg, date_utc)
+    date_utc, _ = plate_solver.validated_date(picture.date_utc)
+    outcome = plate_solver.solve_picture(picture, solver, date_utc)
+    hint = plate_solver.outcome_fields(outcome, date_utc)["hint"]
+    photo, image = solved_photo(outcome.hypothesis.pixels, outcome.report, outcome.tracker)
+    return replace(photo, hint=hint), image
 
 
 def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
@@ -99,11 +106,14 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     return photo, frame.image_dn
 
 
-def solve_photo(image: NDArray, fov_deg: float | None, date_utc: datetime.datetime | None) -> PhotoPixels:
-    """Solve an image; the result's status says why if there is no solution. date_utc : None if unknown."""
+def solve_frame(image: NDArray, fov_deg: float | None) -> PhotoPixels:
+    """Solve a frame of a live camera; the result's status says why if there is no solution."""
     check_size(image)
-    solver = plate_solver.make_solver(fov_deg, None)
-    report, tracker = plate_solver.solve_array(image, solver, date_utc)
+    return solved_photo(image, *plate_solver.solve_array(image, plate_solver.make_solver(fov_deg, None), None))
+
+
+def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoPixels:
+    """What the page shows of an image that a tracker has solved or refused."""
     attitude = report.attitude
     detections = detection_views(report, matches_by_row(tracker, attitude, report.centroids.xy_px))
     solution = plate_solver.solution_fields(report) if attitude.solved else {}

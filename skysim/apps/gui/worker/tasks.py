@@ -128,7 +128,7 @@ class Worker:
         """Solve the next frame of a live camera, which stays open."""
         if self.camera is None:
             self.camera = images.LiveCamera(source)
-        return self.show_photo(photo.solve_photo(images.monochrome(self.camera.frame()), fov_deg, None))
+        return self.show_photo(photo.solve_frame(images.monochrome(self.camera.frame()), fov_deg))
 
     def release(self) -> None:
         """Close the live camera."""

@@ -88,7 +88,8 @@ class PhotoPanel:
             self.tab.log(status_text)
         solution = photo.solution
         if not solution:
-            self.show_text(f"{status_text}\nRejected: the match is not significant.", "warn")
+            hint = photo.hint or "Rejected: the match is not significant."
+            self.show_text(f"{status_text}\n{hint}", "warn")
             return
         pointing = f"RA {solution['ra_deg']:.4f}°  Dec {solution['dec_deg']:+.4f}°  roll {solution['roll_deg']:.3f}°"
         quality = f"field {solution['fov_deg']:.3f}°  {solution['matches']} stars  rms {solution['rms_arcsec']:.1f}″"

@@ -1,0 +1,222 @@
+"""The likely cause of a refusal, and what to do about it.
+
+Causes are tried from the certain to the vague. Some are tried by solving: the mirrored sky, and other fields of view.
+Such a solution names the cause, and is never the answer.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.core.camera import Camera
+from estimator.core.types import Attitude, Blobs, Centroids, FramePriors
+from estimator.detection.detect import DETECTORS
+from estimator.identification.chance import MIN_EVIDENCE_MATCHES
+from estimator.trackers.pipeline import Clock
+from skysim.apps.plate_solver.solver import FIELD_SEARCH, FieldSearch, Solver, best_attitude, solve_centroids
+
+WIDE_SEARCH = FieldSearch(widest_deg=100.0, narrowest_deg=FIELD_SEARCH.widest_deg, trackers=3)
+MIN_CATALOG_STARS, ENOUGH_CATALOG_STARS = 6.0, 15.0  # expected in a field: hardly solvable below, safe above
+# Stars of the Gaia catalogs of `skysim catalog build`: 45,709 to V 8, 130,337 to V 9, 357,037 to V 10, their limit.
+GAIA_STARS, GAIA_DEX_PER_MAG, GAIA_LIMITS_MAG = 45_709, 0.45, (8, 9, 10)
+OVEREXPOSED_SHARE = 0.3  # of pixels at the greatest value
+SHAPED_BLOBS, MIN_BLOBS, SAME_SHARE = 6, 3, 0.5  # of the brightest blobs, so many and this share have one shape
+BLUR_PX, SAME_SIZE = 14.0, 0.3  # least diameter of defocused stars (of sharp ones 4 to 10 px), and its relative spread
+FILLED = 0.6  # least share of its box that a defocused star fills; a disk fills 0.79
+TRAIL_PX, THIN = 20.0, 6.0  # least length of a trail, and least ratio of its square to the area; of a disk it is 2.5
+SAME_ANGLE_RAD = 0.1  # greatest difference between the directions of parallel trails
+TRAILS = "trails of {:.0f} px: a shorter exposure, a steadier camera, or a mount that tracks"
+FEW_LIGHTS = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A monochrome image that was refused: its centroids, and the solvers that were tried.
+
+    row_order_known : False if both row orders were tried, and with them the mirrored sky
+    """
+
+    image: NDArray
+    centroids: Centroids
+    solvers: tuple[Solver, ...]
+    date_utc: datetime.datetime | None = None
+    row_order_known: bool = True
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.image.shape[1], self.image.shape[0]
+
+    @property
+    def can_be_tried(self) -> bool:
+        """Whether there are lights enough for a solution."""
+        return len(self.centroids) >= MIN_EVIDENCE_MATCHES
+
+    def blobs(self) -> Blobs:
+        """What the detector found, with what cannot be a star."""
+        settings = self.solvers[0].settings
+        detect = DETECTORS[settings.detector]
+        priors = FramePriors(None, settings.saturation)
+        return detect(self.image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, priors)
+
+
+def likely_cause(refusal: Refusal) -> str:
+    """The likeliest cause in one line, with a remedy."""
+    return next(text for cause in CAUSES if (text := cause(refusal)))
+
+
+def shallow_catalog(refusal: Refusal) -> str:
+    """There are lights enough, but few stars of the catalog in the widest field that was tried, by its mean density."""
+    solver = max(refusal.solvers, key=lambda one: one.tried_fov_deg(*refusal.size_px)[1])
+    narrow_deg, wide_deg = solver.tried_fov_deg(*refusal.size_px)
+    share = sphere_share(refusal.size_px, (narrow_deg + wide_deg) / 2)
+    expected = len(solver.stars) * share
+    if not solver.field_is_known or expected >= MIN_CATALOG_STARS or not refusal.can_be_tried:
+        return ""
+    return (
+        f"the catalog is too shallow for this field: {expected:.1f} of its {len(solver.stars)} stars are expected"
+        f" there; take {deeper_catalog(solver, share)}"
+    )
+
+
+def sphere_share(size_px: tuple[int, int], fov_deg: float) -> float:
+    """Share of the sphere of an image with this horizontal field: the solid angle of a pyramid over 4 pi."""
+    camera = Camera.from_fov(*size_px, math.radians(fov_deg))
+    a, b = (side / 2 / camera.focal_px for side in size_px)
+    return math.asin(a * b / math.sqrt((1 + a * a) * (1 + b * b))) / math.pi
+
+
+def deeper_catalog(solver: Solver, share: float) -> str:
+    """The remedy for a field that is this share of the sphere: the shallowest Gaia catalog with enough stars."""
+    first, last = GAIA_LIMITS_MAG[0], GAIA_LIMITS_MAG[-1]
+    for limit in (limit for limit in GAIA_LIMITS_MAG if limit > solver.stars.v_mag[-1]):
+        if GAIA_STARS * 10 ** (GAIA_DEX_PER_MAG * (limit - first)) * share >= ENOUGH_CATALOG_STARS:
+            build = "" if limit == first else f", after `skysim catalog build --source gaia --limit {limit}`"
+            return f"--catalog gaia_v{limit}.0{build}"
+    return f"a wider picture: the deepest catalog, to V {last}, has too few as well"
+
+
+def mirrored(refusal: Refusal) -> str:
+    """It solves with its columns reversed; the centroids' are reversed here, not the image's."""
+    if not (refusal.can_be_tried and refusal.row_order_known):
+        return ""
+    flipped = reversed_columns(refusal.centroids, refusal.size_px[0])
+    for solver in refusal.solvers:
+        attitude, _ = solve_centroids(flipped, solver, refusal.size_px, refusal.date_utc, Clock())
+        if attitude.solved:
+            return "perhaps mirrored: it solves when flipped left to right; flip it, and solve that"
+    return ""
+
+
+def reversed_columns(centroids: Centroids, width_px: int) -> Centroids:
+    """The centroids of the image with its columns in reverse order."""
+    xy_px = centroids.xy_px * [-1, 1] + [width_px - 1, 0]
+    covariance_px2 = centroids.covariance_px2
+    if covariance_px2 is not None:
+        covariance_px2 = covariance_px2 * [[1, -1], [-1, 1]]
+    return replace(centroids, xy_px=xy_px, covariance_px2=covariance_px2)
+
+
+def other_field(refusal: Refusal) -> str:
+    """It solves with another field of view than those that were tried; with little effort only."""
+    if not refusal.can_be_tried:
+        return ""
+    for search in (FIELD_SEARCH, WIDE_SEARCH):
+        if any(solver.search is search and not solver.field_is_known for solver in refusal.solvers):
+            continue
+        attitude = solve_with(search, refusal)
+        if attitude.solved:
+            assert attitude.camera is not None
+            fov_deg = math.degrees(attitude.camera.fov_rad)
+            if search is WIDE_SEARCH:
+                return f"perhaps wider than {FIELD_SEARCH.widest_deg:g}°: it solves with --fov {fov_deg:.1f}"
+            return f"perhaps another field of view: it solves with --fov {fov_deg:.1f}"
+    return ""
+
+
+def solve_with(search: FieldSearch, refusal: Refusal) -> Attitude:
+    """The attitude by the least effort with fields of another range."""
+    unknown = replace(refusal.solvers[0], fov_deg=None, camera=None, opencv_calibration=None, search=search)
+    trackers = unknown.trackers(*refusal.size_px, refusal.date_utc)
+    return best_attitude(refusal.centroids, trackers, Clock(), 0, search.trackers)[0]
+
+
+def overexposed(refusal: Refusal) -> str:
+    """A large part of the image is at its greatest value."""
+    brightest = refusal.image.max()
+    share = np.count_nonzero(refusal.image == brightest) / refusal.image.size
+    if share < OVEREXPOSED_SHARE:
+        return ""
+    return f"overexposed: {share:.0%} of the pixels are at {brightest:g}; a shorter exposure, or a darker sky"
+
+
+def trailed(refusal: Refusal) -> str:
+    """The brightest blobs are parallel lines: the detector's streak, or most of a few are long for their area."""
+    blobs = refusal.blobs()
+    if blobs.streak_px is not None:
+        return TRAILS.format(math.hypot(*blobs.streak_px))
+    sides_px, area_px = brightest_shapes(blobs)
+    lengths_px, angle_rad = np.hypot(*sides_px.T), np.arctan2(*sides_px.T)
+    lines = (lengths_px >= TRAIL_PX) & (lengths_px**2 >= THIN * area_px)
+    if not lines.any():
+        return ""
+    lines &= np.abs(angle_rad - np.median(angle_rad[lines])) < SAME_ANGLE_RAD
+    return TRAILS.format(np.median(lengths_px[lines])) if is_most(lines) else ""
+
+
+def out_of_focus(refusal: Refusal) -> str:
+    """The brightest blobs are large, filled, and of one size, whatever their brightness."""
+    sides_px, area_px = brightest_shapes(refusal.blobs())
+    diameter_px = np.sqrt(4 / np.pi * area_px)
+    large = (diameter_px >= BLUR_PX) & (area_px >= FILLED * sides_px.prod(axis=1))
+    if not large.any():
+        return ""
+    typical_px = float(np.median(diameter_px[large]))
+    large &= np.abs(diameter_px / typical_px - 1) < SAME_SIZE
+    return f"blobs of {typical_px:.0f} px: out of focus?" if is_most(large) else ""
+
+
+def brightest_shapes(blobs: Blobs) -> tuple[NDArray, NDArray]:
+    """Width and height, (N, 2), and area, (N,), of the brightest blobs, in pixels."""
+    box_px = blobs.box_px[:SHAPED_BLOBS]
+    return box_px[:, 2:] - box_px[:, :2] + 1, blobs.area_px[:SHAPED_BLOBS]
+
+
+def is_most(chosen: NDArray) -> bool:
+    """Whether these are most of the brightest blobs, and not too few."""
+    return bool(np.count_nonzero(chosen) >= MIN_BLOBS and chosen.mean() >= SAME_SHARE)
+
+
+def few_lights(refusal: Refusal) -> str:
+    """There is little to identify."""
+    count = len(refusal.centroids)
+    if count >= FEW_LIGHTS:
+        return ""
+    return f"too few lights ({count}): a longer exposure or a higher gain, sharper focus; is it the night sky?"
+
+
+def unknown_cause(refusal: Refusal) -> str:
+    """No cause was found: what is left."""
+    solver = refusal.solvers[0]
+    narrow_deg = min(FIELD_SEARCH.narrowest_deg, *(one.tried_fov_deg(*refusal.size_px)[0] for one in refusal.solvers))
+    text = (
+        f"no cause found: no field of {narrow_deg:g}° to {WIDE_SEARCH.widest_deg:g}° fits, nor the mirrored picture;"
+        " are there trees, lamps or clouds? crop them away"
+    )
+    share = sphere_share(refusal.size_px, solver.tried_fov_deg(*refusal.size_px)[0])
+    if len(solver.stars) * share >= ENOUGH_CATALOG_STARS:
+        return text
+    field = "or take " if solver.field_is_known else f"if the field is below {narrow_deg:g}°, give --fov and "
+    return f"{text}; {field}{deeper_catalog(solver, share)}"
+
+
+CAUSES: tuple[Callable[[Refusal], str], ...] = (
+    *(shallow_catalog, mirrored, other_field),
+    *(overexposed, trailed, out_of_focus, few_lights, unknown_cause),
+)

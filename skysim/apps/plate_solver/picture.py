@@ -1,0 +1,211 @@
+"""From a picture's file to its solution: load it as it is viewed, solve its hypotheses, diagnose a refusal."""
+
+from __future__ import annotations
+
+import datetime
+import math
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.core.errors import ImageError
+from estimator.detection.detect import check_size
+from estimator.trackers.pipeline import Report
+from estimator.trackers.star_tracker import StarTracker
+from skysim.apps.plate_solver.solution import PlateSolution, annotated_image, solution_fields
+from skysim.apps.plate_solver.solver import FOV_LIMITS_DEG, Solver, make_solver, solve_array, validated_date
+from skysim.core import files, images
+from skysim.core.errors import InputError
+
+ANNOTATED = ".annotated.png"
+# The focal length of the 35 mm camera (36 x 24 mm) with the same diagonal field: CIPA DCG-001, to which Exif's
+# FocalLengthIn35mmFilm (CIPA DC-008) is written; whole millimeters. Some makers convert the longer side instead, which
+# differs by 4 % for sensors of 4:3; the rest is rounding, distortion and a small crop.
+DIAGONAL_35MM = math.hypot(36, 24)
+FOCAL_35MM_UNCERTAINTY = 0.10
+TOP_DOWN = "no ROWORDER in the header: its first row is the highest here, not the lowest as the standard recommends"
+
+
+class Hypothesis(NamedTuple):
+    """One reading of a picture: the pixels as they would be viewed, the solver for its field, and what it assumes."""
+
+    pixels: NDArray
+    solver: Solver
+    assumption: str = ""
+
+
+class Outcome(NamedTuple):
+    """The hypothesis that was solved, or else the first one, with its report and tracker; all hypotheses."""
+
+    hypothesis: Hypothesis
+    report: Report
+    tracker: StarTracker
+    tried: list[Hypothesis]
+
+
+def solve(
+    path: str | Path,
+    *,
+    fov_deg: float | None = None,
+    camera: str | Path | None = None,
+    time_utc: datetime.datetime | None = None,
+    catalog: str | Path | None = None,
+) -> PlateSolution:
+    """Solve the attitude of an image file of the sky, lost in space. Public as `skysim.solve`.
+
+    fov_deg  : horizontal field of view to 5 %; if neither it nor `camera` is given, the field that EXIF tells, and 5 to
+        40 degrees
+    camera   : a scene, a camera file or an OpenCV calibration in place of fov_deg
+    time_utc : when the image was taken; the FITS header's date if left out
+    catalog  : name or file of a deeper star catalog, for fields of a few degrees
+
+    Raises InputError with one line for an image that cannot be read.
+    """
+    names = Path(camera) if camera else None, str(catalog) if catalog else None
+    solver = make_solver(fov_deg, names[0], time_utc=time_utc, catalog=names[1])
+    result = solve_file(Path(path), solver, None)
+    if result["bad_input"]:
+        raise InputError(result["status"])
+    return PlateSolution(**{name.name: result[name.name] for name in fields(PlateSolution)})
+
+
+def pictures_in(paths: Iterable[Path]) -> list[Path]:
+    """The files, with every folder replaced by its image files, sorted; without annotated images of an earlier call.
+
+    Raises InputError for a folder without an image.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if not path.is_dir():
+            found.append(path)
+            continue
+        names = sorted(child for child in path.iterdir() if child.name.lower().endswith(images.IMAGE_SUFFIXES))
+        names = [child for child in names if child.name[0] != "." and not child.name.endswith(ANNOTATED)]
+        if not names:
+            raise InputError(f"{path}: a folder without images; allowed: {', '.join(images.IMAGE_SUFFIXES)}")
+        found += names
+    return found
+
+
+def annotated_paths(folder: Path, paths: list[Path]) -> list[Path]:
+    """Paths of the annotated images: named as the pictures, with another suffix.
+
+    If two pictures differ in suffix only, the suffix stays in the name; if they have one name, a number is appended.
+    """
+    stems = [stem_of(path) for path in paths]
+    names = [path.name if stems.count(stem) > 1 else stem for path, stem in zip(paths, stems, strict=True)]
+    repeats = [names[:n].count(name) for n, name in enumerate(names)]
+    return [folder / f"{name}{f'-{n + 1}' if n else ''}{ANNOTATED}" for name, n in zip(names, repeats, strict=True)]
+
+
+def stem_of(path: Path) -> str:
+    """The file's name without the suffix of its image format."""
+    suffixes = [suffix for suffix in images.IMAGE_SUFFIXES if path.name.lower().endswith(suffix)]
+    return path.name.removesuffix(path.name[-len(max(suffixes, key=len)) :]) if suffixes else path.stem
+
+
+def solve_file(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
+    """Solve one file and return the fields of `skysim solve --json`. Writes the annotated PNG if `annotated` is given.
+
+    An unreadable image does not raise, so that the files after it are still solved: its error line becomes `status`,
+    and `bad_input` is true (for the exit code). `warning` says why the header's date was ignored, if it was.
+    """
+    result: dict[str, Any] = {"file": str(path), **asdict(PlateSolution()), "time_ms": None, "warning": ""}
+    begin = time.perf_counter()
+    try:
+        picture = load_picture(path, solver)
+        date_utc, warning = validated_date(picture.date_utc)
+        if warning and not solver.time_utc:
+            result["warning"] = f"{path}: DATE-OBS {warning}: ignored"
+        outcome = solve_picture(picture, solver, date_utc)
+    except (InputError, ImageError) as error:
+        message = str(error)
+        result["status"] = message if message.startswith(str(path)) else f"{path}: {message}"
+        return result | {"bad_input": True}
+    result["time_ms"] = 1e3 * (time.perf_counter() - begin)
+    result |= {"bad_input": False} | outcome_fields(outcome, date_utc)
+    if annotated:
+        files.write_image(annotated, annotated_image(outcome.hypothesis.pixels, outcome.report, outcome.tracker))
+    return result
+
+
+def load_picture(path: Path, solver: Solver) -> images.Picture:
+    """The picture as it is viewed, in monochrome. Raises InputError or ImageError if it cannot be solved."""
+    picture = images.read_picture(path)
+    check_image(path, picture.pixels, solver)
+    pixels = images.monochrome(picture.pixels)
+    check_size(pixels)
+    return replace(picture, pixels=pixels)
+
+
+def check_image(path: Path, image: NDArray, solver: Solver) -> None:
+    """Check the image's size against the known camera, and for a scene's camera also its channels and bit depth.
+
+    Raises InputError if the image cannot come from this camera.
+    """
+    camera = solver.camera
+    if camera and image.ndim != 2:
+        raise InputError(f"{path}: a color image of shape {image.shape}; this camera's are monochrome")
+    if camera and image.dtype == np.uint8 and camera.detector.bits > 8:
+        bits = camera.detector.bits
+        raise InputError(f"{path}: an 8-bit image; this camera's have {bits} bits, in 16-bit FITS, PNG or TIFF")
+    sensor = camera or solver.opencv_calibration
+    if sensor and image.shape[:2] != (sensor.height_px, sensor.width_px):
+        size = f"{image.shape[1]}x{image.shape[0]}"
+        raise InputError(f"{path}: {size} pixels; this camera's are {sensor.width_px}x{sensor.height_px}")
+
+
+def solve_picture(picture: images.Picture, solver: Solver, date_utc: datetime.datetime | None) -> Outcome:
+    """Solve the hypotheses about a monochrome picture in turn, up to the first that is solved."""
+    tried = hypotheses(picture, solver)
+    outcomes = []
+    for hypothesis in tried:
+        outcomes.append(Outcome(hypothesis, *solve_array(hypothesis.pixels, hypothesis.solver, date_utc), tried))
+        if outcomes[-1].report.attitude.solved:
+            return outcomes[-1]
+    return outcomes[0]
+
+
+def hypotheses(picture: images.Picture, solver: Solver) -> list[Hypothesis]:
+    """What a picture may show, the likeliest first: its field by EXIF, or an unknown one; both row orders, if unknown.
+
+    A field or a camera of the user's takes precedence over EXIF.
+    """
+    height_px, width_px = picture.pixels.shape
+    solvers, readings = [solver], [(picture.pixels, "")]
+    if picture.focal_35mm and not solver.field_is_known:
+        focal_px = picture.focal_35mm / DIAGONAL_35MM * math.hypot(width_px, height_px)
+        fov_deg = math.degrees(2 * math.atan((width_px - 1) / 2 / focal_px))
+        if FOV_LIMITS_DEG[0] <= fov_deg <= FOV_LIMITS_DEG[1]:
+            solvers.insert(0, replace(solver, fov_deg=fov_deg, fov_uncertainty=FOCAL_35MM_UNCERTAINTY))
+    if not picture.row_order_known:
+        readings.append((np.ascontiguousarray(picture.pixels[::-1]), TOP_DOWN))
+    count = len(solvers) * len(readings)
+    return [Hypothesis(pixels, replace(one, hypotheses=count), text) for one in solvers for pixels, text in readings]
+
+
+def outcome_fields(outcome: Outcome, date_utc: datetime.datetime | None) -> dict[str, Any]:
+    """The fields of PlateSolution: what was seen and tried, the solution, or the likely cause of a refusal."""
+    (pixels, solver, assumption), report = outcome.hypothesis, outcome.report
+    height_px, width_px = pixels.shape
+    solvers = {one.solver.fov_deg: one.solver for one in outcome.tried}.values()
+    seen = {
+        "status": report.attitude.status,
+        "lights": len(report.centroids),
+        "brightest_dn": float(pixels.max()),
+        "background_dn": float(np.median(pixels)),
+        "tried_fov_deg": [one.tried_fov_deg(width_px, height_px) for one in solvers],
+        "catalog_limit_mag": round(float(solver.stars.v_mag[-1]), 1),
+    }
+    if report.attitude.solved:
+        return seen | solution_fields(report) | {"hint": assumption}
+    from skysim.apps.plate_solver import diagnosis
+
+    rows_known = len({id(one.pixels) for one in outcome.tried}) == 1
+    refusal = diagnosis.Refusal(pixels, report.centroids, tuple(solvers), date_utc, rows_known)
+    return seen | {"hint": diagnosis.likely_cause(refusal)}

@@ -1,0 +1,302 @@
+"""Plate solver: right ascension, declination and roll of images from any camera, lost in space.
+
+If the field of view is known (a camera file, an OpenCV calibration or `--fov`), one `StarTracker` solves the image.
+Otherwise 5 to 40 degrees are split into N overlapping ranges of focal length in geometric progression, each searched
+by a tracker that fits the focal length within its range. The image's stars are detected once; all trackers are tried
+with little effort before any is tried with more.
+
+Every tracker is one more opportunity for a false match. With P the probability that the best match is due to chance,
+it is accepted if P <= P_accept / N (Bonferroni), and if no solution elsewhere on the sky has a P less than 1000 times
+as large (`FieldSearch.margin_dex`). N includes the hypotheses about a picture (`picture.py`), each of which is solved.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
+
+from estimator.catalog import catalog as star_catalog
+from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
+from estimator.core.types import Attitude, Centroids
+from estimator.identification.chance import ACCEPT_LOG10_CHANCE
+from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid
+from estimator.trackers.star_tracker import NO_MATCH, StarTracker
+from skysim.core.errors import InputError, unknown_name
+from skysim.core.paths import CATALOGS
+from skysim.core.utc import check_year
+
+if TYPE_CHECKING:
+    from skysim.scene.camera import CameraConfig
+    from skysim.scene.opencv_calibration import Calibration
+
+# Relative uncertainty of the focal length. An OpenCV chessboard calibration gives it to about 0.1 %.
+CALIBRATED_UNCERTAINTY = 0.003
+FOV_UNCERTAINTY = 0.055  # 5 % that --fov allows, plus 0.5 % for the definition of the field of view
+FOV_LIMITS_DEG = 1.0, 120.0
+CATALOG = CATALOGS / "hipparcos_hp6.5.ecsv"
+DEFAULT_EPOCH = datetime.datetime(2020, 1, 1, 12)
+
+
+@dataclass(frozen=True, slots=True)
+class FieldSearch:
+    """Options of the search over unknown horizontal fields of view.
+
+    The ranges are wide because one index of star pairs serves fields 1.5 times as wide, and a search takes as long
+    for a narrow range.
+
+    widest_deg, narrowest_deg : limits of the fields of view
+    trackers   : number of trackers that share this range
+    overlap    : of neighboring ranges, as a fraction of the focal length
+    decisive_log10_chance : a solution below this ends the search without trying other fields of view
+    margin_dex : by which a solution must beat those with another attitude
+    same_attitude_rad : solutions that differ by less than this are the same
+    """
+
+    widest_deg: float = 40.0
+    narrowest_deg: float = 5.0
+    trackers: int = 5
+    overlap: float = 0.01
+    decisive_log10_chance: float = -10.0
+    margin_dex: float = 3.0
+    same_attitude_rad: float = math.radians(0.2)
+
+    def cameras(self, width_px: int, height_px: int) -> list[tuple[Camera, float]]:
+        """The cameras to try, each with its relative focal-length uncertainty, from the middle of the range outward."""
+        count = self.trackers
+        widest, narrowest = (math.tan(math.radians(deg) / 2) for deg in (self.widest_deg, self.narrowest_deg))
+        ratio = (widest / narrowest) ** (1 / count)
+        from_middle_out = sorted(range(count), key=lambda n: abs(n - (count - 1) / 2))
+        # A tracker of focal length f covers f (1 - u) to f (1 + u): u = (ratio - 1) / (ratio + 1) makes neighbors meet.
+        uncertainty = (ratio - 1) / (ratio + 1)
+        # Half-field tangents: range n begins at widest / ratio^n, where the focal length is f (1 - u).
+        tangents = [widest / ratio**n * (1 - uncertainty) for n in from_middle_out]
+        return [
+            (Camera.from_fov(width_px, height_px, 2 * math.atan(tangent)), uncertainty + self.overlap)
+            for tangent in tangents
+        ]
+
+
+FIELD_SEARCH = FieldSearch()
+
+
+@dataclass(frozen=True, slots=True)
+class Solver:
+    """Settings of the plate solver: a field of view known to 5 %, or a camera known exactly or by calibration; with
+    neither, `search` says which fields are tried.
+
+    time_utc : when the images were taken; None takes the date of each FITS header. Without any date the epoch is
+        2020, and stellar aberration (20") is left out because its direction depends on the season.
+    fov_uncertainty : relative, of the focal length that follows from fov_deg
+    hypotheses : number of alternative readings of one picture that are solved in turn
+    tracker_cache : the trackers for the last image size and date, by camera and uncertainty
+    """
+
+    fov_deg: float | None
+    camera: CameraConfig | None
+    stars: star_catalog.StarCatalog
+    settings: Settings
+    time_utc: datetime.datetime | None = None
+    opencv_calibration: Calibration | None = None
+    fov_uncertainty: float = FOV_UNCERTAINTY
+    search: FieldSearch = FIELD_SEARCH
+    hypotheses: int = 1
+    tracker_cache: dict[Any, dict[Any, StarTracker]] = field(default_factory=dict, compare=False, repr=False)
+
+    @property
+    def field_is_known(self) -> bool:
+        """Whether a single tracker solves the image."""
+        return bool(self.camera or self.opencv_calibration or self.fov_deg)
+
+    def candidate_cameras(self, width_px: int, height_px: int) -> list[tuple[Camera, float]]:
+        """Cameras to try for this image size, each with its relative focal-length uncertainty, the likeliest first."""
+        if self.camera:
+            from skysim.tracking.onboard_model import calibration
+
+            return [(calibration(self.camera), 0.0)]
+        if lens := self.opencv_calibration:
+            camera = Camera(lens.width_px, lens.height_px, lens.focal_px, lens.center_px, lens.distortion)
+            return [(camera, CALIBRATED_UNCERTAINTY)]
+        if self.fov_deg:
+            return [(Camera.from_fov(width_px, height_px, math.radians(self.fov_deg)), self.fov_uncertainty)]
+        return self.search.cameras(width_px, height_px)
+
+    def tried_fov_deg(self, width_px: int, height_px: int) -> tuple[float, float]:
+        """Narrowest and widest horizontal field that is tried for this image size."""
+        if not self.field_is_known:
+            return self.search.narrowest_deg, self.search.widest_deg
+        ((camera, uncertainty),) = self.candidate_cameras(width_px, height_px)
+        fields_rad = (camera.zoomed(1 + change).fov_rad for change in (uncertainty, -uncertainty))
+        narrow_deg, wide_deg = (round(math.degrees(field_rad), 2) for field_rad in fields_rad)
+        return narrow_deg, wide_deg
+
+    def trackers(self, width_px: int, height_px: int, date_utc: datetime.datetime | None) -> Iterator[StarTracker]:
+        """Yield the trackers for an image of this size and date: one, or one per range of fields of view.
+
+        Trackers are built when first needed and cached until an image of another size or date comes.
+        """
+        date_utc = self.time_utc or date_utc
+        if (width_px, height_px, date_utc) not in self.tracker_cache:
+            self.tracker_cache.clear()  # keep the trackers of one image size and date only
+        cached = self.tracker_cache.setdefault((width_px, height_px, date_utc), {})
+        for camera, uncertainty in self.candidate_cameras(width_px, height_px):
+            if (camera, uncertainty) not in cached:
+                vectors = (
+                    star_catalog.apparent(self.stars, star_catalog.on_earth(date_utc))
+                    if date_utc
+                    else star_catalog.at_epoch(self.stars, DEFAULT_EPOCH.year)
+                )
+                tracker = StarTracker(camera, self.stars, vectors, self.settings, uncertainty)
+                cached[camera, uncertainty] = tracker
+            yield cached[camera, uncertainty]
+
+
+def make_solver(
+    fov_deg: float | None,
+    camera_file: Path | None,
+    time_utc: datetime.datetime | None = None,
+    stages: Mapping[str, str] | None = None,
+    catalog: str | None = None,
+) -> Solver:
+    """Build a Solver from user input. Raises InputError with one line.
+
+    stages  : names of algorithms by stage (`check_stages`); the tracker's defaults for the others
+    catalog : name or file of a star catalog; the shipped one to V 6.5 if left out
+    """
+    low, high = FOV_LIMITS_DEG
+    if fov_deg is not None and camera_file is not None:
+        raise InputError("give either --fov DEG or --camera FILE")
+    if fov_deg is not None and not low <= fov_deg <= high:
+        raise InputError(f"--fov {fov_deg:g}: allowed: the horizontal field of view, {low:g} to {high:g} degrees")
+    time_utc, warning = validated_date(time_utc)
+    if warning:
+        raise InputError(f"--time: {warning}")
+    camera, lens, settings = read_camera(camera_file) if camera_file else (None, None, Settings())
+    if stages:
+        check_stages(stages)
+        settings = replace(settings, **stages)  # type: ignore[arg-type]
+    return Solver(fov_deg, camera, read_catalog(catalog), settings, time_utc, lens)
+
+
+def check_stages(stages: Mapping[str, str]) -> None:
+    """Raise InputError for the name of an unknown algorithm; stages are detector, centroider, identifier, solver."""
+    from skysim.tracking.settings import STAR_ALGORITHMS
+
+    for stage, name in stages.items():
+        if name not in STAR_ALGORITHMS[stage]:
+            raise InputError(f"--{stage}: {unknown_name(stage, name, STAR_ALGORITHMS[stage])}")
+
+
+def read_camera(path: Path) -> tuple[CameraConfig | None, Calibration | None, Settings]:
+    """The camera of a scene (its file, or its name) or of a camera file, or else an OpenCV calibration; the settings.
+
+    Raises InputError with one line.
+    """
+    from skysim.camera.detector.detector import saturation_dn
+    from skysim.scene import loader
+    from skysim.scene import opencv_calibration as opencv
+
+    if opencv.looks_like_calibration(path):
+        return None, opencv.read(path), Settings()
+    is_file = path.suffix or path.exists()  # else the name of a shipped scene
+    camera = loader.load_camera(path if is_file else loader.find(str(path)))
+    return camera, None, Settings(gain_e_dn=camera.detector.gain_e_dn, saturation=saturation_dn(camera.detector))
+
+
+def read_catalog(name: str | None) -> star_catalog.StarCatalog:
+    """The catalog of `--catalog`, a name in data/catalogs/ or a file; the shipped one for None. Raises InputError."""
+    if name is not None:
+        from skysim.tracking.onboard_model import onboard_catalog
+
+        return onboard_catalog("--catalog", name)
+    try:
+        return star_catalog.read(CATALOG)
+    except ImageError as error:
+        raise InputError(f"{error}; make it with: skysim catalog build") from None
+
+
+def validated_date(date_utc: datetime.datetime | None) -> tuple[datetime.datetime | None, str]:
+    """Return (date in UTC, ""), or (None, reason) for a date outside the supported range; (None, "") without a date."""
+    try:
+        return (check_year(date_utc) if date_utc else None), ""
+    except ValueError as error:
+        return None, str(error)
+
+
+def solve_array(image: NDArray, solver: Solver, date_utc: datetime.datetime | None) -> tuple[Report, StarTracker]:
+    """Solve one monochrome image and return the report and the tracker that made it. date_utc : None if unknown."""
+    height_px, width_px = image.shape
+    first = next(solver.trackers(width_px, height_px, date_utc))
+    clock = Clock()
+    centroids = detect_and_centroid(image, first.camera, solver.settings, clock)  # of the camera only the size is used
+    attitude, tracker = solve_centroids(centroids, solver, (width_px, height_px), date_utc, clock)
+    return Report(attitude, centroids, clock.seconds), tracker
+
+
+def solve_centroids(
+    centroids: Centroids,
+    solver: Solver,
+    size_px: tuple[int, int],
+    date_utc: datetime.datetime | None,
+    clock: Clock,
+) -> tuple[Attitude, StarTracker]:
+    """Solve the centroids of an image of (width, height) with every tracker of the solver, as `solve_array`."""
+    first = next(solver.trackers(*size_px, date_utc))
+    if solver.field_is_known:
+        attitude = first.solve_centroids(centroids, clock)
+        allowed = ACCEPT_LOG10_CHANCE - math.log10(solver.hypotheses)
+        return (Attitude(NO_MATCH) if log10_chance(attitude) > allowed and attitude.solved else attitude), first
+    tries = solver.search.trackers * solver.hypotheses
+    for effort in range(first.efforts):  # try all fields of view quickly before trying any thoroughly
+        trackers = solver.trackers(*size_px, date_utc)
+        attitude, tracker = best_attitude(centroids, trackers, clock, effort, tries)
+        if attitude.solved:
+            break
+    return attitude, tracker
+
+
+def best_attitude(
+    centroids: Centroids,
+    trackers: Iterator[StarTracker],
+    clock: Clock,
+    effort: int,
+    tries: int = FIELD_SEARCH.trackers,
+) -> tuple[Attitude, StarTracker]:
+    """Return the most significant attitude among those of trackers with different fields of view, and its tracker.
+
+    The accepted probability of chance is divided by the number of tries. The best attitude must also beat every
+    different attitude by `margin_dex`; otherwise the result is NO_MATCH.
+    """
+    solutions: list[tuple[Attitude, StarTracker]] = []
+    for tracker in trackers:
+        attitude = tracker.solve_centroids(centroids, clock, effort)
+        if log10_chance(attitude) <= FIELD_SEARCH.decisive_log10_chance:
+            return attitude, tracker
+        if attitude.solved:
+            solutions.append((attitude, tracker))
+    if not solutions:
+        return attitude, tracker
+    best, best_tracker = min(solutions, key=lambda solution: log10_chance(solution[0]))
+    # The same attitude from neighboring trackers, whose ranges overlap, is no rival.
+    rivals = [log10_chance(other) for other, _ in solutions if not same_attitude(other, best)]
+    threshold = ACCEPT_LOG10_CHANCE - math.log10(tries)  # Bonferroni correction
+    significant = log10_chance(best) <= min(threshold, min(rivals, default=0.0) - FIELD_SEARCH.margin_dex)
+    return (best if significant else Attitude(NO_MATCH)), best_tracker
+
+
+def log10_chance(attitude: Attitude) -> float:
+    """log10 of the probability that the match is due to chance; 0 without a match."""
+    return attitude.match.log10_chance if attitude.match else 0.0
+
+
+def same_attitude(first: Attitude, second: Attitude) -> bool:
+    """Return True if two solved attitudes differ by less than `same_attitude_rad`."""
+    assert first.cam_from_ref is not None
+    assert second.cam_from_ref is not None
+    return bool((first.cam_from_ref * second.cam_from_ref.inv()).magnitude() < FIELD_SEARCH.same_attitude_rad)
