@@ -24,7 +24,7 @@ from estimator.detection.detect import DETECTORS
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers.dome_tracker import IDENTIFIERS as DOME_IDENTIFIERS
 from skysim.apps.gui.page.forms import file_value, yaml_line
-from skysim.core.paths import CATALOGS, ROOT
+from skysim.core.paths import ROOT
 from skysim.core.tolerance import ErrorSchema
 from skysim.core.units import ConfigModel, si_unit
 from skysim.experiments.study.plan import Study
@@ -59,7 +59,8 @@ def stems(folder: Path, ending: str) -> str:
     return names(sorted(path.stem for path in folder.glob(f"*.{ending}")))
 
 
-CATALOG = f"{stems(CATALOGS, 'ecsv')}, or an `.ecsv` file of `skysim catalog build`"
+SHIPPED = ("gaia_v8.0", "hipparcos_hp6.5")  # the folder may hold others, built here
+CATALOG = f"{names(SHIPPED)}, or an `.ecsv` file of `skysim catalog build`"
 # What a text may be, where the model does not say it.
 TEXTS = {
     "title": "any text",

@@ -96,7 +96,7 @@ def check_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})) -
         return Verdict(str(path), fault=str(error))
 
 
-def describe_file(path: Path, programs: Mapping[str, str]) -> tuple[str, tuple[str, ...]]:
+def describe_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})) -> tuple[str, tuple[str, ...]]:
     """Return a description of the file and warnings. Raises InputError with one line."""
     from skysim.core.yaml_reader import is_file, read_yaml
     from skysim.scene import opencv_calibration
