@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -90,6 +91,26 @@ def load(
         each = [scene.tracker.model_copy(update={"name": tracker}) for tracker in trackers]
         unused.check_overrides([scene.model_copy(update={"tracker": tracker}) for tracker in each], values)
     return scene
+
+
+def used_programs(options: list[str] | None, names: Iterable[str | None]) -> dict[str, str]:
+    """The commands of --program by name. Raises InputError for a name that is not among those used."""
+    from skysim.tracking.external import process
+
+    programs, used = process.program_commands(options), set(names)
+    for name in programs:
+        if name not in used:
+            raise InputError(
+                f"--program {name}: has no effect: nothing has this name; allowed: that of --tracker, tracker.name or"
+                " motion.control.law"
+            )
+    return programs
+
+
+def scene_names(scene: Scene) -> tuple[str | None, str | None]:
+    """The names of the scene's tracker and of its controller, None without one."""
+    control = scene.motion.control
+    return scene.tracker.name, control.law if control else None
 
 
 def output_folder(out: Path | None, name: str) -> Path:

@@ -105,6 +105,14 @@ def test_before_the_first_trial_there_is_no_answer() -> None:
     assert answer.headline(study(), empty, True) == answer.ranges(study(), empty) == []
 
 
+def test_a_point_whose_trials_all_failed_is_left_out() -> None:
+    none = {name: Summary(math.nan, math.nan, math.nan, 0) for name in NEVER}
+    failed = PointRow(1, {"leds": 900}, none, 20)
+    texts = answer.headline(study(), [line(0, 500, 100), failed], True)
+    assert texts == answer.headline(study(), [line(0, 500, 100)], True)
+    assert answer.headline(study(), [failed], True) == []
+
+
 # What the report begins with.
 
 

@@ -27,7 +27,9 @@ from skysim.apps.cli.options import (
     SolverName,
     load,
     output_folder,
+    scene_names,
     selected_stages,
+    used_programs,
     with_location,
 )
 
@@ -60,13 +62,12 @@ def run(
     from skysim.simulation.compilation import on_two_processes
     from skysim.simulation.run import simulate_motion
     from skysim.simulation.testbed import build_testbed
-    from skysim.tracking.external import process
 
     stages = selected_stages(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
     if tracker is not None:
         stages["name"] = tracker
     loaded = load(scene, frames, seed, [*(set_ or []), *(f"tracker.{key}={name}" for key, name in stages.items())])
-    testbed = build_testbed(loaded, process.program_commands(program))
+    testbed = build_testbed(loaded, used_programs(program, scene_names(loaded)))
     plan = check(testbed)
     for finding in plan.findings:
         terminal.print_error(with_location(finding))
@@ -141,10 +142,9 @@ def compare(
     from skysim.results.run import Recorder
     from skysim.simulation import run as simulation
     from skysim.simulation.testbed import build_testbed
-    from skysim.tracking.external import process
 
     loaded = load(scene, frames, seed, set_, tracker)
-    testbed = build_testbed(loaded, process.program_commands(program))
+    testbed = build_testbed(loaded, used_programs(program, [*tracker, *scene_names(loaded)]))
     entrants = tracker_comparison.build_trackers(testbed, tracker)
     with terminal.progress_callback("simulating the motion", quiet=json) as update:
         testbed = simulation.simulate_motion(testbed, update)

@@ -17,6 +17,8 @@ from skysim.core.errors import InputError
 if TYPE_CHECKING:
     from skysim.apps.stream.http import FrameHub
 
+HOST = "127.0.0.1"
+
 
 def stream(
     scene: SceneArg,
@@ -26,7 +28,7 @@ def stream(
     http: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Serve MJPEG and packets on this port; 0: any free port.")
     ] = None,
-    host: Annotated[str, typer.Option(help="Address to serve on, without access control.")] = "127.0.0.1",
+    host: Annotated[str, typer.Option(help="Address to serve on, without access control.")] = HOST,
     pipe: Annotated[
         str | None,
         typer.Option(help="Write packets (a line of JSON, then pixels) to a named pipe; -: to standard output."),
@@ -49,6 +51,8 @@ def stream(
 
     if folder is None and http is None and pipe is None:
         raise InputError("skysim stream: no output; give --folder DIR, --http PORT or --pipe PATH")
+    if http is None and host != HOST:
+        raise InputError(f"--host {host}: has no effect without --http; allowed: --http PORT --host {host}")
     if endless and frames is not None:
         raise InputError("skysim stream: give either --frames N or --endless")
     testbed = replace(build_testbed(load(scene, frames, seed, set_)), endless=endless)

@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skysim.apps.cli.options import Json, OpenReport, Out, Overrides, Programs, complete_study, output_folder
+from skysim.apps.cli.options import (
+    Json,
+    OpenReport,
+    Out,
+    Overrides,
+    Programs,
+    complete_study,
+    output_folder,
+    scene_names,
+    used_programs,
+)
 from skysim.apps.cli.study_summary import (
     print_answers,
     print_points,
@@ -74,6 +84,7 @@ def run(
 
     overrides = parse_overrides(set_)
     plan = loader.load(study, overrides, process.program_commands(program))
+    used_programs(program, names_in(plan) if program else ())
     search = context.info_name == "optimize"
     if search and plan.study.optimize is None:
         raise InputError(f"{plan.path}: has no key optimize; allowed: skysim study run")
@@ -230,6 +241,20 @@ SEARCH_HELP = (
 app.command("optimize", help=SEARCH_HELP)(run)
 
 
+def names_in(plan: Plan) -> set[str | None]:
+    """All texts that are values of a study, and the names of its scene's tracker and controller."""
+    from skysim.experiments.study.plan import resolve_point
+
+    def texts(value: Any) -> Iterator[str]:
+        if isinstance(value, str):
+            yield value
+        for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ():
+            yield from texts(inner)
+
+    scene, _ = resolve_point(plan.spec, {})
+    return {*texts(plan.study.model_dump(mode="json")), *scene_names(scene)}
+
+
 def run_and_report(
     plan: Plan,
     study: str,
@@ -352,6 +377,8 @@ def create_engine(name: str, workers: int | None, scheduler: str) -> Engine:
 
     if name not in ENGINES:
         raise InputError(f"--engine: {unknown_name('engine', name, ENGINES)}")
+    if workers is not None and name != "pool":
+        raise InputError(f"--workers {workers}: has no effect with --engine {name}; allowed: --engine pool")
     if (name == "dask") != bool(scheduler):
         raise InputError("--scheduler: required with --engine dask and only then; allowed: tcp://HOST:PORT")
     return ENGINES[name](workers, scheduler)

@@ -26,12 +26,12 @@ RESPONSES = (*EVENTS, "ambiguous")  # responses that the answers need besides th
 
 
 def headline(study: Study, lines: Sequence[PointRow], may_be_ambiguous: bool) -> list[str]:
-    """Thresholds, ambiguity and wrong answers, one sentence or two each; none before the first trial is in.
+    """Thresholds, ambiguity and wrong answers, one sentence or two each; none without a trial that did not fail.
 
     lines : of all points, with the responses of the study and RESPONSES
     may_be_ambiguous : whether the tracker can refuse a frame as ambiguous
     """
-    done = [line for line in lines if line.trials]
+    done = [line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)]
     if not done:
         return []
     place, found = placer(study, done), list[str]()

@@ -108,7 +108,7 @@ def most_similar(fields: Fields, least: float) -> tuple[Floats, Ints]:
             larger = 1 + max(fields.first[i + 1] - fields.first[i], fields.first[j + 1] - fields.first[j])
             # The exact search is needed only if the pair can raise the maximum of one of its two fields.
             threshold = min(fraction[i], fraction[j]) * larger
-            overlap = (1 + max_coincident(fields, i, j, threshold - 1)) / larger
+            overlap = (1 + max_coincident(fields, i, j, threshold - 1, least > 0)) / larger
             if overlap > fraction[i]:
                 fraction[i], other[i] = overlap, j
             if overlap > fraction[j]:
@@ -117,13 +117,18 @@ def most_similar(fields: Fields, least: float) -> tuple[Floats, Ints]:
 
 
 @jit
-def max_coincident(fields: Fields, i: int, j: int, threshold: float) -> int:
-    """The most neighbors of i that coincide with ones of j at any rotation; 0 if no more than `threshold` can."""
+def max_coincident(fields: Fields, i: int, j: int, threshold: float, farther: bool) -> int:
+    """The most neighbors of i that coincide with ones of j at any rotation, if more than `threshold`; else less.
+
+    farther : try only the rotations of the farther half of n neighbors, or of n - threshold if those are more. They
+              are more accurate than those of near ones, and of any n - threshold neighbors one must coincide.
+    """
     first, radius, angle, tolerance = fields.first, fields.radius, fields.angle_rad, fields.tolerance[i]
     if upper_bound(fields, i, j) <= threshold:
         return 0
     most, begin = 0, first[j]
-    for k in range(first[i], first[i + 1]):
+    inner = max(min(int(threshold), (first[i + 1] - first[i]) // 2), 0) if farther else 0
+    for k in range(first[i] + inner, first[i + 1]):
         # Radii ascend, so the window of equal radii in field j only moves forward.
         while begin < first[j + 1] and radius[begin] < radius[k] - tolerance:
             begin += 1
@@ -131,7 +136,7 @@ def max_coincident(fields: Fields, i: int, j: int, threshold: float) -> int:
         while n < first[j + 1] and radius[n] <= radius[k] + tolerance:
             # The identity, a field laid on itself without rotation, is no ambiguity.
             if i != j or n != k:
-                most = max(most, count_coincident(fields, i, j, angle[n] - angle[k]))
+                most = max(most, count_coincident(fields, i, j, angle[n] - angle[k], max(most, threshold)))
             n += 1
     return most
 
@@ -149,11 +154,13 @@ def upper_bound(fields: Fields, i: int, j: int) -> int:
 
 
 @jit
-def count_coincident(fields: Fields, i: int, j: int, rotation_rad: float) -> int:
-    """Number of neighbors of i that coincide with a neighbor of j after field i is rotated by turn_rad."""
+def count_coincident(fields: Fields, i: int, j: int, rotation_rad: float, threshold: float) -> int:
+    """Neighbors of i that coincide with one of j after i is rotated; fewer if no more than the threshold do."""
     first, radius, angle, tolerance = fields.first, fields.radius, fields.angle_rad, fields.tolerance[i]
     total, begin = 0, first[j]
     for k in range(first[i], first[i + 1]):
+        if total + first[i + 1] - k <= threshold:
+            break
         while begin < first[j + 1] and radius[begin] < radius[k] - tolerance:
             begin += 1
         n = begin

@@ -1,0 +1,52 @@
+"""An option of the command line that does nothing is refused in one line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+SKYSIM = [sys.executable, "-c", "from skysim.apps.cli.main import main; main()"]
+STUDY = {
+    "schema": 1,
+    "title": "Small",
+    "scene": "afit_simsat_ideal",
+    "seed": 1,
+    "trial": {"kind": "centroids"},
+    "factors": {"noise": {"key": "trial.noise_px", "values": [0.1]}},
+    "responses": ["identified"],
+}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("run shefex2 --program mine=cat", "--program mine: has no effect: nothing has this name"),
+        ("compare shefex2 --tracker own --program mine=cat", "--program mine: has no effect: nothing has this name"),
+        ("study run study.yaml --program mine=cat", "--program mine: has no effect: nothing has this name"),
+        ("study run study.yaml --engine serial --workers 2", "--workers 2: has no effect with --engine serial"),
+        ("stream shefex2 --folder out --host ::1", "--host ::1: has no effect without --http"),
+        ("reproduce afit-table-1 --open", "--open: has no effect without --report"),
+    ],
+)
+def test_an_option_without_effect_is_refused(words: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump(STUDY))
+    done = subprocess.run([*SKYSIM, *words.split()], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"skysim: {message}")
+    assert done.stderr.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["study.yaml"]
+
+
+def test_a_program_that_a_level_names_has_an_effect(tmp_path: Path) -> None:
+    """It is started; its trials fail because `true` ends at once, and the report is written."""
+    factors = {"tracker": {"key": "tracker.name", "values": ["own", "mine"]}}
+    study = STUDY | {"factors": factors, "trial": {"kind": "frames"}, "scene": "shefex2"}
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump(study))
+    words = ["study", "run", "study.yaml", "--engine", "serial", "--program", "mine=true"]
+    done = subprocess.run([*SKYSIM, *words], cwd=tmp_path, capture_output=True, text=True)
+    assert "has no effect" not in done.stderr
+    assert (tmp_path / "out/study/report.html").exists()
