@@ -29,6 +29,9 @@ SHIPPED = "a file that comes along, each of which a test reads"
 GUARDED = "runs in a child process with limits, whose end of any kind is an error of the file"
 SOURCES = "reads bytes for their digest alone"
 OUT_OF_REACH = {
+    "skysim.apps.cli.commands.camera.CameraGroup.parse_args": "words of the command line",
+    "skysim.apps.cli.commands.camera.read_camera": "hands the file on to `loader` or `opencv_calibration.read`",
+    "skysim.scene.data_sheet.sheet.parsed": "a word of the command line, read as a quantity or a number",
     "skysim.apps.cli.commands.study.load_stored_plan": "the store is read by `open_store`, the study by `loader.load`",
     "skysim.apps.plate_solver.picture.load_picture": "hands the file on to `read_picture`",
     "skysim.apps.plate_solver.solver.read_camera": "hands the file on to `loader` or `opencv_calibration.read`",
