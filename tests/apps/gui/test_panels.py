@@ -18,8 +18,10 @@ from skysim.apps.gui.page import forms, keys, overlay
 from skysim.apps.gui.page.star_names import NAMES
 from skysim.apps.gui.server import Guard, host_of
 from skysim.apps.gui.worker import export, pointing, study_process
+from skysim.apps.gui.worker.photo import SUFFIXES
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
+from skysim.core.images import IMAGE_SUFFIXES
 from skysim.core.paths import SCENES
 from skysim.core.types import Mount
 from skysim.dynamics import multibody
@@ -375,3 +377,10 @@ def test_a_pedestal_under_a_frame_changes_nothing_for_the_eye() -> None:
     image[50, 60] = 900
     shown = [stretch.to_8bit((image + up).astype(np.uint16), "square root") for up in (0, 1000)]
     np.testing.assert_array_equal(*shown)
+
+
+def test_the_file_dialog_takes_the_end_of_every_image_s_name() -> None:
+    """A browser's `accept` knows one suffix: `.gz` of `.fits.gz`."""
+    assert {".fits", ".gz", ".fz", ".png", ".jpg"} <= set(SUFFIXES)
+    assert all(any(name.endswith(end) for end in SUFFIXES) for name in IMAGE_SUFFIXES)
+    assert all(len(end) > 1 for end in SUFFIXES)

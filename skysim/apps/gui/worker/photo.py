@@ -58,7 +58,7 @@ class Photo:
 
 PhotoPixels = tuple[Photo, NDArray]  # with the image's pixels
 # Ends of the names of image files, as a browser's file dialog takes them: ".gz" for ".fits.gz".
-SUFFIXES = tuple(dict.fromkeys(Path(suffix).suffix for suffix in images.IMAGE_SUFFIXES))
+SUFFIXES = tuple(dict.fromkeys("." + suffix.rpartition(".")[2] for suffix in images.IMAGE_SUFFIXES))
 
 
 def photo_from_file(name: str, data: bytes, fov_deg: float | None) -> PhotoPixels:
