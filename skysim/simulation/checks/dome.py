@@ -166,8 +166,9 @@ def round_disk_warning(scene: Scene, sources: Sources, mount: Mount) -> str:
     worst = int(np.abs(views.peak_error).argmax())
     axes = " and ".join(f"{axis:.2f}" for axis in views.axes[worst])
     return (
-        f"light.led.disk_diameter: LED disks are drawn as circles; peaks are wrong by"
-        f" {100 * np.median(np.abs(views.peak_error)):.2g} % (median), {100 * abs(views.peak_error[worst]):.2g} % at"
+        "light.led.disk_diameter: LED disks are drawn as circles, a limit of the renderer: places are right, but peaks"
+        f" wrong by {100 * np.median(np.abs(views.peak_error)):.2g} % (median),"
+        f" {100 * abs(views.peak_error[worst]):.2g} % at"
         f" {np.degrees(views.incidence_rad[worst]):.0f} deg of incidence and {np.degrees(views.field_rad[worst]):.0f}"
         f" deg off axis, where the image's semi-axes should be {axes} of the drawn radius"
     )

@@ -158,6 +158,12 @@ def test_a_finding_that_differs_in_its_numbers_is_told_once(texts: list[str], to
     assert overview.finding_text(at, checked=3) == told
 
 
+def test_a_place_has_its_unit() -> None:
+    rates = study(factors={"rate": {"key": "trial.rate_deg_s", "values": [0, 8]}}, trial={"kind": "frames"})
+    lines = [line(0, 500, 100)._replace(levels={"rate": 0}), line(1, 500, 100, wrong=3)._replace(levels={"rate": 8})]
+    assert "most at rate = 8 deg/s: 3 %" in said(answer.headline(rates, lines, True), "Wrong attitudes")
+
+
 def test_a_rounding_error_of_zero_is_zero() -> None:
     assert format_summary(Summary(4.5e-13, 3e-13, 4.6e-13, 9)) == "0"
     assert format_summary(Summary(4.5e-8, 3e-13, 4.6e-3, 9)) == "4.5e-08 (0..0.0046)"

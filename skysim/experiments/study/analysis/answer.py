@@ -11,8 +11,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from skysim.experiments.study.analysis import thresholds
-from skysim.experiments.study.analysis.axes import distinct
+from skysim.experiments.study.analysis.axes import axis, distinct, unit_of
 from skysim.experiments.study.analysis.table import PointRow, format_level, format_summary, has_few_values
+from skysim.experiments.study.factors import Value
 from skysim.experiments.study.plan import Study
 from skysim.results import metrics
 from skysim.results.metrics import Summary
@@ -55,9 +56,14 @@ Place = Callable[[PointRow], str]
 
 
 def placer(study: Study, lines: Sequence[PointRow]) -> Place:
-    """The function that names a point by the levels that vary: "leds = 900, placement = spiral"."""
+    """The function that names a point by the levels that vary: "leds = 900, rate = 8 deg/s"."""
     varied = [name for name in study.factors if len(distinct(line.levels[name] for line in lines)) > 1]
-    return lambda line: ", ".join(f"{name} = {format_level(line.levels[name])}" for name in varied)
+    units = {name: unit_of(axis(study, lines, name)) for name in varied}
+
+    def named(name: str, level: Value) -> str:
+        return f"{name} = {format_level(level)}" + ("" if isinstance(level, str) else units[name])
+
+    return lambda line: ", ".join(named(name, line.levels[name]) for name in varied)
 
 
 def response_range(name: str, lines: Sequence[PointRow], place: Place) -> str:

@@ -103,6 +103,12 @@ def axis(study: Study, lines: Sequence[PointRow], name: str) -> Axis:
     return Axis(label(name, "" if has_text else unit), levels, False, False)
 
 
+def unit_of(axis: Axis) -> str:
+    """The unit of an axis after a space; empty if it has none."""
+    unit = axis.label.partition(" [")[2].rstrip("]")
+    return f" {unit}" if unit else ""
+
+
 def as_numbers(levels: Sequence[Value]) -> tuple[Floats | None, str]:
     """(N,) levels as numbers, and their unit. None unless all are numbers of the same unit and distinct."""
     try:

@@ -155,17 +155,11 @@ def group_crossing(threshold: Threshold, lines: Sequence[PointRow], axis: Axis) 
 def sentences(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> list[str]:
     """The threshold in words, one sentence for each level of `by`."""
     axis = axes.axis(study, lines, threshold.along)
-    unit = unit_of(axes.axis(study, lines, threshold.by)) if threshold.by is not None else ""
+    unit = axes.unit_of(axes.axis(study, lines, threshold.by)) if threshold.by is not None else ""
     return [
         (f"{threshold.by} = {label}{unit}: " if label else "") + describe(one, threshold, axis)
         for label, one in crossings(threshold, study, lines).items()
     ]
-
-
-def unit_of(axis: Axis) -> str:
-    """The unit of an axis after a space; empty if it has none."""
-    unit = axis.label.partition(" [")[2].rstrip("]")
-    return f" {unit}" if unit else ""
 
 
 def describe(found: Crossing | None, threshold: Threshold, axis: Axis) -> str:
@@ -173,7 +167,7 @@ def describe(found: Crossing | None, threshold: Threshold, axis: Axis) -> str:
     response, limit, name = threshold.response, f"{100 * threshold.limit:g} %", threshold.along
     if found is None:
         return f"{response} has no trials at two levels of {name} yet."
-    unit = unit_of(axis)
+    unit = axes.unit_of(axis)
     if math.isnan(found.value):
         return f"{response} neither rises nor falls along {name}, so no level of it is a threshold."
     first, last = (axis.coordinate(one) for one in (axis.levels[0], axis.levels[-1]))
