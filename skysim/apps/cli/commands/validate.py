@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from skysim.apps.cli.options import Json, Overrides, Programs, SceneArg, load, with_location
+from skysim.apps.cli.options import Json, Overrides, Programs, SceneArg, load, scene_names, used_programs, with_location
 from skysim.apps.cli.terminal import print_check, print_error, print_json
 from skysim.core.errors import InputError
 from skysim.scene.data_sheet.sheet import PLACEHOLDER_LENS
@@ -77,10 +77,9 @@ def check(scene: SceneArg, program: Programs = None, set_: Overrides = None, jso
     """
     from skysim.simulation.checks import check as check_plan
     from skysim.simulation.testbed import build_testbed
-    from skysim.tracking.external import process
 
     loaded = load(scene, None, None, set_)
-    result = check_plan(build_testbed(loaded, process.program_commands(program)))
+    result = check_plan(build_testbed(loaded, used_programs(program, scene_names(loaded))))
     findings = [with_location(finding) for finding in result.findings]
     if json:
         print_json(result._replace(findings=findings).as_dict())
