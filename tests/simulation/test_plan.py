@@ -303,7 +303,7 @@ def test_smear_is_not_also_reported_as_faint_lights() -> None:
 
 def test_the_brightest_hundred_of_many_lights_are_no_fault() -> None:
     """The tracker takes as many from a frame; the fact says so, and no warning blames the area or the exposure."""
-    tape = "{kind: string, pitch: 8 mm, spacing: 17 mm, cap_deg: 42}"
+    tape = "{kind: string, pitch: 4 mm, spacing: 14 mm, cap_deg: 32}"
     dense = bed("afit_simsat_ideal", light__surface=SPHERE, light__layout=tape, light__led__disk_diameter="1 mm")
     result = check(dense)
     assert "; the tracker uses the 100 brightest)" in fact(result, "lights in the field").lines[0]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import yaml
 
-SKYSIM = [sys.executable, "-c", "from skysim.apps.cli.main import main; main()"]
+Command = Callable[..., subprocess.CompletedProcess[str]]
 STUDY = {
     "schema": 1,
     "title": "Small",
@@ -33,21 +33,22 @@ STUDY = {
         ("reproduce afit-table-1 --open", "--open: has no effect without --report"),
     ],
 )
-def test_an_option_without_effect_is_refused(words: str, message: str, tmp_path: Path) -> None:
+def test_an_option_without_effect_is_refused(command: Command, words: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "study.yaml").write_text(yaml.safe_dump(STUDY))
-    done = subprocess.run([*SKYSIM, *words.split()], cwd=tmp_path, capture_output=True, text=True)
+    done = command(*words.split())
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith(f"skysim: {message}")
     assert done.stderr.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["study.yaml"]
 
 
-def test_a_program_that_a_level_names_has_an_effect(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_a_program_that_a_level_names_has_an_effect(command: Command, tmp_path: Path) -> None:
     """It is started; its trials fail because `true` ends at once, and the report is written."""
     factors = {"tracker": {"key": "tracker.name", "values": ["own", "mine"]}}
     study = STUDY | {"factors": factors, "trial": {"kind": "frames"}, "scene": "shefex2"}
     (tmp_path / "study.yaml").write_text(yaml.safe_dump(study))
     words = ["study", "run", "study.yaml", "--engine", "serial", "--program", "mine=true"]
-    done = subprocess.run([*SKYSIM, *words], cwd=tmp_path, capture_output=True, text=True)
+    done = command(*words)
     assert "has no effect" not in done.stderr
     assert (tmp_path / "out/study/report.html").exists()
