@@ -215,7 +215,7 @@ def test_a_truncated_gzipped_file_is_one_line(tmp_path: Path, share: float) -> N
     data = gzip.compress(fits_file(tmp_path / "x.fits", RNG.integers(0, 60_000, (60, 90), np.uint16)).read_bytes())
     path = tmp_path / "x.fits.gz"
     path.write_bytes(data[: int(share * len(data))])
-    assert re.search("not a complete (gzip|FITS) file", complaint(path))
+    assert f"not a complete {'gzip' if share else 'FITS'} file" in complaint(path)
 
 
 @pytest.mark.parametrize("data", [b"once upon a time", gzip.compress(b"once upon a time"), bytes(99)])
@@ -264,5 +264,9 @@ def test_color_planes_of_a_tiff_are_read_right_or_refused_by_name(
 
 
 def test_a_gray_tiff_may_say_what_it_likes_of_planes(tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "x.tif", FRAME, planarconfig=None, extratags=[(284, 3, 1, 2, True)])
+    Image.fromarray(FRAME).save(tmp_path / "x.tif")
+    data = (tmp_path / "x.tif").read_bytes()
+    entry = struct.pack("<HHIH", 284, 3, 1, 1)
+    assert data.count(entry) == 1
+    (tmp_path / "x.tif").write_bytes(data.replace(entry, struct.pack("<HHIH", 284, 3, 1, 2)))
     np.testing.assert_array_equal(images.read_picture(tmp_path / "x.tif").pixels, FRAME)
