@@ -130,6 +130,17 @@ def test_an_exif_block_that_lies_leaves_the_picture(tmp_path: Path) -> None:
     assert images.read_picture(tmp_path / "x.png").pixels.size == GRAY.size
 
 
+@pytest.mark.filterwarnings("error")
+def test_pillow_does_not_talk_past_us_of_damaged_exif(tmp_path: Path) -> None:
+    """A text of 4,000 characters in a block of a hundred."""
+    data = bytearray(with_exif(tmp_path / "x.jpg", GRAY, 6, 26).read_bytes())
+    at = data.index(struct.pack("<HHI", EXIF, 4, 1)) if b"II*" in data else data.index(struct.pack(">HHI", EXIF, 4, 1))
+    order = "<" if b"II*" in data else ">"
+    data[at : at + 12] = struct.pack(f"{order}HHII", 270, 2, 4000, 8)
+    (tmp_path / "x.jpg").write_bytes(data)
+    assert images.read_picture(tmp_path / "x.jpg").pixels.shape == GRAY.T.shape
+
+
 # FITS
 
 
