@@ -102,11 +102,12 @@ def test_no_photograph_is_answered_wrongly_with_its_field_unknown(row, blind):
 @needs_photographs
 @by_file(TO_SOLVE)
 def test_a_photograph_in_a_mirror_is_refused(row, blind):
-    """No turn of the sky is its mirror image, so whatever were answered would be wrong."""
+    """No turn of the sky is its mirror image, so whatever were answered would be wrong; the mirror is named."""
     image = images.monochrome(images.read_image(FOLDER / row["file"]))
-    found, _ = plate_solver.solve_array(np.ascontiguousarray(image[:, ::-1]), blind, None)
-    assert not found.attitude.solved
-    assert len(found.centroids) >= 10
+    outcome = plate_solver.solve_picture(images.Picture(np.ascontiguousarray(image[:, ::-1])), blind, None)
+    assert not outcome.report.attitude.solved
+    assert len(outcome.report.centroids) >= 10
+    assert plate_solver.outcome_fields(outcome, None)["hint"].startswith("perhaps mirrored: ")
 
 
 @pytest.mark.long

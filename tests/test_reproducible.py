@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import select
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numba
 import numpy as np
 import pytest
@@ -101,6 +103,20 @@ def test_a_command_says_once_that_it_compiles_and_nothing_once_it_has(tmp_path: 
         os.close(ours), os.close(theirs)
     assert re.fullmatch(r"skysim: compiling numba functions.*\nend\n", said[0])
     assert said[1:] == ["end\n"] * 3
+
+
+def test_the_first_picture_ever_says_that_it_compiles(tmp_path: Path) -> None:
+    """Half a minute of silence otherwise. It is stopped as soon as it has said so."""
+    cv2.imwrite(str(tmp_path / "x.png"), np.random.default_rng(0).integers(0, 99, (64, 80), np.uint8))
+    ours, theirs = os.openpty()
+    words = [sys.executable, "-m", "skysim", "solve", "x.png", "--fov", "20"]
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=theirs, env=environment, cwd=tmp_path) as process:
+        ready, _, _ = select.select([ours], [], [], 120)
+        said = os.read(ours, 1000).decode() if ready else ""
+        process.terminate()
+    os.close(ours), os.close(theirs)
+    assert said.startswith("skysim: compiling numba functions (once ")
 
 
 @pytest.mark.long

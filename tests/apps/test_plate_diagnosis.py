@@ -119,6 +119,14 @@ def test_each_cause_is_named(change: Change, fov_deg: float, says: str) -> None:
     assert re.search(says, told), told
 
 
+def test_short_trails_are_those_that_the_detector_measures() -> None:
+    """Thick for their length: their shapes alone would not show them. sqrt(60^2 + 30^2) = 67."""
+    solvers = (plate_solver.make_solver(20.0, None),)
+    short = diagnosis.Refusal(spread(trail(60))(photograph()), Centroids.empty(), solvers)
+    assert diagnosis.trailed(short).startswith("trails of 67 px: ")
+    assert diagnosis.trailed(diagnosis.replace(short, image=photograph())) == ""
+
+
 @pytest.mark.parametrize(
     ("change", "focal", "says"),
     [
@@ -164,6 +172,7 @@ ANGLES = ("ra_deg", "dec_deg", "roll_deg")
     [
         (5.0, 6.7, "--catalog gaia_v8.0"),
         (3.5, 6.7, "--catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`"),
+        (5.0, 8.0, "--catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`"),  # that one was taken
         (3.5, 8.0, "--catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`"),
         (1.9, 6.7, "--catalog gaia_v10.0, after `skysim catalog build --source gaia --limit 10`"),
         (1.0, 6.7, "a wider picture: the deepest catalog, to V 10, has too few as well"),

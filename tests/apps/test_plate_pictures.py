@@ -122,7 +122,7 @@ def test_exif_tells_the_field_by_the_diagonal(sky: tuple[Scene, Frame, Truth], g
     (narrow, wide), search = found["tried_fov_deg"]
     assert (focal_35mm, search) == (133, (5, 40))
     assert narrow < 0.93 * FOV_DEG < 1.07 * FOV_DEG < wide
-    assert narrow > 0.87 * FOV_DEG
+    assert math.sqrt(narrow * wide) == pytest.approx(FOV_DEG, rel=0.01)  # the longer side would be 4 % off
 
 
 @pytest.mark.parametrize("focal_35mm", [133, 138])
@@ -136,7 +136,16 @@ def test_both_ways_to_convert_a_focal_length_are_within_its_uncertainty(
     outcome = plate_solver.solve_picture(seen, unknown, None)
     assert outcome.report.attitude.solved
     assert outcome.hypothesis.solver.fov_deg is not None
+    assert [one.solver.hypotheses for one in outcome.tried] == [2, 2]
     assert plate_picture.hypotheses(seen, plate_solver.make_solver(20.0, None))[0].solver.fov_deg == 20.0
+
+
+def test_the_tracker_of_one_uncertainty_is_not_taken_for_another(gray: NDArray) -> None:
+    told = plate_solver.make_solver(20.0, None)
+    by_exif = solver.replace(told, fov_uncertainty=0.1)  # of the same picture: they share their trackers' cache
+    first, second, again = (next(one.trackers(640, 480, None)) for one in (told, by_exif, told))
+    assert (first.focal_uncertainty, second.focal_uncertainty) == (solver.FOV_UNCERTAINTY, 0.1)
+    assert first is again
 
 
 def test_a_phone_s_wide_field_is_solved_by_its_focal_length(tmp_path: Path) -> None:
@@ -279,3 +288,21 @@ def test_json_is_stable_and_says_more(gray: NDArray, tmp_path: Path) -> None:
         *("time_ms", "warning", "bad_input"),
     ]
     assert found["hint"] == ""
+
+
+@pytest.mark.parametrize("name", ["x.JPG", "x.fits.gz"])
+def test_the_browser_s_panel_sees_the_same_picture(
+    sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path, name: str
+) -> None:
+    from skysim.apps.gui.worker.photo import photo_from_file
+
+    if name == "x.JPG":
+        data = with_exif(tmp_path / "x.jpg", STORED[6](gray), 6).read_bytes()
+    else:
+        fits.PrimaryHDU(sky[1].image_dn[::-1]).writeto(tmp_path / "x.fits.gz")
+        data = (tmp_path / "x.fits.gz").read_bytes()
+    photo, pixels = photo_from_file(name, data, FOV_DEG)
+    assert (photo.size_px, pixels.shape) == ((WIDTH_PX, HEIGHT_PX), (HEIGHT_PX, WIDTH_PX))
+    check_right({"status": photo.result.status, **photo.solution}, sky[2])
+    refused, _ = photo_from_file("x.png", with_exif(tmp_path / "y.png", gray, 2).read_bytes(), FOV_DEG)
+    assert "mirrored" in refused.hint

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import io
 import struct
+import warnings
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -83,12 +86,22 @@ def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
 
 
 def pillow_size(data: bytes) -> Sizes:
-    """Size of a JPEG or BMP file by Pillow, which reads the header only."""
+    """Size of a JPEG or BMP file."""
+    with opened_by_pillow(data) as image:
+        yield image.size, 1 if image.mode in ("1", "L") else 4
+
+
+@contextmanager
+def opened_by_pillow(data: bytes) -> Iterator[Any]:
+    """A JPEG or BMP file as an image of Pillow, which reads the header only; its warnings are left out."""
     from PIL import BmpImagePlugin, JpegImagePlugin
 
-    plugin = BmpImagePlugin.BmpImageFile if data.startswith(b"BM") else JpegImagePlugin.JpegImageFile
-    with plugin(io.BytesIO(data)) as image:  # the class, not Image.open: that has a limit of its own
-        yield image.size, 1 if image.mode in ("1", "L") else 4
+    # The class, not Image.open: that has a limit of its own.
+    plugin = BmpImagePlugin.BmpImageFile if data.startswith(BMP_MAGIC) else JpegImagePlugin.JpegImageFile
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of damaged EXIF
+        with plugin(io.BytesIO(data)) as image:
+            yield image
 
 
 def tiff_size(data: bytes) -> Sizes:
@@ -125,9 +138,7 @@ def read_exif(data: bytes) -> tiff.Exif:
     if data.startswith(PNG_MAGIC):
         return tiff.read_exif(next((data[at:end] for kind, at, end in png_chunks(data) if kind == b"eXIf"), b""))
     if data.startswith(JPEG_MAGIC):
-        from PIL import JpegImagePlugin
-
-        with JpegImagePlugin.JpegImageFile(io.BytesIO(data)) as image:
+        with opened_by_pillow(data) as image:
             return tiff.read_exif(image.info.get("exif", b"").removeprefix(b"Exif\0\0"))
     return tiff.Exif()
 

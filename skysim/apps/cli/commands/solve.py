@@ -62,6 +62,7 @@ def solve(
 
     Exit code 0 if all images could be read, solved or not; 2 otherwise.
     """
+    import skysim.core.jit  # noqa: F401  # says so if numba has to compile
     from skysim.apps import plate_solver
     from skysim.core import files
     from skysim.core.images import grab_frame
