@@ -8,7 +8,7 @@ torque that the actuators can give is returned to the law for its anti-windup.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -21,7 +21,7 @@ from skysim.dynamics.controllers.adapter import NO_SOURCE, ControllerSource, Ext
 from skysim.dynamics.controllers.interface import ControllerSetup
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import VehicleModel
-from skysim.scene.motion import BUILT_IN_LAWS
+from skysim.scene.motion import BUILT_IN_LAWS, ControlConfig
 from skysim.scene.scene import Scene
 from skysim.scene.vehicle import CmgsConfig, FansConfig, WheelsConfig
 
@@ -166,6 +166,22 @@ ACTUATORS: dict[str, Callable[..., Actuators]] = {
 }
 
 
+def build_actuators(scene: Scene, vehicle: VehicleModel) -> dict[str, Actuators]:
+    """All actuators that are switched on, by their key in `vehicle`."""
+    return {
+        key: actuator_type(vehicle, config)
+        for key, actuator_type in ACTUATORS.items()
+        if (config := getattr(scene.vehicle, key)) is not None
+    }
+
+
+def controlling_actuator(
+    config: ControlConfig, actuator_sets: Mapping[str, Actuators], vehicle: VehicleModel
+) -> Actuators:
+    """The actuators that the controller's torque is given to."""
+    return IdealTorque(vehicle) if config.actuators == "ideal" else actuator_sets[config.actuators]
+
+
 class MomentumDump:
     """Momentum dumping by fans, with a model of their lag."""
 
@@ -196,19 +212,13 @@ class FlightComputer:
     ) -> None:
         self.config = None if scene.motion.is_prescribed else scene.motion.control
         self.period_s = 1 / scene.control_rate_hz
-        self.actuator_sets = {
-            key: actuator_type(vehicle, config)
-            for key, actuator_type in ACTUATORS.items()
-            if (config := getattr(scene.vehicle, key)) is not None
-        }
+        self.actuator_sets = build_actuators(scene, vehicle)
         self.nu = vehicle.model.nu
         self.control_torque_nm = np.zeros(3)
         self.momentum_dump: MomentumDump | None = None
         if self.config is None:
             return
-        self.actuator = (
-            IdealTorque(vehicle) if self.config.actuators == "ideal" else self.actuator_sets[self.config.actuators]
-        )
+        self.actuator = controlling_actuator(self.config, self.actuator_sets, vehicle)
         self.law = self.build_law(scene, vehicle, reference, source)
         if self.config.desaturation:
             self.momentum_dump = MomentumDump(self.actuator_sets["fans"], Desaturator(self.config.desaturation))

@@ -73,7 +73,7 @@ class ClosedLoop:
             random_stream(scene.seed, AIR_CURRENT, 0),
         )
         try:
-            check_reference(self.reference, testbed, self.flight_computer)
+            check_reference(self.reference, testbed)
         except InputError:
             self.close()
             raise

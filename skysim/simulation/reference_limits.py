@@ -9,7 +9,8 @@ import numpy as np
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
-from skysim.dynamics.flight_computer import FlightComputer, usage
+from skysim.dynamics.flight_computer import build_actuators, controlling_actuator, usage
+from skysim.scene.motion import ControlConfig
 from skysim.scene.vehicle import VehicleConfig
 from skysim.simulation.testbed import Testbed
 
@@ -17,39 +18,28 @@ TILT_CHECK_S = 0.05  # sampling interval of a maneuver when its tilt is checked
 ROUNDING = 1e-6  # relative
 
 
-def check_maneuver(testbed: Testbed) -> None:
-    """Raise InputError for a maneuver that a run would refuse; an external controller is started and ended."""
-    scene, start = testbed.scene, testbed.trajectory.lab_from_body[0]
-    if scene.motion.control is None:
-        return
-    reference = guidance.plan(scene.motion, start, testbed.profiles)
-    flight_computer = FlightComputer(scene, testbed.vehicle, reference, testbed.controllers)
-    try:
-        check_reference(reference, testbed, flight_computer)
-    finally:
-        flight_computer.close()
-
-
-def check_reference(reference: guidance.Reference, testbed: Testbed, flight_computer: FlightComputer) -> None:
+def check_reference(reference: guidance.Reference, testbed: Testbed) -> None:
     """Raise InputError for a maneuver beyond the tilt stop, the gyros' range or the actuators' torque.
 
     The controller would push against the stop, or fall behind. A prescribed motion needs no torque.
     """
-    motion, vehicle = testbed.scene.motion, testbed.scene.vehicle
+    scene, motion, vehicle = testbed.scene, testbed.scene.motion, testbed.scene.vehicle
     if motion.control is None:
         return
     check_tilt(reference, vehicle, testbed.duration_s)
+    actuators = build_actuators(scene, testbed.vehicle)
     legs = zip(reference.legs, reference.start_s, motion.maneuver, strict=False)
     for n, (leg, begin_s, element) in enumerate(legs):
         if element.kind not in ("profile", "chirp"):
             continue
-        t_s, rate, acceleration = demands(leg, flight_computer.period_s)
+        t_s, rate, acceleration = demands(leg, 1 / scene.control_rate_hz)
         key = f"motion.maneuver.{n}: {element.kind}"
         check_rate(key, begin_s + t_s, rate, vehicle)
         if not motion.is_prescribed:
             inertia = testbed.vehicle.inertia_kg_m2
             torque_nm = acceleration @ inertia.T + np.cross(rate, rate @ inertia.T)
-            check_torque(key, begin_s + t_s, torque_nm, flight_computer)
+            used = usage(controlling_actuator(motion.control, actuators, testbed.vehicle), torque_nm)
+            check_torque(key, begin_s + t_s, used, torque_nm, motion.control)
 
 
 def check_tilt(reference: guidance.Reference, vehicle: VehicleConfig, duration_s: float) -> None:
@@ -95,14 +85,12 @@ def check_rate(key: str, t_s: Floats, rate_rad_s: Floats, vehicle: VehicleConfig
         )
 
 
-def check_torque(key: str, t_s: Floats, torque_nm: Floats, flight_computer: FlightComputer) -> None:
-    """Raise InputError for a torque (K, 3) that the actuators cannot give."""
-    used = usage(flight_computer.actuator, torque_nm)
+def check_torque(key: str, t_s: Floats, used: Floats, torque_nm: Floats, control: ControlConfig) -> None:
+    """Raise InputError for a torque (K, 3) that the actuators cannot give. used : (K,) times what they can"""
     n = int(used.argmax())
     if used[n] > 1 + ROUNDING:
-        assert flight_computer.config is not None
         torque = ", ".join(f"{component:.3g}" for component in torque_nm[n])
         raise InputError(
             f"{key}: needs a torque of ({torque}) N m at {t_s[n]:.6g} s, {used[n]:.3g} times what the actuators"
-            f" {flight_computer.config.actuators} can give; allowed: slower or smaller, or motion.control: prescribed"
+            f" {control.actuators} can give; allowed: slower or smaller, or motion.control: prescribed"
         )

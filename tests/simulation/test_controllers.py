@@ -24,6 +24,7 @@ from skysim.experiments.study.execution import runner, setups
 from skysim.experiments.study.execution.engines import Serial
 from skysim.scene import loader
 from skysim.simulation import run
+from skysim.simulation.checks import check
 from skysim.simulation.testbed import build_testbed
 from skysim.simulation.user_parts import build_testbed_with
 from skysim.tracking.external import process
@@ -300,6 +301,15 @@ def test_a_program_ends_with_its_motion(tmp_path: Path) -> None:
             run.simulate_motion(testbed)
         with pytest.raises(ProcessLookupError):
             os.kill(int((tmp_path / "pid").read_text()), 0)
+
+
+def test_a_check_does_not_start_a_program(tmp_path: Path) -> None:
+    """Or `skysim run`, which checks its plan, would start it twice."""
+    started = tmp_path / "started"
+    programs = command(tmp_path, f"open({str(started)!r}, 'w')\n{READY}")
+    testbed = build_testbed(skysim.load_scene("simsat_slew", SHORT | {"motion.control": {"law": "mine"}}), programs)
+    check(testbed)
+    assert not started.exists()
 
 
 def test_an_unknown_law_is_told_before_the_motion() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from skysim.camera import wcs
+from skysim.dynamics import guidance
 from skysim.scene.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, dome, lookalike
 from skysim.simulation.checks.attitudes import Attitudes
@@ -13,7 +14,7 @@ from skysim.simulation.checks.expected_error import expected
 from skysim.simulation.checks.facts import FACTS, Fact, Sampled, Samples
 from skysim.simulation.checks.findings import FINDINGS
 from skysim.simulation.checks.views import views
-from skysim.simulation.reference_limits import check_maneuver
+from skysim.simulation.reference_limits import check_reference
 from skysim.simulation.testbed import Testbed
 
 
@@ -40,7 +41,7 @@ def check(testbed: Testbed) -> Check:
         return Check([], first)  # all else assumes that the camera is inside
     context = context_of(testbed)
     frames = attitudes.of_frames(testbed)
-    check_maneuver(testbed)
+    check_reference(guidance.plan(scene.motion, testbed.trajectory.lab_from_body[0], testbed.profiles), testbed)
     reach = attitudes.within_reach(scene, testbed.mount, frames)
     samples = Samples(sampled(frames, context), sampled(reach, context))
     facts = [fact for build in FACTS if (fact := build(context, samples)) is not None]
