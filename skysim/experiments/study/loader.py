@@ -36,10 +36,13 @@ from skysim.scene.scene import Scene
 from skysim.tracking.external.interface import OWN, TRACKERS
 
 HARDWARE_SEED = re.compile(r"(hardware_seed|survey\.(surface_)?seed)$")
+FLIGHT_QUANTITIES = (
+    *("availability", "filter_arcsec", "filter_worst_arcsec", "drift_arcsec"),
+    *("pointing_arcsec", "pointing_worst_arcsec"),
+)
 # Kinds of trial that measure a quantity; quantities that are not listed are measured by all.
 MEASURED_BY: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(("availability", "filter_arcsec", "filter_worst_arcsec", "drift_arcsec"), ("flight",)),
-    **dict.fromkeys(("pointing_arcsec", "pointing_worst_arcsec"), ("flight",)),
+    **dict.fromkeys(FLIGHT_QUANTITIES, ("flight",)),
     "streak_px": ("frames", "flight"),
 }
 

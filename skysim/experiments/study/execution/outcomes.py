@@ -18,6 +18,7 @@ from skysim.core import quaternion
 from skysim.core.types import Floats, Telemetry, Truth
 from skysim.core.units import ARCSEC_RAD
 from skysim.results import metrics
+from skysim.results.telemetry_report import attitude_error_deg
 from skysim.scene.light import DomeConfig
 from skysim.simulation.testbed import Testbed
 from skysim.tracking import factory
@@ -236,9 +237,8 @@ def directions(testbed: Testbed, lab_from_body: Floats, cam_from_lab: Floats) ->
 
 def angles_arcsec(lab_from_other: Rotation | None, log: Telemetry, settle_s: float) -> Floats:
     """(K,) angle between another attitude and the true one at the ticks from settle_s on; empty without the other."""
-    if lab_from_other is None:
-        return np.empty(0)
-    return np.asarray((lab_from_other * log.lab_from_body.inv()).magnitude()[log.t_s >= settle_s] / ARCSEC_RAD)
+    error_deg = attitude_error_deg(lab_from_other, log.lab_from_body)
+    return np.empty(0) if error_deg is None else 3600 * error_deg[log.t_s >= settle_s]
 
 
 def summarize_flight(testbed: Testbed, outcomes: list[Outcome], settle_s: float) -> Outcome:
