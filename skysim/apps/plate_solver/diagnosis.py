@@ -7,6 +7,7 @@ Such a solution names the cause, and is never the answer.
 from __future__ import annotations
 
 import datetime
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -35,7 +36,7 @@ TRAILS = "trails of {:.0f} px: a shorter exposure, a steadier camera, or a mount
 FEW_LIGHTS = 10
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Refusal:
     """A monochrome image that was refused: its centroids, and the solvers that were tried.
 
@@ -58,6 +59,7 @@ class Refusal:
         """Whether there are lights enough for a solution."""
         return len(self.centroids) >= MIN_EVIDENCE_MATCHES
 
+    @functools.cached_property
     def blobs(self) -> Blobs:
         """What the detector found, with what cannot be a star."""
         settings = self.solvers[0].settings
@@ -158,7 +160,7 @@ def overexposed(refusal: Refusal) -> str:
 
 def trailed(refusal: Refusal) -> str:
     """The brightest blobs are parallel lines: the detector's streak, or most of a few are long for their area."""
-    blobs = refusal.blobs()
+    blobs = refusal.blobs
     if blobs.streak_px is not None:
         return TRAILS.format(math.hypot(*blobs.streak_px))
     sides_px, area_px = brightest_shapes(blobs)
@@ -172,7 +174,7 @@ def trailed(refusal: Refusal) -> str:
 
 def out_of_focus(refusal: Refusal) -> str:
     """The brightest blobs are large, filled, and of one size, whatever their brightness."""
-    sides_px, area_px = brightest_shapes(refusal.blobs())
+    sides_px, area_px = brightest_shapes(refusal.blobs)
     diameter_px = np.sqrt(4 / np.pi * area_px)
     large = (diameter_px >= BLUR_PX) & (area_px >= FILLED * sides_px.prod(axis=1))
     if not large.any():

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.core.errors import ImageError
+from estimator.core.types import Centroids
 from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
@@ -84,7 +85,7 @@ def pictures_in(paths: Iterable[Path]) -> list[Path]:
         if not path.is_dir():
             found.append(path)
             continue
-        names = sorted(child for child in path.iterdir() if child.name.lower().endswith(images.IMAGE_SUFFIXES))
+        names = sorted(child for child in path.iterdir() if images.image_suffix(child.name))
         names = [child for child in names if child.name[0] != "." and not child.name.endswith(ANNOTATED)]
         if not names:
             raise InputError(f"{path}: a folder without images; allowed: {', '.join(images.IMAGE_SUFFIXES)}")
@@ -105,8 +106,8 @@ def annotated_paths(folder: Path, paths: list[Path]) -> list[Path]:
 
 def stem_of(path: Path) -> str:
     """The file's name without the suffix of its image format."""
-    suffixes = [suffix for suffix in images.IMAGE_SUFFIXES if path.name.lower().endswith(suffix)]
-    return path.name.removesuffix(path.name[-len(max(suffixes, key=len)) :]) if suffixes else path.stem
+    suffix = images.image_suffix(path.name)
+    return path.name[: -len(suffix)] if suffix else path.stem
 
 
 def solve_file(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
@@ -163,9 +164,12 @@ def check_image(path: Path, image: NDArray, solver: Solver) -> None:
 def solve_picture(picture: images.Picture, solver: Solver, date_utc: datetime.datetime | None) -> Outcome:
     """Solve the hypotheses about a monochrome picture in turn, up to the first that is solved."""
     tried = hypotheses(picture, solver)
-    outcomes = []
+    outcomes, centroids = [], dict[int, Centroids]()  # those of a reading serve all fields of view
     for hypothesis in tried:
-        outcomes.append(Outcome(hypothesis, *solve_array(hypothesis.pixels, hypothesis.solver, date_utc), tried))
+        reading = id(hypothesis.pixels)
+        solved = solve_array(hypothesis.pixels, hypothesis.solver, date_utc, centroids.get(reading))
+        outcomes.append(Outcome(hypothesis, *solved, tried))
+        centroids[reading] = outcomes[-1].report.centroids
         if outcomes[-1].report.attitude.solved:
             return outcomes[-1]
     return outcomes[0]

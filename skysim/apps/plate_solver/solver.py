@@ -229,12 +229,18 @@ def validated_date(date_utc: datetime.datetime | None) -> tuple[datetime.datetim
         return None, str(error)
 
 
-def solve_array(image: NDArray, solver: Solver, date_utc: datetime.datetime | None) -> tuple[Report, StarTracker]:
-    """Solve one monochrome image and return the report and the tracker that made it. date_utc : None if unknown."""
+def solve_array(
+    image: NDArray, solver: Solver, date_utc: datetime.datetime | None, centroids: Centroids | None = None
+) -> tuple[Report, StarTracker]:
+    """Solve one monochrome image and return the report and the tracker that made it.
+
+    date_utc : None if unknown;  centroids : of this image, if they are known
+    """
     height_px, width_px = image.shape
     first = next(solver.trackers(width_px, height_px, date_utc))
     clock = Clock()
-    centroids = detect_and_centroid(image, first.camera, solver.settings, clock)  # of the camera only the size is used
+    if centroids is None:  # of the camera only the size is used
+        centroids = detect_and_centroid(image, first.camera, solver.settings, clock)
     attitude, tracker = solve_centroids(centroids, solver, (width_px, height_px), date_utc, clock)
     return Report(attitude, centroids, clock.seconds), tracker
 

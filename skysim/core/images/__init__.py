@@ -9,6 +9,7 @@ from skysim.core.images.live import LiveCamera as LiveCamera
 from skysim.core.images.live import grab_frame as grab_frame
 from skysim.core.images.reader import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from skysim.core.images.reader import Picture as Picture
+from skysim.core.images.reader import image_suffix as image_suffix
 from skysim.core.images.reader import monochrome as monochrome
 from skysim.core.images.reader import read_image as read_image
 from skysim.core.images.reader import read_picture as read_picture

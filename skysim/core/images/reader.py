@@ -56,11 +56,16 @@ def read_image(path: Path) -> NDArray:
     return check_numbers(path, fits.read_fits(path) if is_fits(path) else encoded.decode_image(path, path.read_bytes()))
 
 
+def image_suffix(name: str) -> str:
+    """The suffix of an image file's name, in small letters: the longest known one; empty if there is none."""
+    return max((suffix for suffix in IMAGE_SUFFIXES if name.lower().endswith(suffix)), key=len, default="")
+
+
 def check_name(path: Path) -> None:
     """Raise InputError for a missing or too large file, and for one with the suffix of no known format."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    if not path.name.lower().endswith(IMAGE_SUFFIXES):
+    if not image_suffix(path.name):
         raise InputError(f"{path}: unknown image suffix; allowed: {', '.join(IMAGE_SUFFIXES)}")
     check_bytes(path)
 

@@ -242,10 +242,10 @@ def print_new(path: Path, filled: Sheet) -> None:
     lens, body = read_camera(str(path), None)
     print("{path}: {width_px} x {height_px} px".format(path=path, **body) + (f"; {lens.field_text()}" if lens else ""))
     if filled.missing:
-        print(f"not stated, and assumed in {path}:" if filled.missing else "")
+        print(f"not stated, and assumed in {path}:")
+    width = min(max(terminal_width(), 40), 100)
     for one in filled.missing:
         name = one.name.replace("_", " ")
         line = f"{name:19s}{one.assumed or 'left out'}: {one.consequence}"
-        width = min(max(terminal_width(), 40), 100)
         print(textwrap.fill(line, width, initial_indent="  ", subsequent_indent=" " * 21, break_on_hyphens=False))
     print(f"in a scene: camera: {{preset: {path}}}; skysim camera {path} shows it")

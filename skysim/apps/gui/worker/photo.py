@@ -63,12 +63,12 @@ SUFFIXES = tuple(dict.fromkeys("." + suffix.rpartition(".")[2] for suffix in ima
 
 def photo_from_file(name: str, data: bytes, fov_deg: float | None) -> PhotoPixels:
     """Solve an uploaded file, as it is viewed. Raises InputError if it is no readable image."""
-    suffixes = [suffix for suffix in images.IMAGE_SUFFIXES if name.lower().endswith(suffix)]
-    if not suffixes:
+    suffix = images.image_suffix(name)
+    if not suffix:
         raise InputError(f"{Path(name).name}: allowed: {', '.join(images.IMAGE_SUFFIXES)}")
     solver = plate_solver.make_solver(fov_deg, None)
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"upload{max(suffixes, key=len)}"
+        path = Path(folder) / f"upload{suffix}"
         path.write_bytes(data)
         try:
             picture = plate_solver.load_picture(path, solver)
