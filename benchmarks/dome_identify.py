@@ -22,7 +22,7 @@ from skysim.scene import loader
 from skysim.simulation.testbed import build_testbed
 from skysim.sources.dome.layouts import placing
 from skysim.sources.dome.placement import optimize
-from skysim.sources.dome.surface import Surface, build_surface
+from skysim.sources.dome.shell.surface import Surface, build_surface
 from skysim.tracking.onboard_model import calibration
 
 COUNT, CAP_DEG, TILT_DEG = 1400, 40.0, 30.0

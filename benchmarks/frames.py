@@ -23,7 +23,7 @@ from estimator.core.camera import Camera
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.paths import CATALOGS
-from skysim.core.units import ARCSEC_RAD
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.results.metrics import WRONG_RAD
 
 STEP_PX = 0.1  # step of the Gaussians along a streak

@@ -28,7 +28,7 @@ from estimator.core.types import Attitude
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps import plate_solver
-from skysim.core import images
+from skysim.core.io import images
 from skysim.core.paths import CATALOGS
 from skysim.results.files import frames
 from skysim.results.metrics import normalized_error_squared

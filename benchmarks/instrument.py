@@ -17,7 +17,7 @@ from skysim.camera.detector.detector import Detector, expose
 from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render
 from skysim.core.types import Floats, Mount, Sources, Trajectory
-from skysim.scene.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig
 
 AT_CENTER = Mount(np.zeros(3), Rotation.identity())
 EXPOSURE_S = 0.01

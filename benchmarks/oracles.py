@@ -30,8 +30,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.core.camera import Camera
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Frame, Trajectory, Truth
-from skysim.core.units import ARCSEC_RAD
 from skysim.results.files import frames as frame_files
 from skysim.results.metrics import WRONG_RAD
 from skysim.scene import loader

@@ -17,8 +17,9 @@ from skysim.apps.cli import terminal
 from skysim.apps.cli.commands import validate
 from skysim.apps.stream import packet
 from skysim.camera.psf import otf
-from skysim.core import images, units, yaml_reader
 from skysim.core.errors import InputError
+from skysim.core.io import images, yaml_reader
+from skysim.core.quantities import units
 from skysim.dynamics.controllers.interface import torque_of_reply
 from skysim.dynamics.multibody import mjcf
 from skysim.dynamics.profiles.load import read_profile
@@ -30,8 +31,8 @@ from skysim.results.files import recording
 from skysim.scene import loader, opencv_calibration
 from skysim.sources import catalog as star_catalog
 from skysim.sources import photometry
-from skysim.sources.dome import point_cloud
 from skysim.sources.dome.layouts import listed
+from skysim.sources.dome.shell import point_cloud
 from skysim.tracking import dome_map_file
 from skysim.tracking.external import interface
 

@@ -16,8 +16,8 @@ from skysim.core.paths import ROOT
 from skysim.core.types import Mount, Sources, Trajectory
 from skysim.dynamics import multibody
 from skysim.scene import opencv_calibration
-from skysim.scene.camera import CameraConfig
-from skysim.scene.vehicle import VehicleConfig
+from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.sources.stars import cam_from_icrs
 
 # A pinhole whose arithmetic can be done in the head: f = 1000 px, middle of the chip at (320, 240).

@@ -18,8 +18,8 @@ from skysim.experiments.study.execution.trials import run_frame_trial
 from skysim.experiments.study.plan import FrameTrial
 from skysim.results import metrics
 from skysim.scene import loader
-from skysim.scene.light import CollimatedDisplayConfig, StarsConfig
-from skysim.scene.vehicle import VehicleConfig
+from skysim.scene.sections.light import CollimatedDisplayConfig, StarsConfig
+from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation import exposure, run
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker, exposure_window
 from skysim.tracking import onboard_model

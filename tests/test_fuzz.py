@@ -24,13 +24,13 @@ from benchmarks.hostilefiles import promise
 from fuzz.__main__ import NAMES, TOKENS, mutate, seeds
 from fuzz.targets import TARGETS, rejects
 from skysim.camera.psf.otf import read_cells
-from skysim.core import images, yaml_reader
 from skysim.core.errors import InputError
-from skysim.core.images import encoded, limits
+from skysim.core.io import images, yaml_reader
+from skysim.core.io.images import encoded, limits
 from skysim.scene import loader
 from skysim.sources import photometry
-from skysim.sources.dome import point_cloud
 from skysim.sources.dome.layouts import listed
+from skysim.sources.dome.shell import point_cloud
 
 AS_IT_IS = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from skysim.apps import plate_solver
-from skysim.core import images
+from skysim.core.io import images
 from skysim.core.paths import ROOT
 from skysim.sources.stars import cam_from_icrs
 

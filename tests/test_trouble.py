@@ -21,8 +21,8 @@ from astropy.io import fits
 from typer.testing import CliRunner
 
 from skysim.apps.cli import main
-from skysim.core import files
 from skysim.core.errors import InputError
+from skysim.core.io import files
 from skysim.results.files import export, frames, recording
 from skysim.scene import loader
 from skysim.simulation import run

@@ -17,10 +17,10 @@ from skysim.camera.render import Window, render
 from skysim.core.types import Floats, Mount, Sources, Trajectory
 from skysim.dynamics import multibody
 from skysim.scene import loader
-from skysim.scene.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig
 from skysim.sources import stars as star_sources
 from skysim.sources.catalog import read
-from skysim.sources.dome import surface
+from skysim.sources.dome.shell import surface
 
 mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "skysim", "font.family": "sans-serif", "font.size": 11})
 LABEL_BOX = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}  # an opaque background for labels

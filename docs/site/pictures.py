@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 
-from skysim.core import files
+from skysim.core.io import files
 from skysim.dynamics.multibody.view.picture import picture
 from skysim.results import report, telemetry_report
 from skysim.scene import loader

@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.optics import Optics, radial, tangential
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.scene.camera import CameraConfig
-from skysim.scene.light import Glow, MoonGlowConfig, SkyGlowConfig, StrayLightConfig, UniformGlowConfig
+from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.light import Glow, MoonGlowConfig, SkyGlowConfig, StrayLightConfig, UniformGlowConfig
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 
 MAX_NODE_SPACING_PX = 32.0

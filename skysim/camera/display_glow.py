@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.background import pixel_directions, viewing_geometry
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats
-from skysim.scene import layouts, leds, light
+from skysim.scene.sections import layouts, leds, light
 from skysim.sources.dome.display import black_transmission, panel_surface
 from skysim.sources.dome.led import LOBES, full_strength_e_s_sr
-from skysim.sources.dome.surface import build_surface
+from skysim.sources.dome.shell.surface import build_surface
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
 

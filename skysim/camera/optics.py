@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from skysim.core.types import Floats
-from skysim.scene.camera import CameraConfig, TwoStopsConfig, VignettingTableConfig
+from skysim.scene.sections.camera import CameraConfig, TwoStopsConfig, VignettingTableConfig
 
 
 def two_stops(config: TwoStopsConfig, field_rad: Floats) -> Floats:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats
-from skysim.scene.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig
 
 MAX_ORDER = 9  # the highest that SIP allows
 TARGET_ERROR_PX = 1e-4  # error at which the order is high enough

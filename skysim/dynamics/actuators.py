@@ -19,7 +19,7 @@ import numpy as np
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.scene.motion import DesaturationConfig
+from skysim.scene.sections.motion import DesaturationConfig
 
 # Generalized singularity-robust inverse and the weights of variable-speed CMGs: the sizes are `assumed`.
 DAMPING = 0.01  # lambda at a singularity, in units of the rotors' momentum squared

@@ -12,7 +12,7 @@ from skysim.core.jit import jit
 from skysim.core.quaternion import apply, cross, inverse, matrix_vector, multiply, to_rotvec
 from skysim.core.types import Floats
 from skysim.dynamics.guidance import Reference
-from skysim.scene.motion import ControlConfig
+from skysim.scene.sections.motion import ControlConfig
 
 TORQUE_DEFICIT = 0.01  # relative torque deficit that counts as a limit; damped steering gives smaller ones
 

@@ -17,7 +17,7 @@ from skysim.core.jit import jit
 from skysim.core.quaternion import apply, cross, inverse, matrix_vector
 from skysim.core.types import Floats
 from skysim.dynamics.guidance import Impulse
-from skysim.scene.vehicle import AirCurrentConfig, DisturbancesConfig
+from skysim.scene.sections.vehicle import AirCurrentConfig, DisturbancesConfig
 
 
 @jit

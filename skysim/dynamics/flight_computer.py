@@ -13,17 +13,17 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from skysim.core.quantities.units import RPM_RAD_S
 from skysim.core.types import Floats
-from skysim.core.units import RPM_RAD_S
 from skysim.dynamics.actuators import CmgSet, Desaturator, FanSet, WheelSet
 from skysim.dynamics.attitude_control import Pid, build_controller
 from skysim.dynamics.controllers.adapter import NO_SOURCE, ControllerSource, ExternalLaw, external_law
 from skysim.dynamics.controllers.interface import ControllerSetup
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import VehicleModel
-from skysim.scene.motion import BUILT_IN_LAWS, ControlConfig
 from skysim.scene.scene import Scene
-from skysim.scene.vehicle import CmgsConfig, FansConfig, WheelsConfig
+from skysim.scene.sections.motion import BUILT_IN_LAWS, ControlConfig
+from skysim.scene.sections.vehicle import CmgsConfig, FansConfig, WheelsConfig
 
 GYRO_RATE_FRACTION = 0.7  # of the gyros' rate limit (`assumed`)
 

@@ -25,7 +25,7 @@ from skysim.core.types import Floats
 from skysim.dynamics.profiles.angle import AngleProfile, linear_sweep, log_sweep, rest_to_rest, steady, still
 from skysim.dynamics.profiles.rate_change import integrate_knots, rate_change_state
 from skysim.dynamics.profiles.spline import AttitudeSpline
-from skysim.scene.motion import (
+from skysim.scene.sections.motion import (
     AttitudeConfig,
     BumpConfig,
     ChirpConfig,

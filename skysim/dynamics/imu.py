@@ -21,10 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
+from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import random_stream
-from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
-from skysim.scene.vehicle import AccelerometerConfig, GyroConfig, ImuConfig, SiteConfig
+from skysim.scene.sections.vehicle import AccelerometerConfig, GyroConfig, ImuConfig, SiteConfig
 
 EARTH_RATE_RAD_S = 7.2921150e-5  # sidereal rate, 15.041 deg/h (WGS 84)
 STANDARD_GRAVITY_M_S2 = 9.80665  # unit of the accelerometers' g and ug, independent of the lab's gravity

@@ -22,7 +22,7 @@ from skysim.core.jit import jit
 from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.guidance import Reference, plan, vibration_intervals
 from skysim.dynamics.profiles.angle import envelope
-from skysim.scene.motion import JitterBandConfig, JitterLineConfig, JitterPart, MotionConfig
+from skysim.scene.sections.motion import JitterBandConfig, JitterLineConfig, JitterPart, MotionConfig
 
 SINES_PER_BAND = 128  # sines in a band; even a steep spectrum has tens of similar amplitude
 SAMPLES_PER_PERIOD = (

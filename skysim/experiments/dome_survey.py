@@ -25,9 +25,9 @@ from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.core.errors import InputError
+from skysim.core.quantities.units import quantity
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Frame, Truth
-from skysim.core.units import quantity
 from skysim.experiments.configs import with_config
 from skysim.experiments.dome_survey_naming import (
     CalibrationPrior,
@@ -37,8 +37,8 @@ from skysim.experiments.dome_survey_naming import (
     match_by_imu,
     match_by_survey,
 )
-from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.light import DomeConfig
 from skysim.simulation import exposure
 from skysim.simulation.testbed import Testbed
 from skysim.tracking import onboard_model

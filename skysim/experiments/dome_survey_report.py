@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from estimator.calibration.dome_survey import DomeSurvey
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Truth
-from skysim.core.units import ARCSEC_RAD
 from skysim.experiments.dome_survey import led_sigma_m, lens_sigma
 from skysim.experiments.dome_survey_naming import CalibrationPrior, SurveyUncertainty
 from skysim.results import metrics

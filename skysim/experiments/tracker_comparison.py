@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from skysim.core import files
 from skysim.core.errors import InputError
+from skysim.core.io import files
 from skysim.core.types import Frame, FrameRow, Truth
 from skysim.experiments.configs import with_config
 from skysim.results import metrics, scoring

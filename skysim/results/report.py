@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.core.files import write_text
+from skysim.core.io.files import write_text
 from skysim.core.types import Floats, FrameRow, SourceTruth
 from skysim.results.plots import figure_png, stacked_axes
 from skysim.results.stretch import to_8bit

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.types import ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Frame, FrameRow, Mount, Truth
-from skysim.core.units import ARCSEC_RAD
 from skysim.results import metrics
 from skysim.results.report import annotate
-from skysim.scene.light import StarsConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.run import FrameResult
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from skysim.core.quantities.units import RPM_RAD_S
 from skysim.core.types import Floats, Telemetry
-from skysim.core.units import RPM_RAD_S
 from skysim.dynamics.imu import Increments, tilt_rad
 from skysim.results.plots import figure_png, stacked_axes
 

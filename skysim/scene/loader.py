@@ -19,15 +19,15 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
-from skysim.core import yaml_reader
 from skysim.core.errors import InputError, unknown_name
+from skysim.core.io import yaml_reader
+from skysim.core.io.yaml_reader import Files, check_version, explain, is_file, location_of, read_yaml, set_key
 from skysim.core.paths import DATA, SCENES
-from skysim.core.units import ConfigModel, quantity
-from skysim.core.yaml_reader import Files, check_version, explain, is_file, location_of, read_yaml, set_key
-from skysim.scene.camera import CameraConfig, focus_distance
+from skysim.core.quantities.units import ConfigModel, quantity
 from skysim.scene.keys import unused
 from skysim.scene.opencv_calibration import read as read_calibration
 from skysim.scene.scene import NAME_ALIAS, Scene
+from skysim.scene.sections.camera import CameraConfig, focus_distance
 
 PRESETS = DATA / "cameras"
 

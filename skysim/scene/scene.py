@@ -13,14 +13,14 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from skysim.core.tolerance import TimeError
-from skysim.core.units import ConfigModel, Number, Time
-from skysim.core.utc import check_year
-from skysim.scene.camera import CameraConfig
-from skysim.scene.light import DomeConfig, Glow, Light
-from skysim.scene.motion import MotionConfig, PointingConfig
-from skysim.scene.tracker import FilterConfig, SurveyErrorsConfig, TrackerConfig
-from skysim.scene.vehicle import SiteConfig, VehicleConfig
+from skysim.core.quantities.tolerance import TimeError
+from skysim.core.quantities.units import ConfigModel, Number, Time
+from skysim.core.quantities.utc import check_year
+from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.light import DomeConfig, Glow, Light
+from skysim.scene.sections.motion import MotionConfig, PointingConfig
+from skysim.scene.sections.tracker import FilterConfig, SurveyErrorsConfig, TrackerConfig
+from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
 
 NAME_ALIAS = "(the file's name)"  # alias of Scene.name, not a valid key in a file
 

@@ -18,9 +18,9 @@ from numba.core import event
 
 from skysim.camera.detector.detector import saturation_dn
 from skysim.core.errors import InputError
+from skysim.core.io.yaml_reader import parse_overrides
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Frame
-from skysim.core.yaml_reader import parse_overrides
 from skysim.scene import loader
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker, exposure_window
 from skysim.tracking import factory

@@ -10,8 +10,8 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
 from skysim.dynamics.flight_computer import build_actuators, controlling_actuator, usage
-from skysim.scene.motion import ControlConfig
-from skysim.scene.vehicle import VehicleConfig
+from skysim.scene.sections.motion import ControlConfig
+from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation.testbed import Testbed
 
 TILT_CHECK_S = 0.05  # sampling interval of a maneuver when its tilt is checked

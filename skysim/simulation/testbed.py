@@ -17,8 +17,8 @@ from skysim.camera.detector.detector import Detector
 from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT
 from skysim.camera.render import Window
+from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import CAMERA_TIMING, random_stream
-from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Mount, Sources, Telemetry, Trajectory
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.controllers.adapter import ControllerSource
@@ -26,15 +26,16 @@ from skysim.dynamics.controllers.interface import Factory
 from skysim.dynamics.multibody.view import mjcf_export
 from skysim.dynamics.profiles.load import load_profiles
 from skysim.dynamics.profiles.spline import AttitudeSpline
-from skysim.scene.camera import RollingShutterConfig
-from skysim.scene.light import CollimatedDisplayConfig, DomeConfig
-from skysim.scene.motion import PointingConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.camera import RollingShutterConfig
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene.sections.motion import PointingConfig
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
-from skysim.sources.dome import display, surface
+from skysim.sources.dome import display
 from skysim.sources.dome.clocks import Clocks, build_clocks
 from skysim.sources.dome.led import Emitter
+from skysim.sources.dome.shell import surface
 from skysim.sources.photometry import Band
 from skysim.tracking import factory, settings
 from skysim.tracking.external.interface import TRACKERS

@@ -10,9 +10,9 @@ from typing import Any
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
-from skysim.core.yaml_reader import is_file
-from skysim.scene.motion import PRESCRIBED, ControlConfig, MotionConfig, ProfileConfig
+from skysim.core.io.yaml_reader import is_file
 from skysim.scene.scene import Scene
+from skysim.scene.sections.motion import PRESCRIBED, ControlConfig, MotionConfig, ProfileConfig
 from skysim.simulation.testbed import Testbed, build_testbed
 from skysim.tracking import factory
 from skysim.tracking.external.function import FunctionTracker

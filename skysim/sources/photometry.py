@@ -20,7 +20,7 @@ import numpy as np
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.types import Floats
-from skysim.scene.camera import EfficiencyConfig, curve_file
+from skysim.scene.sections.camera import EfficiencyConfig, curve_file
 
 HC_J_M = 6.62607015e-34 * 299792458.0  # energy of a photon times its wavelength
 HC_K_M = HC_J_M / 1.380649e-23

@@ -8,8 +8,8 @@ import erfa
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from skysim.core.quantities.utc import in_utc
 from skysim.core.types import Floats, Sources
-from skysim.core.utc import in_utc
 from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import Band, star_flux_e_s_m2
 

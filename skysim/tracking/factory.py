@@ -17,8 +17,8 @@ from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
 from skysim.core.types import Frame, Mount, Sources
-from skysim.scene.light import CollimatedDisplayConfig, DomeConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.sources.dome import display
 from skysim.tracking.external import adapter
 from skysim.tracking.external.adapter import ExternalTracker

@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Attitude
 from estimator.filter.mekf import AttitudeFilter, GyroModel
 from skysim.core import quaternion
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats, Mount
-from skysim.core.units import ARCSEC_RAD
 from skysim.dynamics import imu
 from skysim.scene.scene import Scene
-from skysim.scene.tracker import FilterConfig
+from skysim.scene.sections.tracker import FilterConfig
 
 
 class Navigation:

@@ -13,12 +13,13 @@ from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
 from skysim.core.types import Mount, Sources
-from skysim.scene.camera import CameraConfig
-from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.light import DomeConfig
 from skysim.sources.catalog import require_catalog
-from skysim.sources.dome import surface, survey_errors
 from skysim.sources.dome.layouts import registry
+from skysim.sources.dome.shell import surface
+from skysim.sources.dome.survey import survey_errors
 from skysim.tracking import dome_map_file
 
 

@@ -14,8 +14,8 @@ from estimator.trackers.dome_tracker import IDENTIFIERS as NEAR_IDENTIFIERS
 from estimator.trackers.pipeline import Settings
 from skysim.camera.detector.detector import saturation_dn
 from skysim.core.errors import InputError, unknown_name
-from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.light import DomeConfig
 
 DOME_ALGORITHMS = {
     "detector": "local",

@@ -22,8 +22,8 @@ from estimator.trackers.pipeline import Clock
 from skysim.apps import plate_solver
 from skysim.apps.plate_solver import picture as plate_picture
 from skysim.apps.plate_solver import solution, solver
-from skysim.core import images
 from skysim.core.errors import InputError
+from skysim.core.io import images
 from skysim.core.types import Frame, Truth
 from skysim.results.files import frames
 from skysim.scene import loader

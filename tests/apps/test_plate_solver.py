@@ -16,7 +16,7 @@ from estimator.trackers.star_tracker import NO_MATCH, NO_STARS
 from skysim.apps import plate_solver
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.units import ARCSEC_RAD
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.scene import loader
 from skysim.simulation import exposure, run
 from skysim.simulation.testbed import Testbed

@@ -24,8 +24,8 @@ from skysim.camera.background import (
     viewing_geometry,
 )
 from skysim.camera.optics import Optics
-from skysim.scene import light
-from skysim.scene.camera import CameraConfig
+from skysim.scene.sections import light
+from skysim.scene.sections.camera import CameraConfig
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
 BAND = Band.from_efficiency(0.5)

@@ -15,7 +15,7 @@ from skysim.camera.detector.cosmic_rays import (
     draw_tracks,
 )
 from skysim.core.errors import InputError
-from skysim.scene.camera import ParticlesConfig
+from skysim.scene.sections.camera import ParticlesConfig
 
 PIXEL_M = 10e-6
 SHAPE = (200, 300)

@@ -14,7 +14,7 @@ from scipy import stats
 from skysim.camera.detector import detector
 from skysim.camera.detector.detector import Detector
 from skysim.core.types import SourceTruth
-from skysim.scene.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig
 
 SHAPE = (400, 500)
 N = SHAPE[0] * SHAPE[1]
@@ -320,7 +320,7 @@ def test_the_mean_of_many_frames_is_the_frame_without_noise() -> None:
 
 DRAW = """
 import sys, numba, numpy as np
-from skysim.scene.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig
 from skysim.camera.detector.detector import Detector, expose
 numba.set_num_threads(int(sys.argv[1]))
 made = Detector.from_camera(CameraConfig.model_validate(eval(sys.argv[2])))

@@ -10,7 +10,7 @@ import pytest
 from skysim.camera.psf.kernel import build_kernel
 from skysim.camera.psf.kernel_cache import GAUSS, GRID, ROUND, sharpness_px, source_kernels
 from skysim.core.errors import InputError
-from skysim.scene.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig
 
 
 def camera(**changes: Any) -> CameraConfig:

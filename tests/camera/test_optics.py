@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.optics import VIGNETTING, Optics, fold_r
 from skysim.camera.render import Window, render
 from skysim.core.types import Mount, Sources, Trajectory
-from skysim.scene.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig
 
 CAMERA = {
     "width_px": 659,

@@ -16,7 +16,7 @@ from skysim.camera.psf.kernel import Kernel, build_kernel, round_kernel
 from skysim.camera.psf.otf import EXTENT, PSFS, airy_unit_px, blur_radius_px, cell_response, field_sigma_px
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene.camera import (
+from skysim.scene.sections.camera import (
     AiryPsfConfig,
     CameraConfig,
     DiskPsfConfig,

@@ -20,9 +20,9 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
 from skysim.dynamics.jitter import Vibration
 from skysim.scene import loader
-from skysim.scene.camera import CameraConfig
-from skysim.scene.leds import CosineLobeConfig
-from skysim.scene.motion import JitterLineConfig, MotionConfig
+from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.leds import CosineLobeConfig
+from skysim.scene.sections.motion import JitterLineConfig, MotionConfig
 from skysim.sources.dome.led import Emitter
 from skysim.sources.photometry import SUN, Band, led_strength_e_s_sr, star_flux_e_s_m2
 

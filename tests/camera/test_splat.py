@@ -11,7 +11,7 @@ from splatting import add_kernel
 from skysim.camera.psf import splat
 from skysim.camera.psf.kernel import Kernel, build_kernel, grid_kernel, round_kernel
 from skysim.core.types import Floats
-from skysim.scene.camera import CameraConfig, GaussianPsfConfig, MoffatPsfConfig, Psf
+from skysim.scene.sections.camera import CameraConfig, GaussianPsfConfig, MoffatPsfConfig, Psf
 
 CAMERA = CameraConfig.model_validate(
     {

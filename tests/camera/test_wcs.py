@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skysim.camera import wcs
-from skysim.scene.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig
 
 
 @pytest.mark.parametrize("center_px", [(319.5, 239.5), (-300.0, 239.5), (900.0, 700.0), (-250.0, -200.0)])

@@ -20,9 +20,9 @@ from astropy.table import Table
 from astropy.wcs import WCS
 from scipy.spatial.transform import Rotation
 
-from skysim.core import files, images
 from skysim.core.errors import InputError
-from skysim.core.files import HOST, TEMPORARY_NAME
+from skysim.core.io import files, images
+from skysim.core.io.files import HOST, TEMPORARY_NAME
 from skysim.core.types import Frame, Truth
 from skysim.results.files import ccsds_aem, frames
 from skysim.scene import loader, scene
@@ -264,7 +264,7 @@ def test_an_interrupt_leaves_the_old_folder_or_the_new(tmp_path: Path, monkeypat
 KILLED = """
 import os, sys
 from pathlib import Path
-from skysim.core import files as io
+from skysim.core.io import files as io
 out = Path(sys.argv[1])
 with io.atomic_file(out / "solutions.ecsv") as file, io.atomic_folder(out / "frames.zarr") as folder:
     file.write_text("half")

@@ -17,10 +17,10 @@ from astropy.io import fits
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
-from skysim.core import images
 from skysim.core.errors import InputError
-from skysim.core.images import encoded, limits, tiff
-from skysim.core.images import fits as fits_images
+from skysim.core.io import images
+from skysim.core.io.images import encoded, limits, tiff
+from skysim.core.io.images import fits as fits_images
 
 RNG = np.random.default_rng(4)
 GRAY = np.kron(RNG.integers(0, 255, (5, 7), np.uint8), np.ones((8, 8), np.uint8))  # blocks, which JPEG keeps

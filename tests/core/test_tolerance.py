@@ -12,13 +12,14 @@ from pydantic import ValidationError
 from scipy import stats
 
 from skysim.core.errors import InputError
-from skysim.core.tolerance import LengthError, NumberError, Tolerance, scaled_errors
-from skysim.core.units import ConfigModel
+from skysim.core.quantities.tolerance import LengthError, NumberError, Tolerance, scaled_errors
+from skysim.core.quantities.units import ConfigModel
 from skysim.dynamics import imu
-from skysim.scene import loader, vehicle
+from skysim.scene import loader
+from skysim.scene.sections import vehicle
 from skysim.sources import dome
-from skysim.sources.dome import survey_errors
 from skysim.sources.dome.clocks import Clocks
+from skysim.sources.dome.survey import survey_errors
 from skysim.sources.photometry import Band
 
 COUNT = 200_000

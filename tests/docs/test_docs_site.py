@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from skysim.apps.cli import main
 from skysim.core.paths import ROOT
 from skysim.scene.scene import ExposureConfig
-from skysim.scene.tracker import SurveyErrorsConfig
+from skysim.scene.sections.tracker import SurveyErrorsConfig
 
 
 def of_the_site(name: str) -> ModuleType:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.dynamics.actuators import STEERING, CmgSet, Desaturator, FanSet, WheelSet
-from skysim.scene.motion import DesaturationConfig
+from skysim.scene.sections.motion import DesaturationConfig
 
 BUS = np.array([[3.0, 0.2, -0.1], [0.2, 4.0, 0.3], [-0.1, 0.3, 5.0]])  # kg m2, less the rotors about their axles
 BUS_INVERSE = np.linalg.inv(BUS)

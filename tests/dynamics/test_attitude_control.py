@@ -15,7 +15,7 @@ from skysim.core.types import Floats
 from skysim.dynamics.attitude_control import Pid, build_controller
 from skysim.dynamics.guidance import Reference, plan
 from skysim.scene import loader
-from skysim.scene.motion import ControlConfig, MotionConfig
+from skysim.scene.sections.motion import ControlConfig, MotionConfig
 from skysim.simulation import run
 
 INERTIA = np.array([6.0, 6.5, 9.0])

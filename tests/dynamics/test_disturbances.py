@@ -15,7 +15,7 @@ from skysim.dynamics.disturbances import AirCurrent, DisturbanceModel, earth_tor
 from skysim.dynamics.guidance import Impulse
 from skysim.dynamics.imu import earth_rate_lab_rad_s
 from skysim.scene import loader
-from skysim.scene.vehicle import AirCurrentConfig, DisturbancesConfig, SiteConfig
+from skysim.scene.sections.vehicle import AirCurrentConfig, DisturbancesConfig, SiteConfig
 from skysim.simulation import run
 from skysim.simulation.testbed import Testbed
 

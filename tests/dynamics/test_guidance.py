@@ -22,7 +22,7 @@ from skysim.dynamics.guidance import (
     vibration_intervals,
 )
 from skysim.dynamics.profiles.angle import envelope
-from skysim.scene.motion import AttitudeConfig, MotionConfig, SlewConfig, StepConfig
+from skysim.scene.sections.motion import AttitudeConfig, MotionConfig, SlewConfig, StepConfig
 
 HOLD = {"kind": "hold", "duration": "2 s"}
 LIMITS = {"rate_deg_s": 2.0, "acceleration_deg_s2": 0.5}

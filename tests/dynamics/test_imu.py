@@ -27,7 +27,7 @@ from skysim.dynamics.imu import (
     ideal_increments,
     tilt_rad,
 )
-from skysim.scene.vehicle import ImuConfig, SiteConfig
+from skysim.scene.sections.vehicle import ImuConfig, SiteConfig
 
 G = 9.80665
 DEG_H = np.radians(1) / 3600

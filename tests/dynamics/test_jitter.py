@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.types import Trajectory
 from skysim.dynamics.jitter import SPECTRA, Vibration, concatenate, evaluate_sines, rotvec_body_rate
-from skysim.scene.motion import JitterBandConfig, JitterLineConfig, MotionConfig
+from skysim.scene.sections.motion import JitterBandConfig, JitterLineConfig, MotionConfig
 
 ARCSEC = np.radians(1 / 3600)
 RMS = (5.0, 2.0, 0.5)

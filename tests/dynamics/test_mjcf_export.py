@@ -22,7 +22,7 @@ from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
-from skysim.sources.dome import surface
+from skysim.sources.dome.shell import surface
 from skysim.sources.photometry import Band
 
 EVERYTHING = {

@@ -22,8 +22,8 @@ from skysim.core.types import Floats, Trajectory
 from skysim.dynamics import multibody
 from skysim.dynamics.attitude_control import build_controller
 from skysim.dynamics.guidance import plan, start_attitude
-from skysim.scene.motion import MotionConfig
-from skysim.scene.vehicle import VehicleConfig
+from skysim.scene.sections.motion import MotionConfig
+from skysim.scene.sections.vehicle import VehicleConfig
 
 STILL = np.zeros(3)
 LEVEL = Rotation.identity()

@@ -15,11 +15,12 @@ from skysim.core.types import Floats, Sources
 from skysim.dynamics import multibody
 from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.occlusion import behind_wall
-from skysim.scene import light, loader
+from skysim.scene import loader
+from skysim.scene.sections import light
 from skysim.simulation import exposure
 from skysim.simulation.testbed import Testbed, build_testbed
-from skysim.sources.dome import surface
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.shell import surface
+from skysim.sources.dome.shell.surface import Surface
 
 SIMSAT = (SCENES / "vehicles" / "simsat.xml").read_text(encoding="utf-8")
 QUIET = {

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.types import Floats
 from skysim.dynamics import multibody
-from skysim.scene.vehicle import VehicleConfig
+from skysim.scene.sections.vehicle import VehicleConfig
 
 STILL = np.zeros(3)
 LEVEL = Rotation.identity()

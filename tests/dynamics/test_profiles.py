@@ -11,14 +11,14 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from skysim.core.errors import InputError
-from skysim.core.units import ARCSEC_RAD
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.dynamics.guidance import plan
 from skysim.dynamics.profiles import text
 from skysim.dynamics.profiles.load import read_profile
 from skysim.dynamics.profiles.samples import MAX_SAMPLES, Samples, check_samples
 from skysim.dynamics.profiles.spline import fit_spline
 from skysim.results.files import ccsds_aem
-from skysim.scene.motion import MotionConfig, ProfileConfig
+from skysim.scene.sections.motion import MotionConfig, ProfileConfig
 from skysim.sources.stars import cam_from_icrs
 
 START = datetime.datetime(2016, 12, 31, 12, 0, 0)

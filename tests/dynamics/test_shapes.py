@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.dynamics import multibody
 from skysim.dynamics.multibody.view.shapes import Shape, shapes
-from skysim.scene.vehicle import VehicleConfig
+from skysim.scene.sections.vehicle import VehicleConfig
 
 # The tetrahedron is neither centered nor turned as its principal axes are.
 PARTS = """<mujoco>

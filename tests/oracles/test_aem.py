@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from skysim.core import files
 from skysim.core.errors import InputError
+from skysim.core.io import files
 from skysim.core.paths import ROOT
 from skysim.dynamics.profiles.load import read_profile
 from skysim.results.files import ccsds_aem

@@ -11,7 +11,7 @@ from splatting import add_kernel
 
 from skysim.camera.psf.kernel import Kernel, build_kernel
 from skysim.core.types import Floats
-from skysim.scene.camera import (
+from skysim.scene.sections.camera import (
     AiryPsfConfig,
     CameraConfig,
     DiskPsfConfig,

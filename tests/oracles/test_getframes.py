@@ -9,7 +9,7 @@ import pytest
 
 from skysim.camera.detector import detector
 from skysim.camera.detector.detector import Detector
-from skysim.scene.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig
 
 gf = pytest.importorskip("getframes")
 

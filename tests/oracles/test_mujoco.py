@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics
 from skysim.dynamics.multibody.model import CAM_FROM_MJCAM
-from skysim.scene.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig
 
 WIDTH, HEIGHT = 640, 480
 CAMERA = CameraConfig.model_validate(

@@ -11,7 +11,7 @@ from astropy.wcs import WCS
 
 from skysim.camera import wcs
 from skysim.camera.optics import Optics
-from skysim.scene.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig
 from skysim.sources import stars as star_sources
 
 CAMERA = CameraConfig.model_validate(

@@ -21,13 +21,13 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera import wcs
 from skysim.camera.optics import Optics
-from skysim.core import files
 from skysim.core.errors import InputError
+from skysim.core.io import files
 from skysim.core.types import Floats
 from skysim.results import scoring, stretch
 from skysim.results.files import ccsds_aem, export, frames, recording
 from skysim.scene import loader
-from skysim.scene.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation import run
 from skysim.simulation.checks import check
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker

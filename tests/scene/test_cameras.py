@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from skysim.core.errors import InputError
-from skysim.scene.camera import CameraConfig
 from skysim.scene.loader import PRESETS, CameraFileConfig, with_preset
+from skysim.scene.sections.camera import CameraConfig
 
 FILES = sorted(PRESETS.glob("*.yaml"))
 NAMES = [path.stem for path in FILES]

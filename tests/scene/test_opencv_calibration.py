@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from skysim.apps import plate_solver
 from skysim.camera.optics import Optics
-from skysim.core import files
 from skysim.core.errors import InputError
+from skysim.core.io import files
 from skysim.results.files import frames
 from skysim.scene import loader, opencv_calibration
 from skysim.scene.opencv_calibration import Calibration

@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from skysim.apps.cli import main
 from skysim.apps.cli.commands import json_schema
 from skysim.apps.cli.commands.validate import check_file
-from skysim.core import yaml_reader
 from skysim.core.errors import InputError
+from skysim.core.io import yaml_reader
 from skysim.core.paths import DATA, ROOT, SCENES
 from skysim.experiments.study import loader
 from skysim.scene import opencv_calibration

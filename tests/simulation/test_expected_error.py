@@ -9,8 +9,8 @@ import pytest
 import scipy
 from scipy.spatial.transform import Rotation
 
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats, Trajectory
-from skysim.core.units import ARCSEC_RAD
 from skysim.results import metrics
 from skysim.scene import loader
 from skysim.simulation.checks import attitudes, beliefs, detection, expected_error, plan

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.units import ARCSEC_RAD
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.dynamics import multibody
 from skysim.scene import loader
 from skysim.simulation import exposure, run

@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude
 from estimator.filter.mekf import Update
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Sources
-from skysim.core.units import ARCSEC_RAD
 from skysim.scene import loader
-from skysim.scene.leds import ClockConfig
+from skysim.scene.sections.leds import ClockConfig
 from skysim.simulation import exposure
 from skysim.simulation.closed_loop import ClosedLoop
 from skysim.simulation.testbed import build_testbed, exposure_window, time_tag_error_s

@@ -12,14 +12,16 @@ import pytest
 from skysim.camera import display_glow
 from skysim.core.errors import InputError
 from skysim.core.types import Sources
-from skysim.scene import layouts, loader
-from skysim.scene.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene import loader
+from skysim.scene.sections import layouts
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.simulation import exposure
 from skysim.simulation.testbed import Testbed, build_testbed, exposure_window, light_sources
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
-from skysim.sources.dome import display, surface
+from skysim.sources.dome import display
 from skysim.sources.dome.led import lit_moments_s
+from skysim.sources.dome.shell import surface
 from skysim.sources.photometry import SUN, Band, led_strength_e_s_sr, star_flux_e_s_m2
 
 FOOT_M = 0.3048

@@ -10,11 +10,12 @@ from scipy.spatial import cKDTree
 
 from skysim.core.errors import InputError
 from skysim.core.types import Sources
-from skysim.scene import light, loader
-from skysim.scene.light import DomeConfig
+from skysim.scene import loader
+from skysim.scene.sections import light
+from skysim.scene.sections.light import DomeConfig
 from skysim.sources import dome
-from skysim.sources.dome import surface as dome_surface
-from skysim.sources.dome.surface import SURFACES, Ellipsoid, Plane
+from skysim.sources.dome.shell import surface as dome_surface
+from skysim.sources.dome.shell.surface import SURFACES, Ellipsoid, Plane
 from skysim.sources.photometry import Band, led_strength_e_s_sr
 
 INCH_M = 0.0254

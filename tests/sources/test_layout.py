@@ -14,13 +14,14 @@ from estimator.attitude.dome_map import Lever, project
 from estimator.core.camera import Camera
 from skysim.core.errors import InputError
 from skysim.core.types import Sources
-from skysim.scene import light, loader
-from skysim.scene.light import DomeConfig
+from skysim.scene import loader
+from skysim.scene.sections import light
+from skysim.scene.sections.light import DomeConfig
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
-from skysim.sources.dome import surface
 from skysim.sources.dome.layouts import boards, spreads
 from skysim.sources.dome.led import lit_moments_s
+from skysim.sources.dome.shell import surface
 from skysim.sources.photometry import Band, led_strength_e_s_sr
 
 INCH_M = 0.0254

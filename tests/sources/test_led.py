@@ -7,7 +7,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from skysim.scene.leds import CosineLobeConfig, LedConfig, LobeTableConfig
+from skysim.scene.sections.leds import CosineLobeConfig, LedConfig, LobeTableConfig
 from skysim.sources.dome.led import FALLOFF, LOBES, Emitter, irradiance_e_s_m2
 from skysim.sources.photometry import Band, led_strength_e_s_sr
 

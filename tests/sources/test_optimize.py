@@ -13,8 +13,8 @@ from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.nearfield import rotation_only
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Sources
-from skysim.scene import layouts
-from skysim.scene.light import DomeConfig
+from skysim.scene.sections import layouts
+from skysim.scene.sections.light import DomeConfig
 from skysim.sources import catalog, dome
 from skysim.sources.dome.placement import fisher, optimize
 from skysim.sources.dome.placement.ambiguity import field_ambiguity

@@ -10,7 +10,7 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
-from skysim.scene.camera import curve_file
+from skysim.scene.sections.camera import curve_file
 from skysim.sources import catalog
 from skysim.sources.photometry import (
     SUN,

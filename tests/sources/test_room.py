@@ -13,11 +13,12 @@ from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study import store
 from skysim.experiments.study.analysis import search
 from skysim.experiments.study.execution import engines, runner
-from skysim.scene import light, loader
-from skysim.scene.light import DomeConfig, RoomConfig
+from skysim.scene import loader
+from skysim.scene.sections import light
+from skysim.scene.sections.light import DomeConfig, RoomConfig
 from skysim.sources import dome
-from skysim.sources.dome import room as rooms
-from skysim.sources.dome import surface
+from skysim.sources.dome.shell import room as rooms
+from skysim.sources.dome.shell import surface
 from skysim.sources.photometry import Band
 
 RADIUS_M, RIM_M = 1.5, 0.9

@@ -11,13 +11,15 @@ from scipy.stats import chi2
 from estimator.trackers.dome_tracker import DomeTracker
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene import light, loader
+from skysim.scene import loader
 from skysim.scene.scene import Scene
-from skysim.scene.tracker import SurveyErrorsConfig
+from skysim.scene.sections import light
+from skysim.scene.sections.tracker import SurveyErrorsConfig
 from skysim.simulation import exposure
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
-from skysim.sources.dome import surface, survey_errors
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.shell import surface
+from skysim.sources.dome.shell.surface import Surface
+from skysim.sources.dome.survey import survey_errors
 from skysim.tracking import factory
 
 RARE = 1e-6  # of a sum of squares that is outside: the seeds are fixed, so it fails for a wrong law alone

@@ -9,10 +9,12 @@ import pytest
 from scipy.stats import chi2
 
 from skysim.core.errors import InputError
-from skysim.scene import light, loader
-from skysim.scene.tracker import SurveyErrorsConfig, TotalStationConfig
+from skysim.scene import loader
+from skysim.scene.sections import light
+from skysim.scene.sections.tracker import SurveyErrorsConfig, TotalStationConfig
 from skysim.simulation.testbed import build_testbed, build_tracker
-from skysim.sources.dome import surface, survey_errors, total_station
+from skysim.sources.dome.shell import surface
+from skysim.sources.dome.survey import survey_errors, total_station
 
 ARCSEC = np.pi / 180 / 3600
 STATION = {

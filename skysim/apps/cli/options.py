@@ -74,7 +74,7 @@ def load(
     trackers : names of all trackers that will solve its frames, the scene's own first; an override must have an effect
         for one of them
     """
-    from skysim.core.yaml_reader import parse_overrides
+    from skysim.core.io.yaml_reader import parse_overrides
     from skysim.scene.keys import unused
     from skysim.scene.loader import load as load_scene
 

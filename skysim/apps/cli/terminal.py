@@ -325,7 +325,7 @@ def print_remarks(solution: dict[str, Any]) -> None:
 
 
 def print_json(data: Any) -> None:
-    from skysim.core.files import to_json
+    from skysim.core.io.files import to_json
 
     print(to_json(data))
 
@@ -373,7 +373,7 @@ def write_3d_views(testbed: Testbed, folder: Path) -> list[Path]:
 
     Without OpenGL print a message and return an empty list, so that the run continues.
     """
-    from skysim.core import files
+    from skysim.core.io import files
     from skysim.dynamics.multibody.view import picture
     from skysim.simulation.testbed import export_mjcf
 

@@ -20,8 +20,8 @@ from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.plate_solver.solution import PlateSolution, annotated_image, solution_fields
 from skysim.apps.plate_solver.solver import FOV_LIMITS_DEG, Solver, make_solver, solve_array, validated_date
-from skysim.core import files, images
 from skysim.core.errors import InputError
+from skysim.core.io import files, images
 
 ANNOTATED = ".annotated.png"
 # The focal length of the 35 mm camera (36 x 24 mm) with the same diagonal field: CIPA DCG-001, to which Exif's

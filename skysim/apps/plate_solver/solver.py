@@ -30,11 +30,11 @@ from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_cent
 from estimator.trackers.star_tracker import NO_MATCH, StarTracker
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import CATALOGS
-from skysim.core.utc import check_year
+from skysim.core.quantities.utc import check_year
 
 if TYPE_CHECKING:
-    from skysim.scene.camera import CameraConfig
     from skysim.scene.opencv_calibration import Calibration
+    from skysim.scene.sections.camera import CameraConfig
 
 # Relative uncertainty of the focal length. An OpenCV chessboard calibration gives it to about 0.1 %.
 CALIBRATED_UNCERTAINTY = 0.003

@@ -14,7 +14,7 @@ from skysim.camera.psf.splat import add_gaussian
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.scene.camera import ParticlesConfig
+from skysim.scene.sections.camera import ParticlesConfig
 
 STEP_PX = 0.25
 # Landau's scale 0.1535 MeV cm^2/g x Z/A 0.498 x 2.33 g/cm^3 = 17.8 eV a micrometer, 4.9 electrons of 3.65 eV, over

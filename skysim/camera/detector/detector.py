@@ -20,7 +20,7 @@ from skysim.camera.detector import charge_transfer, cosmic_rays, noise
 from skysim.core.jit import jit
 from skysim.core.random_streams import random_stream
 from skysim.core.types import SourceTruth
-from skysim.scene.camera import CameraConfig, DetectorConfig, FrameTransferConfig, InterlineConfig, Shutter
+from skysim.scene.sections.camera import CameraConfig, DetectorConfig, FrameTransferConfig, InterlineConfig, Shutter
 from skysim.sources.photometry import snr
 
 

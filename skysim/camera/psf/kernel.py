@@ -22,7 +22,7 @@ from scipy import fft, special
 from skysim.camera.psf.otf import EXTENT, NOT_ROUND, PSFS, WINGED, Otf, blur, uniform_disk
 from skysim.camera.psf.splat import PER_PX, REACH_SIGMA, Singles
 from skysim.core.types import Floats
-from skysim.scene.camera import CameraConfig, Psf
+from skysim.scene.sections.camera import CameraConfig, Psf
 
 QUANTUM_PX = 0.01  # sizes are rounded to this, so that LEDs of nearly one size share a kernel
 CUT_SIGMA = 5.0  # a Gaussian's image ends here: 4e-6 of its light is beyond

@@ -13,7 +13,7 @@ from skysim.camera.psf.otf import blur_radius_px, field_sigma_px
 from skysim.camera.psf.splat import PER_PX, Singles
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig
 
 GAUSS, ROUND, GRID = 0, 1, 2
 PACKING = np.array([1 << 42, 1 << 21, 1])  # packs three sizes, in steps of 0.01 px, into one integer

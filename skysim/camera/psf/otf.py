@@ -19,7 +19,7 @@ from scipy import special
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene.camera import (
+from skysim.scene.sections.camera import (
     AiryPsfConfig,
     CameraConfig,
     DiskPsfConfig,
@@ -133,7 +133,7 @@ def read_cells(file: str) -> Floats:
 
     Raises InputError with one line, `camera.psf.file: ...`, for an unreadable file or an unusable table.
     """
-    from skysim.core.images import monochrome, read_image
+    from skysim.core.io.images import monochrome, read_image
 
     path = Path(file)
     try:

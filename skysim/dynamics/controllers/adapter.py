@@ -23,7 +23,7 @@ from skysim.dynamics.controllers.interface import (
     torque_of_reply,
 )
 from skysim.dynamics.guidance import Reference
-from skysim.scene.motion import ControlConfig
+from skysim.scene.sections.motion import ControlConfig
 
 
 class ControllerSource(NamedTuple):

@@ -19,7 +19,7 @@ from skysim.core.errors import printable
 from skysim.core.plugins.kind import PluginKind
 from skysim.core.plugins.messages import Floats, finite_array, to_lists
 from skysim.core.plugins.program import MAX_STATUS_CHARS
-from skysim.scene.motion import BUILT_IN_LAWS, PRESCRIBED
+from skysim.scene.sections.motion import BUILT_IN_LAWS, PRESCRIBED
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene.vehicle import CmgsConfig, FansConfig, VehicleConfig, WheelsConfig
+from skysim.scene.sections.vehicle import CmgsConfig, FansConfig, VehicleConfig, WheelsConfig
 
 TORQUES = ("torque_x", "torque_y", "torque_z")
 UNIT_GEAR = (1, 0, 0, 0, 0, 0)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene.vehicle import VehicleConfig, WheelsConfig
+from skysim.scene.sections.vehicle import VehicleConfig, WheelsConfig
 
 CAMERA = "star_camera"
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 
 from skysim.core.errors import InputError
-from skysim.core.yaml_reader import excerpt, is_file
+from skysim.core.io.yaml_reader import excerpt, is_file
 
 # In lower case: MuJoCo finds <INCLUDE> too.
 XML_ELEMENTS = {"include", "model"}

@@ -36,7 +36,7 @@ from skysim.dynamics.multibody.joints import (
 )
 from skysim.dynamics.multibody.mass import CAMERA, MassProperties, declare_mass, tree_mass, unbalance
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings, one_line
-from skysim.scene.vehicle import VehicleConfig
+from skysim.scene.sections.vehicle import VehicleConfig
 
 GRAVITY_M_S2 = 9.80665
 STEP_S = 1e-3

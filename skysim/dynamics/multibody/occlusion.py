@@ -22,7 +22,7 @@ from skysim.dynamics.multibody.joints import lock_unused
 from skysim.dynamics.multibody.mass import CAMERA
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount, place_camera, put_at_origin
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.shell.surface import Surface
 
 OPAQUE, TRANSPARENT = 0, 5  # groups of geoms: those that block light, and the camera's own housing
 GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)  # rays are tested against the first only

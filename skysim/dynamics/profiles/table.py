@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.core import files
 from skysim.core.errors import InputError, printable
+from skysim.core.io import files
 from skysim.core.types import Floats
 from skysim.dynamics.profiles.samples import Samples, from_quaternions
 from skysim.dynamics.profiles.text import Line, excerpt, seconds_since, to_numbers

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from skysim.core.files import make_folder, write_bytes, write_text
+from skysim.core.io.files import make_folder, write_bytes, write_text
 from skysim.experiments.papers.compare import VERDICTS, Comparison, Reproduction, format_summary, format_with_source
 from skysim.results.plots import png
 from skysim.results.report import embed, render_page

@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.yaml_reader import check_version, explain, line_of, read_yaml, set_key
+from skysim.core.io.yaml_reader import check_version, explain, line_of, read_yaml, set_key
 from skysim.dynamics.controllers.interface import CONTROLLERS
 from skysim.experiments.study import unused_options
 from skysim.experiments.study.designs import make_point
@@ -31,8 +31,8 @@ from skysim.experiments.study.plan import (
     resolve_point,
 )
 from skysim.results import metrics
-from skysim.scene.light import CollimatedDisplayConfig, DomeConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.tracking.external.interface import OWN, TRACKERS
 
 HARDWARE_SEED = re.compile(r"(hardware_seed|survey\.(surface_)?seed)$")

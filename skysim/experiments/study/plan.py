@@ -13,11 +13,11 @@ import numpy as np
 import yaml
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
-from skysim.core import yaml_reader
 from skysim.core.errors import InputError
+from skysim.core.io import yaml_reader
+from skysim.core.io.yaml_reader import explain, is_file, set_key
 from skysim.core.paths import STUDIES
-from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Time, Triple
-from skysim.core.yaml_reader import explain, is_file, set_key
+from skysim.core.quantities.units import ConfigModel, Fraction, NotNegative, Number, Time, Triple
 from skysim.experiments.study.designs import Design, Point, points
 from skysim.experiments.study.factors import Factor, Settings, Value
 from skysim.scene.loader import find as find_scene

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.files import make_folder
+from skysim.core.io.files import make_folder
 from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.execution.trials import Row

@@ -24,9 +24,9 @@ from skysim.experiments.study.plan import (
 )
 from skysim.scene.keys import unused
 from skysim.scene.keys.unused import Rule
-from skysim.scene.layouts import CelestialConfig, FibersConfig, LcdConfig
-from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.layouts import CelestialConfig, FibersConfig, LcdConfig
+from skysim.scene.sections.light import DomeConfig
 from skysim.tracking import settings
 
 STREAK_ALGORITHMS = ("default", "streak")  # detectors and centroiders that use the streak measured by a gyro

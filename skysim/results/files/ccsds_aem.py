@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
+from skysim.core.quantities.utc import in_utc
 from skysim.core.types import Floats
-from skysim.core.utc import in_utc
 from skysim.dynamics.profiles.frames import BODY, CAMERA, ICRF, LAB
 
 MOST_CHARACTERS = 254  # limit of a line, section 6.3 of the standard

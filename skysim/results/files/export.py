@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.core import files, images
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.images.live import silent_stderr
+from skysim.core.io import files, images
+from skysim.core.io.images.live import silent_stderr
 from skysim.results import stretch
 from skysim.results.files import ccsds_aem
 from skysim.results.files import frames as frame_files

@@ -7,10 +7,10 @@ import shutil
 from pathlib import Path
 
 from skysim.camera import wcs
-from skysim.core.files import atomic_file, write_png16, write_table
+from skysim.core.io.files import atomic_file, write_png16, write_table
 from skysim.core.types import Frame, Truth
-from skysim.scene.light import StarsConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.light import StarsConfig
 
 RESULT_FILES = (
     *("solutions.ecsv", "telemetry.ecsv", "imu.ecsv"),

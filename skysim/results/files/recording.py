@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.core import files, images
 from skysim.core.errors import InputError
+from skysim.core.io import files, images
 from skysim.core.types import Floats
 from skysim.sources import stars
 

@@ -113,8 +113,8 @@ def check(sheet: Sheet, answers: Mapping[str, str]) -> None:
     """Validate the camera. Raises InputError that begins with the option of the first wrong answer."""
     from pydantic import ValidationError
 
-    from skysim.core.yaml_reader import yaml_keys
-    from skysim.scene.camera import CameraConfig
+    from skysim.core.io.yaml_reader import yaml_keys
+    from skysim.scene.sections.camera import CameraConfig
 
     tree = tree_of(sheet.lines)
     try:

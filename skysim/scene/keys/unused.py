@@ -16,10 +16,11 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from skysim.core.errors import InputError
-from skysim.core.units import ConfigModel
-from skysim.core.yaml_reader import Files, location_of, parse_yaml
-from skysim.scene.camera import DetectorConfig
-from skysim.scene.layouts import (
+from skysim.core.io.yaml_reader import Files, location_of, parse_yaml
+from skysim.core.quantities.units import ConfigModel
+from skysim.scene.scene import Scene
+from skysim.scene.sections.camera import DetectorConfig
+from skysim.scene.sections.layouts import (
     CelestialConfig,
     FibersConfig,
     FibonacciConfig,
@@ -27,9 +28,8 @@ from skysim.scene.layouts import (
     ListedConfig,
     PatchBoardsConfig,
 )
-from skysim.scene.leds import DirectConfig, PwmConfig
-from skysim.scene.light import DomeConfig
-from skysim.scene.scene import Scene
+from skysim.scene.sections.leds import DirectConfig, PwmConfig
+from skysim.scene.sections.light import DomeConfig
 
 SURFACE_SOLVERS = ("thesis", "ray_on_surface")  # the solvers that use the surveyed surface
 FIXED_DETECTORS = ("thesis",)  # the detectors with thresholds of their own

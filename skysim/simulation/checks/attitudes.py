@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount
 from skysim.dynamics import guidance, multibody
-from skysim.scene.light import StarsConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.testbed import Testbed
 
 MAX_FRAMES = 400  # frames at which the reference is evaluated to find the fastest and the most tilted one

@@ -22,13 +22,13 @@ from scipy.spatial import cKDTree
 from estimator.catalog import catalog
 from estimator.catalog.catalog import StarCatalog
 from skysim.core.types import Floats, Sources
-from skysim.scene.camera import CameraConfig
-from skysim.scene.light import CollimatedDisplayConfig, DomeConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.simulation.checks.views import CameraModel
 from skysim.simulation.testbed import Testbed
 from skysim.sources.dome import display
-from skysim.sources.dome.survey_errors import led_covariance_m2
+from skysim.sources.dome.survey.survey_errors import led_covariance_m2
 from skysim.tracking import dome_map_file
 from skysim.tracking.onboard_model import assumed_camera, onboard_catalog
 from skysim.tracking.settings import assumed_settings

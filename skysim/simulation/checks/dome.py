@@ -11,10 +11,10 @@ from skysim.camera.psf.kernel import build_kernel
 from skysim.core.types import Floats, Mount, Sources
 from skysim.dynamics import guidance
 from skysim.dynamics.profiles.load import load_profiles
-from skysim.scene.light import DomeConfig, SurveyedSurfaceConfig
 from skysim.scene.scene import Scene
-from skysim.sources.dome import surface
-from skysim.sources.dome.surface import Radial, Surface
+from skysim.scene.sections.light import DomeConfig, SurveyedSurfaceConfig
+from skysim.sources.dome.shell import surface
+from skysim.sources.dome.shell.surface import Radial, Surface
 
 # Largest rms distance of the fitted ellipsoid from the surface that gives no warning. For a camera whose line of
 # sight passes 0.2 m beside the bearing, 1 m under the dome, it puts the intersection of the line of sight with the

@@ -39,13 +39,13 @@ from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.nearfield import SOLVERS
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
 from skysim.camera.optics import Optics
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
-from skysim.core.units import ARCSEC_RAD
-from skysim.scene.camera import RollingShutterConfig
+from skysim.scene.sections.camera import RollingShutterConfig
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.views import View
-from skysim.sources.dome import survey_errors, total_station
+from skysim.sources.dome.survey import survey_errors, total_station
 
 
 class Independent(NamedTuple):

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.psf.otf import blur_radius_px
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
-from skysim.core.units import ARCSEC_RAD
-from skysim.scene.light import DomeConfig, StarsConfig
+from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, beliefs
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, full_scale_e

@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from skysim.scene.camera import TwoStopsConfig
-from skysim.scene.layouts import FibersConfig, Layout, LcdConfig
-from skysim.scene.light import DomeConfig, StarsConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.camera import TwoStopsConfig
+from skysim.scene.sections.layouts import FibersConfig, Layout, LcdConfig
+from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import (
     BINOMIAL_VARIANCE_PX2,

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.scene.layouts import FibersConfig, LcdConfig
-from skysim.scene.light import DomeConfig
+from skysim.scene.sections.layouts import FibersConfig, LcdConfig
+from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.expected_error import Independent, believed_sigma_px

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from skysim.camera import wcs
 from skysim.dynamics import guidance
-from skysim.scene.light import DomeConfig, StarsConfig
+from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, dome, lookalike
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, context_of, usable

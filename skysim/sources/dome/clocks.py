@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import LED_CLOCKS, random_stream
-from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Sources
-from skysim.scene.layouts import FibersConfig, Layout, LcdConfig
-from skysim.scene.leds import ClockConfig, DirectConfig
-from skysim.scene.light import DomeConfig, Light
+from skysim.scene.sections.layouts import FibersConfig, Layout, LcdConfig
+from skysim.scene.sections.leds import ClockConfig, DirectConfig
+from skysim.scene.sections.light import DomeConfig, Light
 
 LONGEST_ON_S = 3600.0  # a controller was switched on up to so long before the run; many times any period
 PPM = 1e-6

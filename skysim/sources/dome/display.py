@@ -17,11 +17,11 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
-from skysim.scene import layouts, leds, light
+from skysim.scene.sections import layouts, leds, light
 from skysim.sources import stars as star_sources
 from skysim.sources.catalog import Catalog
 from skysim.sources.dome.led import DRIVES, DriveInput, full_strength_e_s_sr, strength_factors
-from skysim.sources.dome.surface import Plane
+from skysim.sources.dome.shell.surface import Plane
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
 SHELL_STREAM = 2  # spawn key of the shell's own random stream, which leaves the fibers' places unchanged

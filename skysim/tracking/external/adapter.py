@@ -16,7 +16,7 @@ from skysim.core.errors import InputError
 from skysim.core.plugins.program import ProgramError, host_command
 from skysim.core.types import Floats, Frame
 from skysim.scene import scene as scenes
-from skysim.scene.light import StarsConfig
+from skysim.scene.sections.light import StarsConfig
 from skysim.tracking.external import process
 from skysim.tracking.external.interface import FAILED, OWN, TRACKERS, Answer, Leds, Picture, Setup, Stars
 

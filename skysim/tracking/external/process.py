@@ -55,7 +55,7 @@ def split_command(name: str, command: str) -> tuple[list[str], str | None]:
 
 def write_png(path: Path, picture: Picture) -> None:
     """Write the frame as a 16-bit PNG."""
-    from skysim.core import files
+    from skysim.core.io import files
 
     files.write_png16(path, picture.image_dn)
 
@@ -64,7 +64,7 @@ def write_fits(path: Path, picture: Picture) -> None:
     """Write the frame as FITS with times in the header, without the truth that a run's own frames carry."""
     from astropy.io import fits
 
-    from skysim.core import files
+    from skysim.core.io import files
 
     header = fits.Header({"EXPTIME": picture.exposure_s, "TMID": picture.t_s, "FRAME": picture.frame})
     with files.atomic_file(path) as temporary:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from skysim.core.utc import in_utc
+from skysim.core.quantities.utc import in_utc
 from skysim.tracking.external.interface import SOLVED, Answer, Picture, Setup
 
 FIELD_MARGIN = 1.1  # field of the pattern database over that of the camera

@@ -21,7 +21,7 @@ from skysim.apps.gui.worker import export, pointing, study_process
 from skysim.apps.gui.worker.photo import SUFFIXES
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
-from skysim.core.images import IMAGE_SUFFIXES
+from skysim.core.io.images import IMAGE_SUFFIXES
 from skysim.core.paths import SCENES
 from skysim.core.types import Mount
 from skysim.dynamics import multibody

@@ -25,7 +25,7 @@ from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core import images
+from skysim.core.io import images
 from skysim.core.paths import ROOT
 
 # SHEFEX-2's chip behind a 25 mm lens that nobody has measured, and what its data sheet says: 1.5 % off, no distortion.

@@ -10,7 +10,7 @@ from estimator.detection.detect import DETECTORS
 from estimator.trackers.exposure_control import Control, Exposure, Observation, observe, step
 from skysim.camera.detector.detector import saturation_dn
 from skysim.scene import loader
-from skysim.scene.light import UniformGlowConfig
+from skysim.scene.sections.light import UniformGlowConfig
 from skysim.simulation import exposure
 from skysim.simulation import run as simulation
 from skysim.simulation.testbed import Testbed

@@ -14,8 +14,8 @@ from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from skysim.apps.cli.main import app
-from skysim.core import files
 from skysim.core.errors import InputError
+from skysim.core.io import files
 from skysim.core.paths import ROOT
 from skysim.experiments.papers import compare, intervals, page, published
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult

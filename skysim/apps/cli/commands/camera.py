@@ -68,7 +68,7 @@ def cameras(context: typer.Context, json: Json = False) -> None:
 
 def preset_entry(path: Path) -> dict[str, str]:
     """Name, size, pitch, shutter and the first words of the description of a preset."""
-    from skysim.core.yaml_reader import read_yaml
+    from skysim.core.io.yaml_reader import read_yaml
 
     tree, text = read_yaml(path)
     camera = tree["camera"]
@@ -105,7 +105,7 @@ def camera_show(
     """
     import dataclasses
 
-    from skysim.core import files
+    from skysim.core.io import files
     from skysim.scene import opencv_calibration
 
     lens, body = read_camera(file, set_)
@@ -134,7 +134,7 @@ def camera_show(
 
 def read_camera(name: str, overrides: list[str] | None) -> tuple[Calibration | None, dict[str, int]]:
     """The calibration, None without a lens, and the chip's size: of a scene, a camera, a preset or an OpenCV file."""
-    from skysim.core.yaml_reader import parse_overrides
+    from skysim.core.io.yaml_reader import parse_overrides
     from skysim.scene import loader, opencv_calibration
 
     if opencv_calibration.looks_like_calibration(Path(name)):
@@ -194,7 +194,7 @@ def camera_new(
 
     Numbers that the data sheet does not state are assumed; the file and the output name them.
     """
-    from skysim.core import files
+    from skysim.core.io import files
     from skysim.scene.data_sheet import sheet
 
     if out.suffix not in (".yaml", ".yml") or out.exists():

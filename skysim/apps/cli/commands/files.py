@@ -29,7 +29,7 @@ def scenes(context: typer.Context, json: Json = False) -> None:
 @scenes_app.command("show")
 def scenes_show(scene: SceneArg, set_: Overrides = None, json: Json = False) -> None:
     """Print the effective scene: every key with its value and where it comes from (file and line, preset, default)."""
-    from skysim.core.yaml_reader import parse_overrides
+    from skysim.core.io.yaml_reader import parse_overrides
     from skysim.scene.keys import provenance
 
     entries = provenance.effective(scene, parse_overrides(set_))
@@ -47,7 +47,7 @@ def scenes_export(
     set_: Overrides = None,
 ) -> None:
     """Write a scene as one MJCF file with dome, LEDs and camera, for MuJoCo's viewer."""
-    from skysim.core import files
+    from skysim.core.io import files
     from skysim.simulation.testbed import build_testbed, export_mjcf
 
     loaded = load(scene, None, seed, set_)

@@ -13,8 +13,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from skysim.experiments.study.plan import Study
-from skysim.scene.camera import CameraConfig
 from skysim.scene.scene import NAME_ALIAS, Scene
+from skysim.scene.sections.camera import CameraConfig
 
 KINDS: Mapping[str, type[BaseModel]] = {"scene": Scene, "study": Study}
 EXTRA_KEYS: Mapping[str, dict[str, Any]] = {  # keys that the loader resolves before validation

@@ -45,7 +45,7 @@ def reproduce(
         ]
         print_list(listed, json, lambda entry: f"{entry['id']:20s} {entry['title']}")
         return
-    from skysim.core import files
+    from skysim.core.io import files
     from skysim.experiments.papers import page
     from skysim.experiments.papers.compare import ExperimentOptions
     from skysim.experiments.papers.registry import check_ids

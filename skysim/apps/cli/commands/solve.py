@@ -64,8 +64,8 @@ def solve(
     """
     import skysim.core.jit  # noqa: F401  # says so if numba has to compile
     from skysim.apps import plate_solver
-    from skysim.core import files
-    from skysim.core.images import grab_frame
+    from skysim.core.io import files
+    from skysim.core.io.images import grab_frame
 
     stages = selected_stages(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
     settings = plate_solver.make_solver(fov, camera, datetime_from_iso(time), stages, catalog)
@@ -112,7 +112,7 @@ def survey(
     json: Json = False,
 ) -> None:
     """Survey a dome from frames at many attitudes: LED positions, lever arm and lens, to a file for `tracker.map`."""
-    from skysim.core import files
+    from skysim.core.io import files
     from skysim.experiments import dome_survey, dome_survey_report
     from skysim.simulation.testbed import build_testbed, build_tracker
     from skysim.tracking import dome_map_file, factory

@@ -46,7 +46,7 @@ def stream(
     from skysim.apps.stream import sender
     from skysim.apps.stream.pacing import Pace
     from skysim.apps.stream.sinks import READER_GONE, Sink, folder_writer, pipe_writer
-    from skysim.core import files
+    from skysim.core.io import files
     from skysim.simulation.testbed import build_testbed
 
     if folder is None and http is None and pipe is None:

@@ -78,7 +78,7 @@ def run(
 ) -> None:
     """Run a study, or a search if called as `optimize`, that has no store yet."""
     start_workers(engine)
-    from skysim.core.yaml_reader import parse_overrides
+    from skysim.core.io.yaml_reader import parse_overrides
     from skysim.experiments.study import loader
     from skysim.tracking.external import process
 
@@ -229,7 +229,7 @@ def worst(
 
 def chosen_levels(words: list[str]) -> dict[str, Any]:
     """Levels by factor from FACTOR=LEVEL. Raises InputError."""
-    from skysim.core.yaml_reader import parse_overrides, parse_yaml
+    from skysim.core.io.yaml_reader import parse_overrides, parse_yaml
 
     return {key: parse_yaml(text)[1] for key, text in parse_overrides(words, "--where", "FACTOR=LEVEL").items()}
 

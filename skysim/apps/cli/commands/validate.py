@@ -97,7 +97,7 @@ def check_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})) -
 
 def describe_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})) -> tuple[str, tuple[str, ...]]:
     """Return a description of the file and warnings. Raises InputError with one line."""
-    from skysim.core.yaml_reader import is_file, read_yaml
+    from skysim.core.io.yaml_reader import is_file, read_yaml
     from skysim.scene import opencv_calibration
 
     path = path if path.suffix else find_shipped(path)
@@ -109,7 +109,7 @@ def describe_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})
         return describe_table(path), ()
     if path.suffix == ".xml":
         from skysim.dynamics import multibody
-        from skysim.scene.vehicle import VehicleConfig
+        from skysim.scene.sections.vehicle import VehicleConfig
 
         model = multibody.build(VehicleConfig.model_validate({"model": str(path.resolve())}))
         return f"a vehicle of {model.mass.mass_kg:g} kg", ()
@@ -132,8 +132,8 @@ def describe_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})
 
 def find_shipped(path: Path) -> Path:
     """Path of the shipped scene, study or camera of this name. Raises InputError with the names of the scenes."""
+    from skysim.core.io.yaml_reader import find_file
     from skysim.core.paths import DATA, SCENES, STUDIES
-    from skysim.core.yaml_reader import find_file
 
     names = (folder / f"{path}.yaml" for folder in (STUDIES, DATA / "cameras"))
     return next((file for file in names if file.is_file()), None) or find_file(str(path), SCENES, "scene")

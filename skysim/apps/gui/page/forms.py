@@ -12,12 +12,12 @@ import yaml
 from pydantic import BaseModel
 
 from skysim.core.errors import InputError
+from skysim.core.io.yaml_reader import read_yaml, set_key
 from skysim.core.paths import SCENES
-from skysim.core.units import SI_SUFFIX, si_unit
-from skysim.core.yaml_reader import read_yaml, set_key
+from skysim.core.quantities.units import SI_SUFFIX, si_unit
 from skysim.scene.loader import file_names, find, load, read
-from skysim.scene.motion import expand_control
 from skysim.scene.scene import NAME_ALIAS, Scene
+from skysim.scene.sections.motion import expand_control
 
 # Units of bare numbers by suffix of a key.
 DISPLAY_UNITS = {
@@ -158,7 +158,7 @@ def loop_overrides(name: str, overrides: Mapping[str, str], feedback: str) -> di
 def save(folder: Path, name: str, base: str, overrides: Mapping[str, str], title: str) -> Path:
     """Save a new scene file that consists of a base and overrides. Raises InputError, also if the file exists."""
     from skysim.apps.gui.worker.export import base_reference, scene_yaml
-    from skysim.core import files
+    from skysim.core.io import files
 
     if not re.fullmatch(r"[A-Za-z0-9][\w-]{0,60}", name):
         raise InputError(f"{name!r}: allowed: letters, digits, _ and -")

@@ -12,10 +12,10 @@ import cv2
 import yaml
 
 from skysim.apps.gui.worker.workbench import Workbench
-from skysim.core import files as file_io
 from skysim.core.errors import InputError
+from skysim.core.io import files as file_io
+from skysim.core.io.yaml_reader import VERSION, set_key
 from skysim.core.paths import SCENES
-from skysim.core.yaml_reader import VERSION, set_key
 from skysim.results import scoring
 from skysim.results.files import frames
 from skysim.scene.loader import find

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from skysim.apps.gui.messages import LabGeometry
 from skysim.core.types import Floats
 from skysim.dynamics import multibody
-from skysim.scene.light import DomeConfig
+from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.testbed import Testbed
-from skysim.sources.dome import surface
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.shell import surface
+from skysim.sources.dome.shell.surface import Surface
 
 SKY_RADIUS_M = 2.5
 MAX_STARS, MAX_LEDS = 600, 4000

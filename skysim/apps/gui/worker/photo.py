@@ -24,8 +24,8 @@ from skysim.apps.gui.worker.workbench import (
     tracker_result,
     true_lights,
 )
-from skysim.core import images
 from skysim.core.errors import InputError
+from skysim.core.io import images
 from skysim.experiments.study import loader, store
 from skysim.experiments.study.execution import replay
 from skysim.experiments.study.execution.setups import prepared_setup

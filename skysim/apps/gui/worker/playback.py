@@ -9,8 +9,8 @@ import numpy as np
 
 from skysim.apps.gui.messages import FrameView, MotionLog
 from skysim.apps.gui.worker.workbench import Workbench
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Telemetry
-from skysim.core.units import ARCSEC_RAD
 from skysim.results import telemetry_report
 from skysim.simulation.testbed import MARGIN_S, Testbed, exposure_window
 

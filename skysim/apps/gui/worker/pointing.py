@@ -11,9 +11,9 @@ from skysim.core.errors import InputError
 from skysim.core.types import Mount
 from skysim.dynamics import guidance, multibody
 from skysim.results import scoring
-from skysim.scene.light import StarsConfig
-from skysim.scene.motion import AttitudeConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.light import StarsConfig
+from skysim.scene.sections.motion import AttitudeConfig
 from skysim.sources import stars
 
 FINE, COARSE = 0.02, 0.2  # step of an arrow key without and with shift, in fields of view

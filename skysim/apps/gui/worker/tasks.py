@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from skysim.apps.gui.messages import FrameView, MotionLog, PixelWindow, SceneInfo, Triple
 from skysim.apps.gui.worker import export, photo, playback, pointing
 from skysim.apps.gui.worker.workbench import Workbench, pixel_window
-from skysim.core import images
 from skysim.core.errors import InputError
+from skysim.core.io import images
 from skysim.simulation import run
 from skysim.simulation.testbed import Testbed
 

@@ -21,9 +21,9 @@ from skysim.core import quaternion
 from skysim.core.types import Floats, Frame, Truth
 from skysim.results import scoring
 from skysim.results import stretch as contrast
-from skysim.scene.light import StarsConfig
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
+from skysim.scene.sections.light import StarsConfig
 from skysim.simulation import exposure
 from skysim.simulation.run import FrameResult
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker

@@ -25,11 +25,11 @@ from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount
 from skysim.dynamics.multibody.view.picture import LAB_CAMERA
-from skysim.scene.camera import CameraConfig
-from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
-from skysim.sources.dome import surface
-from skysim.sources.dome.surface import Ellipsoid, Plane, Surface
+from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.light import DomeConfig
+from skysim.sources.dome.shell import surface
+from skysim.sources.dome.shell.surface import Ellipsoid, Plane, Surface
 
 GROUP_LIGHTS, GROUP_FIELD, GROUP_HIDDEN = 1, 2, 4
 MAX_PX = (1920, 1440)  # width, height of the largest picture

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.files import atomic_file
+from skysim.core.io.files import atomic_file
 from skysim.core.types import Floats
 from skysim.dynamics.multibody.mjcf import mujoco_warnings, one_line
 

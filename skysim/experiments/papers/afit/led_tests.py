@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from skysim.core.quantities.units import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.core.units import INCH_M
 from skysim.experiments.configs import with_config
 from skysim.experiments.papers.afit.test2 import INTENSITY_CD, NOISE_E, ON_FRACTION
 from skysim.experiments.papers.afit.test_stand import (
@@ -30,12 +30,12 @@ from skysim.experiments.papers.intervals import confidence_interval
 from skysim.experiments.papers.published import published_values
 from skysim.results.metrics import Summary, exact, proportion
 from skysim.results.plots import INK
-from skysim.scene.camera import MoffatPsfConfig
-from skysim.scene.layouts import ListedConfig
-from skysim.scene.leds import CosineLobeConfig, DirectConfig
-from skysim.scene.light import FlatSurfaceConfig
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
+from skysim.scene.sections.camera import MoffatPsfConfig
+from skysim.scene.sections.layouts import ListedConfig
+from skysim.scene.sections.leds import CosineLobeConfig, DirectConfig
+from skysim.scene.sections.light import FlatSurfaceConfig
 from skysim.simulation.testbed import Testbed
 
 GrayImage = NDArray[np.uint8]

@@ -9,15 +9,15 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
+from skysim.core.quantities.units import INCH_M
 from skysim.core.types import Floats
-from skysim.core.units import INCH_M
 from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
 from skysim.experiments.papers.published import published_values
 from skysim.results.metrics import exact
 from skysim.results.plots import INK
-from skysim.scene.light import FlatSurfaceConfig, SphereSurfaceConfig
-from skysim.sources.dome.point_cloud import fit_sphere
-from skysim.sources.dome.surface import Rim, Surface, build_surface
+from skysim.scene.sections.light import FlatSurfaceConfig, SphereSurfaceConfig
+from skysim.sources.dome.shell.point_cloud import fit_sphere
+from skysim.sources.dome.shell.surface import Rim, Surface, build_surface
 
 FIELD_RAD = np.radians(10.45)
 STATED_HEIGHT_IN, FITTED_HEIGHT_IN = 14.0, 15.5

@@ -29,8 +29,8 @@ from skysim.experiments.papers.published import published_values
 from skysim.results.metrics import exact
 from skysim.results.plots import INK
 from skysim.scene.loader import load
-from skysim.scene.motion import SlewConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.motion import SlewConfig
 from skysim.simulation.testbed import Testbed, light_sources
 from skysim.tracking import onboard_model
 

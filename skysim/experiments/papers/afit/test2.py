@@ -15,9 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import project
+from skysim.core.quantities.units import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.core.units import INCH_M
 from skysim.experiments.configs import with_config
 from skysim.experiments.papers.afit.surface import contour
 from skysim.experiments.papers.afit.test_stand import E_PER_GRAY, build_test_stand, measure_frame, separations_arcsec
@@ -26,12 +26,12 @@ from skysim.experiments.papers.intervals import bootstrap_interval, confidence_i
 from skysim.experiments.papers.published import experiments
 from skysim.results.metrics import Summary, exact
 from skysim.results.plots import INK, MARKS
-from skysim.scene.camera import MoffatPsfConfig
-from skysim.scene.light import DomeConfig
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
+from skysim.scene.sections.camera import MoffatPsfConfig
+from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.testbed import Testbed
-from skysim.sources.dome.surface import Surface, build_surface
+from skysim.sources.dome.shell.surface import Surface, build_surface
 from skysim.tracking import onboard_model
 
 PLACES_DEG = (0.0, 14.0, 28.0)  # tilts of the scene's places: apex, halfway, edge within the tilt stop

@@ -19,7 +19,7 @@ from skysim.dynamics import guidance
 from skysim.experiments.papers.afit.test_stand import light_positions_m, pair_angles_arcsec
 from skysim.experiments.papers.published import experiments
 from skysim.scene import loader
-from skysim.scene.motion import AttitudeConfig
+from skysim.scene.sections.motion import AttitudeConfig
 from skysim.simulation import exposure
 from skysim.simulation.testbed import Testbed, build_testbed
 from skysim.tracking import onboard_model

@@ -17,11 +17,11 @@ from estimator.core.errors import ImageError
 from estimator.core.types import FramePriors
 from estimator.detection import detect
 from skysim.camera.optics import Optics
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Truth
-from skysim.core.units import ARCSEC_RAD
-from skysim.scene.light import DomeConfig
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
+from skysim.scene.sections.light import DomeConfig
 from skysim.simulation import exposure
 from skysim.simulation.testbed import Testbed, build_obstacles, build_testbed, light_sources
 from skysim.sources.dome.clocks import build_clocks

@@ -13,9 +13,9 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.render import Poses, in_view, project
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
-from skysim.core.units import ARCSEC_RAD
 from skysim.experiments.configs import with_config
 from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import bootstrap_interval
@@ -23,8 +23,8 @@ from skysim.experiments.papers.published import experiments
 from skysim.results.metrics import exact, extremum
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
-from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.testbed import Testbed, build_testbed
 from skysim.sources import dome
 from skysim.sources.photometry import Band

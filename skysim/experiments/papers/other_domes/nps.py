@@ -20,16 +20,16 @@ from estimator.attitude.solvers import quest
 from estimator.catalog import pair_index
 from estimator.catalog.pair_index import PairIndex
 from estimator.identification.published.master_star import master_star
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.core.units import ARCSEC_RAD
 from skysim.experiments import dome_survey
 from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, with_cause
 from skysim.experiments.papers.intervals import bootstrap_interval
 from skysim.results.metrics import Summary, proportion
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
-from skysim.scene.light import DomeConfig, FlatSurfaceConfig
+from skysim.scene.sections.light import DomeConfig, FlatSurfaceConfig
 from skysim.simulation import exposure
 from skysim.simulation.testbed import Testbed, build_testbed
 from skysim.tracking import onboard_model, settings

@@ -20,7 +20,7 @@ from skysim.experiments.study.plan import CentroidTrial
 from skysim.results.metrics import Summary, rms
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
-from skysim.scene.tracker import SurveyErrorsConfig
+from skysim.scene.sections.tracker import SurveyErrorsConfig
 from skysim.simulation.testbed import build_testbed, build_tracker
 
 NOISE_PX = 0.1

@@ -26,9 +26,9 @@ from estimator.identification.published.fialho import (
 )
 from skysim.core.jit import jit
 from skysim.core.paths import CATALOGS
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.core.units import ARCSEC_RAD
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import bootstrap_interval, percent, sample_std
 from skysim.experiments.papers.published import experiments

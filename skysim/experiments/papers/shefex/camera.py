@@ -22,8 +22,8 @@ from skysim.experiments.papers.shefex.nights import FULL_MOON, exposure_override
 from skysim.experiments.papers.shefex.setup import MAX_CENTROIDS, PUBLISHED
 from skysim.results.metrics import Summary, exact, quantile
 from skysim.results.plots import INK, MARKS
-from skysim.scene.light import UniformGlowConfig
 from skysim.scene.loader import load
+from skysim.scene.sections.light import UniformGlowConfig
 from skysim.simulation import exposure
 from skysim.simulation.testbed import Testbed, build_testbed
 from skysim.tracking.exposure_control import ExposureController

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.units import in_si
+from skysim.core.quantities.units import in_si
 from skysim.experiments.study.designs import Point, make_point
 from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.execution.outcomes import FAILED

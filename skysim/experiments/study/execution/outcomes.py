@@ -15,11 +15,11 @@ from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core import quaternion
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats, Telemetry, Truth
-from skysim.core.units import ARCSEC_RAD
 from skysim.results import metrics
 from skysim.results.telemetry_report import attitude_error_deg
-from skysim.scene.light import DomeConfig
+from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.testbed import Testbed
 from skysim.tracking import factory
 

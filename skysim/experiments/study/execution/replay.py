@@ -11,8 +11,8 @@ import numpy as np
 
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report
-from skysim.core import files as file_io
 from skysim.core.errors import InputError
+from skysim.core.io import files as file_io
 from skysim.core.types import Frame, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.setups import Setup, prepared_setup

@@ -42,8 +42,8 @@ from skysim.experiments.study.plan import (
     FrameTrial,
     TrialSpec,
 )
-from skysim.scene.light import DomeConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.light import DomeConfig
 from skysim.simulation import exposure, run
 from skysim.simulation.testbed import MARGIN_S, Testbed, exposure_window
 from skysim.tracking import factory

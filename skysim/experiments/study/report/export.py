@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from skysim.core import files
 from skysim.core.errors import InputError, unknown_name
+from skysim.core.io import files
 from skysim.experiments.study.analysis.table import table, to_columns, trial_columns
 from skysim.experiments.study.store import Store
 from skysim.results.files.export import EXTRA

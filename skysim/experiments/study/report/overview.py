@@ -8,15 +8,15 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from skysim.core.errors import InputError
-from skysim.core.units import ARCSEC_RAD
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.experiments.study.analysis.table import format_level
 from skysim.experiments.study.designs import Point, make_point
 from skysim.experiments.study.factors import Distribution, Factor, Range
 from skysim.experiments.study.loader import may_report_ambiguity
 from skysim.experiments.study.plan import Plan, resolve_point
-from skysim.scene.camera import CameraConfig
-from skysim.scene.light import DomeConfig, StarsConfig
 from skysim.scene.scene import Scene
+from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation import checks
 from skysim.simulation.testbed import Testbed, build_testbed
 

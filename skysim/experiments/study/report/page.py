@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from skysim.core.files import write_text
+from skysim.core.io.files import write_text
 from skysim.experiments.study.analysis.axes import axis
 from skysim.experiments.study.analysis.table import PointRow, cells, format_summary
 from skysim.experiments.study.analysis.worst import ColumnsOf

@@ -9,11 +9,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
+from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import random_stream
-from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Sources
-from skysim.scene.layouts import HOLES, PatchBoardsConfig
-from skysim.scene.leds import LedConfig
+from skysim.scene.sections.layouts import HOLES, PatchBoardsConfig
+from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import (
     Ints,
     PlacedLeds,
@@ -23,7 +23,7 @@ from skysim.sources.dome.layouts.placing import (
     led_sources,
     project_from_bearing,
 )
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.shell.surface import Surface
 from skysim.sources.photometry import Band
 
 GLUE_STREAM = 1  # spawn key of the glue's own random stream, so that glue errors leave a board's pattern unchanged

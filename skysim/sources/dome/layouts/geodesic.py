@@ -19,10 +19,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from skysim.core.types import Floats, Sources
-from skysim.scene.layouts import GeodesicConfig
-from skysim.scene.leds import LedConfig
+from skysim.scene.sections.layouts import GeodesicConfig
+from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import lit_sources, project_from_bearing
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.shell.surface import Surface
 from skysim.sources.photometry import Band
 
 CAP_SLACK = 1e-12  # relative rounding of a vertex on the rim of the cap

@@ -9,8 +9,8 @@ import numpy as np
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
-from skysim.scene.layouts import ListedConfig, relative_levels
-from skysim.scene.leds import LedConfig
+from skysim.scene.sections.layouts import ListedConfig, relative_levels
+from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import (
     check_cap,
     directions_from_angles,
@@ -18,7 +18,7 @@ from skysim.sources.dome.layouts.placing import (
     on_surface,
     project_from_bearing,
 )
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.shell.surface import Surface
 from skysim.sources.photometry import Band
 
 MAX_SURFACE_OFFSET_M = 0.05  # of a listed LED; more is an error in a unit or an axis

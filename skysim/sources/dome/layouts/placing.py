@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
-from skysim.scene.layouts import HOLES, LitConfig
-from skysim.scene.leds import LedConfig
+from skysim.scene.sections.layouts import HOLES, LitConfig
+from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.led import DRIVES, DriveInput, full_strength_e_s_sr, strength_factors
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.shell.surface import Surface
 from skysim.sources.photometry import Band
 
 GOLDEN_ANGLE_RAD = np.pi * (3 - np.sqrt(5))

@@ -13,8 +13,8 @@ import numpy as np
 
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Sources
-from skysim.scene.layouts import HOLES, CelestialConfig, FibersConfig, Layout, LcdConfig, PatchBoardsConfig
-from skysim.scene.leds import LedConfig
+from skysim.scene.sections.layouts import HOLES, CelestialConfig, FibersConfig, Layout, LcdConfig, PatchBoardsConfig
+from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome import celestial as celestial_dome
 from skysim.sources.dome import display
 from skysim.sources.dome.layouts.boards import patch_boards
@@ -23,7 +23,7 @@ from skysim.sources.dome.layouts.listed import listed
 from skysim.sources.dome.layouts.placing import Ints, PlacedLeds, led_sources
 from skysim.sources.dome.layouts.spreads import fibonacci, optimized, poisson_disk, random_places
 from skysim.sources.dome.layouts.string import string
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.shell.surface import Surface
 from skysim.sources.photometry import Band
 
 

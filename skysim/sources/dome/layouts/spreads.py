@@ -7,11 +7,11 @@ import numpy as np
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Sources
-from skysim.scene.layouts import FibonacciConfig, OptimizedConfig, PoissonDiskConfig, RandomPlacesConfig
-from skysim.scene.leds import LedConfig
+from skysim.scene.sections.layouts import FibonacciConfig, OptimizedConfig, PoissonDiskConfig, RandomPlacesConfig
+from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import cap, dimmed_sources, project_from_bearing, scattered_cap
 from skysim.sources.dome.placement import optimize
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.shell.surface import Surface
 from skysim.sources.photometry import Band
 
 DARTS_PER_SPACING2 = 100  # random points per spacing^2: a gap of .03 of that area is found with probability .95

@@ -14,10 +14,10 @@ import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Sources
-from skysim.scene.layouts import StringConfig
-from skysim.scene.leds import LedConfig
+from skysim.scene.sections.layouts import StringConfig
+from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import lit_sources, project_from_bearing
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.shell.surface import Surface
 from skysim.sources.photometry import Band
 
 STEPS_PER_TURN = 720

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.scene import layouts
+from skysim.scene.sections import layouts
 from skysim.sources.dome.placement.ambiguity import Ambiguity, field_ambiguity
 from skysim.sources.dome.placement.fisher import (
     Visibility,
@@ -41,7 +41,7 @@ from skysim.sources.dome.placement.fisher import (
     variances,
     visible_from,
 )
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.shell.surface import Surface
 
 Ints = NDArray[np.int64]
 

@@ -13,8 +13,8 @@ from nicegui import run, ui
 from skysim.apps.gui.page import keys
 from skysim.apps.gui.page.style import COLORS, TOOLTIP, format_number
 from skysim.apps.gui.worker.study_process import RESPONSES, StudyProcess, StudyResults, finished, monte_carlo
-from skysim.core import files
 from skysim.core.errors import InputError
+from skysim.core.io import files
 from skysim.core.paths import STUDIES, title_of
 from skysim.experiments.study import loader
 

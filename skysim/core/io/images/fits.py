@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.guard.process import run_guarded
-from skysim.core.images import limits
-from skysim.core.images.limits import check_pixels
+from skysim.core.io.guard.process import run_guarded
+from skysim.core.io.images import limits
+from skysim.core.io.images.limits import check_pixels
 
 SUFFIXES = tuple(f"{suffix}{packed}" for packed in ("", ".gz", ".fz") for suffix in (".fits", ".fit", ".fts"))
 MAGIC = b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack

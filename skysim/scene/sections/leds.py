@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from skysim.core.tolerance import NumberError, Tolerance
-from skysim.core.units import (
+from skysim.core.quantities.tolerance import NumberError, Tolerance
+from skysim.core.quantities.units import (
     Ascending,
     ConfigModel,
     Intensity,

@@ -26,10 +26,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.tolerance import scaled_errors
+from skysim.core.quantities.tolerance import scaled_errors
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
-from skysim.core.units import ARCSEC_RAD
-from skysim.scene.tracker import TotalStationConfig
+from skysim.scene.sections.tracker import TotalStationConfig
 
 SETUP_ERRORS = 8  # centering 3, leveling 2, orientation, scale, zero point
 PPM = 1e-6

@@ -10,12 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
+from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import random_stream
-from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
-from skysim.scene.tracker import SurveyErrorsConfig
-from skysim.sources.dome import total_station
-from skysim.sources.dome.surface import Surface
+from skysim.scene.sections.tracker import SurveyErrorsConfig
+from skysim.sources.dome.shell.surface import Surface
+from skysim.sources.dome.survey import total_station
 
 STREAM = {"leds": 1, "lever": 2, "surface": 3, "sights": 4, "setup": 5, "focal": 6}
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.images import encoded, fits
-from skysim.core.images.limits import check_bytes
+from skysim.core.io.images import encoded, fits
+from skysim.core.io.images.limits import check_bytes
 
 IMAGE_SUFFIXES = (*fits.SUFFIXES, *encoded.SUFFIXES)
 LUMINANCE = {"blue": 0.114, "green": 0.587, "red": 0.299}  # ITU-R BT.601, in OpenCV's order

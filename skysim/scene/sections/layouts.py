@@ -8,8 +8,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from skysim.core.tolerance import LengthError
-from skysim.core.units import ConfigModel, Length, Number
+from skysim.core.quantities.tolerance import LengthError
+from skysim.core.quantities.units import ConfigModel, Length, Number
 
 HOLES = 9  # of a patch board: 3x3
 Level = Annotated[Number, Field(gt=0, le=1)]

@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, field_validator
 
 from skysim.core.errors import unknown_name
 from skysim.core.paths import DATA
-from skysim.core.units import (
+from skysim.core.quantities.units import (
     Ascending,
     ConfigModel,
     Fraction,

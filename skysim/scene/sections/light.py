@@ -8,10 +8,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, field_validator, model_validator
 
-from skysim.core.tolerance import LengthError
-from skysim.core.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
-from skysim.scene.layouts import Layout, PixelsConfig
-from skysim.scene.leds import LedConfig
+from skysim.core.quantities.tolerance import LengthError
+from skysim.core.quantities.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
+from skysim.scene.sections.layouts import Layout, PixelsConfig
+from skysim.scene.sections.leds import LedConfig
 
 SKY = "gaia_v8.0"  # as faint as any camera of a shipped scene detects
 Tilt = Annotated[Number, Field(ge=-45, le=45)]

@@ -1,7 +1,7 @@
 """Run a script on an untrusted file in a child process with limits: libraries in C may crash, hang or fill memory.
 
-The child is `python -m skysim.core.guard.process CPU_S MEMORY_BYTES SCRIPT ARGUMENTS`. It imports this module, then the
-script as a file, without the packages that contain it.
+The child is `python -m skysim.core.io.guard.process CPU_S MEMORY_BYTES SCRIPT ARGUMENTS`. It imports this module, then
+the script as a file, without the packages that contain it.
 """
 
 from __future__ import annotations

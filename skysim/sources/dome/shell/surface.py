@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene import light
-from skysim.sources.dome import point_cloud
-from skysim.sources.dome.point_cloud import FittedEllipsoid, fit_ellipsoid
+from skysim.scene.sections import light
+from skysim.sources.dome.shell import point_cloud
+from skysim.sources.dome.shell.point_cloud import FittedEllipsoid, fit_ellipsoid
 
 FLAT_RADIUS_M = 1e6  # of a sphere that is flat to a micrometer within a meter
 RINGS, SECTORS = 60, 72  # of the samples to which an ellipsoid is fitted

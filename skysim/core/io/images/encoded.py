@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.images import limits, tiff
-from skysim.core.images.limits import check_pixels
-from skysim.core.images.live import silent_stderr
+from skysim.core.io.images import limits, tiff
+from skysim.core.io.images.limits import check_pixels
+from skysim.core.io.images.live import silent_stderr
 
 MAX_DEFLATE_RATIO = 1032  # greatest compression ratio of deflate (zlib's technical details)
 PNG_MAGIC, JPEG_MAGIC, BMP_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"BM"

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene.light import RoomConfig
-from skysim.sources.dome.surface import Plane, Surface
+from skysim.scene.sections.light import RoomConfig
+from skysim.sources.dome.shell.surface import Plane, Surface
 
 TILTS = 91  # from the zenith to the nadir
 MERIDIANS = 72  # of the whole shell, divisible by 4

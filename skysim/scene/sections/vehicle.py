@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from skysim.core.tolerance import NumberError
-from skysim.core.units import (
+from skysim.core.quantities.tolerance import NumberError
+from skysim.core.quantities.units import (
     Angles,
     ConfigModel,
     Damping,

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
-from skysim.core.units import ConfigModel, Momentum, NotNegative, Number, Positive, Spin, Time
-from skysim.core.yaml_reader import existing_file
+from skysim.core.io.yaml_reader import existing_file
+from skysim.core.quantities.units import ConfigModel, Momentum, NotNegative, Number, Positive, Spin, Time
 
 Duration = Annotated[Time, Field(gt=0)]
 Acceleration = Positive
