@@ -43,7 +43,7 @@ def stacked_axes(heights_in: Sequence[float]) -> tuple[Any, list[Any]]:
     """
     from matplotlib.figure import Figure
 
-    width_in, left_in, right_in, top_in, bottom_in, gap_in = 10, 0.85, 0.15, 0.12, 0.55, 0.15
+    width_in, left_in, right_in, top_in, bottom_in, gap_in = 10, 0.95, 0.15, 0.12, 0.55, 0.15
     height_in = top_in + sum(heights_in) + gap_in * (len(heights_in) - 1) + bottom_in
     fig = Figure(figsize=(width_in, height_in))
     grid = fig.add_gridspec(

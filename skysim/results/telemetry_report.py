@@ -47,11 +47,12 @@ def summary(log: Telemetry) -> dict[str, float]:
     if pointing is not None:
         statistics |= {"pointing_deg_worst": pointing.max(), "pointing_deg_end": pointing[-1]}
         statistics["torque_nm_worst"] = np.abs(log.torque_nm).max()
-    if log.wheel_rad_s.size or log.gimbal_rad.size:
+    controlled = log.lab_from_ref is not None  # a prescribed motion leaves wheels and gimbals as they were
+    if controlled and (log.wheel_rad_s.size or log.gimbal_rad.size):
         statistics["momentum_nms_worst"] = np.linalg.norm(log.momentum_nms, axis=1).max()
-    if log.wheel_rad_s.size:
+    if controlled and log.wheel_rad_s.size:
         statistics["wheel_rpm_worst"] = np.abs(log.wheel_rad_s).max() / RPM_RAD_S
-    if log.manipulability is not None:
+    if controlled and log.manipulability is not None:
         statistics["manipulability_least"] = log.manipulability.min()
     if imu is not None and log.saturated is not None:
         statistics |= {"imu_deg_worst": imu.max(), "imu_deg_end": imu[-1]}
@@ -196,14 +197,15 @@ def momentum_panel(log: Telemetry, axes: Any) -> None:
 
 def panels(log: Telemetry) -> list[Callable[[Telemetry, Any], None]]:
     """The panels for which the telemetry has data."""
+    controlled = log.lab_from_ref is not None
     available = {
         attitude_panel: True,
         attitude_error_panel: log.lab_from_imu is not None or log.lab_from_ref is not None,
         bias_panel: log.lab_from_filter is not None,
-        torque_panel: log.lab_from_ref is not None,
-        wheels_panel: bool(log.wheel_rad_s.size),
-        gimbals_panel: bool(log.gimbal_rad.size),
-        momentum_panel: bool(log.wheel_rad_s.size or log.gimbal_rad.size),
+        torque_panel: controlled,
+        wheels_panel: controlled and bool(log.wheel_rad_s.size),
+        gimbals_panel: controlled and bool(log.gimbal_rad.size),
+        momentum_panel: controlled and bool(log.wheel_rad_s.size or log.gimbal_rad.size),
     }
     return [panel for panel, present in available.items() if present]
 

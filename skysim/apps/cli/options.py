@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import datetime
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
+    from skysim.experiments.study.plan import Plan
     from skysim.scene.scene import Scene
 
 # Loaded scenes: name and command-line overrides, for the locations in error messages.
@@ -111,6 +112,20 @@ def scene_names(scene: Scene) -> tuple[str | None, str | None]:
     """The names of the scene's tracker and of its controller, None without one."""
     control = scene.motion.control
     return scene.tracker.name, control.law if control else None
+
+
+def study_names(plan: Plan) -> set[str | None]:
+    """All texts that are values of a study, and the names of its scene's tracker and controller."""
+    from skysim.experiments.study.plan import resolve_point
+
+    def texts(value: Any) -> Iterator[str]:
+        if isinstance(value, str):
+            yield value
+        for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ():
+            yield from texts(inner)
+
+    scene, _ = resolve_point(plan.spec, {})
+    return {*texts(plan.study.model_dump(mode="json")), *scene_names(scene)}
 
 
 def output_folder(out: Path | None, name: str) -> Path:

@@ -72,12 +72,25 @@ class Store:
                 raise ValueError("overrides are not text values by key")
             return overrides
 
-    def begin(self, points: Iterable[Point], **values: str) -> None:
-        """Initialize the store with a study's points and metadata, in one transaction."""
+    def begin(self, points: Iterable[Point], grown: tuple[int, int] | None = None, **values: str) -> None:
+        """Set the study's points and metadata in one transaction.
+
+        grown : replicates of the stored trials and of the study, if it has more: trials are numbered
+                point * replicates + replicate, and get their new numbers
+        """
         with self.db:
+            if grown:
+                self._renumber(*grown)
             self.db.execute("DELETE FROM points")
             self._insert_points(points)
             self.db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
+
+    def _renumber(self, replicates: int, more: int) -> None:
+        number = f"trial / {replicates} * {more} + trial % {replicates}"
+        for table in ("trials", "timings"):
+            # By way of negative numbers, since a new number may be the old one of another row.
+            self.db.execute(f"UPDATE {table} SET trial = -1 - ({number})")
+            self.db.execute(f"UPDATE {table} SET trial = -1 - trial")
 
     def scenes(self) -> list[tuple[int, int, str]]:
         """Point, replicate and scene hash of the first and the last trial that did not fail."""

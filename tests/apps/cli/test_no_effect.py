@@ -26,6 +26,7 @@ STUDY = {
     [
         ("run shefex2 --program mine=cat", "--program mine: has no effect: nothing has this name"),
         ("check shefex2 --program mine=cat", "--program mine: has no effect: nothing has this name"),
+        ("validate study.yaml shefex2 --program mine=cat", "--program mine: has no effect: nothing has this name"),
         ("compare shefex2 --tracker own --program mine=cat", "--program mine: has no effect: nothing has this name"),
         ("study run study.yaml --program mine=cat", "--program mine: has no effect: nothing has this name"),
         ("study run study.yaml --engine serial --workers 2", "--workers 2: has no effect with --engine serial"),

@@ -78,6 +78,25 @@ def test_what_was_overridden_is_remembered(typed):
     assert json.loads(typed("study", "status", "question.yaml", "--out", "here", "--json")[1])["trials"] == 6
 
 
+@pytest.mark.slow
+def test_a_study_is_grown_and_named_by_its_folder(typed, tmp_path):
+    assert typed("study", "run", "question.yaml", "--engine", "serial", "--set", "replicates=2")[0] == 0
+    refused = typed("study", "resume", "question.yaml", "--engine", "serial", "--set", "seed=2")
+    assert refused[0] == 2
+    assert "another study" in refused[2]
+    grow = ("study", "resume", "out/question", "--engine", "serial", "--set", "replicates=4")
+    code, out, _ = typed(*grow)
+    assert code == 0
+    assert "8 of 8 trials" in out
+    assert typed("study", "export", "out/question", "rows.csv")[0] == 0
+    assert len((tmp_path / "rows.csv").read_text().splitlines()) == 9
+    (tmp_path / "question.yaml").rename(tmp_path / "moved.yaml")
+    code, _, err = typed("study", "export", "out/question", "rows.csv")
+    assert code == 2
+    assert err.strip().endswith("question.yaml; allowed: STUDY --out out/question")
+    assert typed("study", "export", "moved.yaml", "rows.csv", "--out", "out/question")[0] == 0
+
+
 @pytest.mark.long
 def test_the_worst_are_named_with_what_repeats_them(typed):
     assert typed("study", "run", "question.yaml", "--engine", "serial")[0] == 0

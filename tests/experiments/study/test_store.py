@@ -153,7 +153,7 @@ def test_another_study_or_other_code_is_refused(
     done(told, path)
     with pytest.raises(InputError, match="contains 120 trials; allowed: skysim study resume"):
         done(told, path)
-    for key, value in {"seed": "2", "replicates": "41", "set": "{light.limit_mag: 5.5}"}.items():
+    for key, value in {"seed": "2", "replicates": "39", "set": "{light.limit_mag: 5.5}"}.items():
         with pytest.raises(InputError, match="another study"):
             done(other(told, **{key: value}), path, resume=True)
     for key, value in {"title": "another", "responses": "[wrong]", "budget": "{time: 1 h}"}.items():
@@ -163,6 +163,20 @@ def test_another_study_or_other_code_is_refused(
         done(told, path, resume=True)
     with pytest.raises(InputError, match="no trials to resume"):
         done(told, tmp_path / "new.sqlite", resume=True)
+
+
+@pytest.mark.slow
+def test_a_study_of_more_replicates_keeps_the_trials_that_it_has(told: plan.Plan, tmp_path: Path) -> None:
+    more, whole, grown = other(told, replicates="5"), tmp_path / "whole.sqlite", tmp_path / "grown.sqlite"
+    done(more, whole)
+    done(other(told, replicates="2"), grown)
+    assert done(more, grown, resume=True).now == 9
+    assert contents(grown) == contents(whole)
+    with store.open_store(whole) as kept, store.open_store(grown) as other_store:
+        assert kept.meta("replicates") == other_store.meta("replicates") == "5"
+        assert len(other_store.columns()["time_ms"]) == np.count_nonzero(other_store.columns()["time_ms"] > 0) == 15
+    with pytest.raises(InputError, match="another study"):
+        done(other(told, replicates="4"), grown, resume=True)
 
 
 def test_what_is_no_store_is_refused(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from skysim.apps.cli.options import (
     Programs,
     complete_study,
     output_folder,
-    scene_names,
+    study_names,
     used_programs,
 )
 from skysim.apps.cli.study_summary import (
@@ -44,7 +44,7 @@ StudyArg = Annotated[
     str,
     typer.Argument(
         metavar="STUDY",
-        help="Study file (.yaml), or name of a study in scenes/studies/.",
+        help="Study file (.yaml), or name of a study in scenes/studies/; once it has run, its output folder too.",
         autocompletion=complete_study,
     ),
 ]
@@ -84,7 +84,7 @@ def run(
 
     overrides = parse_overrides(set_)
     plan = loader.load(study, overrides, process.program_commands(program))
-    used_programs(program, names_in(plan) if program else ())
+    used_programs(program, study_names(plan) if program else ())
     search = context.info_name == "optimize"
     if search and plan.study.optimize is None:
         raise InputError(f"{plan.path}: has no key optimize; allowed: skysim study run")
@@ -101,13 +101,18 @@ def resume(
     engine: EngineName = "pool",
     scheduler: Scheduler = "",
     failed: Annotated[bool, typer.Option("--failed", help="Repeat failed trials too.")] = False,
+    set_: Overrides = None,
     program: Programs = None,
     open_: OpenReport = False,
     json: Json = False,
 ) -> None:
-    """Continue a study or a search that was stopped or killed, or that used up its budget."""
+    """Continue a study or a search that was stopped or killed, or that used up its budget.
+
+    `--set replicates=N` adds replicates to a study; its trials are kept.
+    """
     start_workers(engine)
-    plan, overrides = load_stored_plan(study, out, program or [])
+    study, out = located(study, out)
+    plan, overrides = load_stored_plan(study, out, program or [], set_, grows=True)
     trial_engine = create_engine(engine, workers, scheduler)
     run_and_report(plan, study, out, trial_engine, overrides, json, open_, resumed=True, repeat_failed=failed)
 
@@ -115,6 +120,7 @@ def resume(
 @app.command()
 def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
     """Show the progress of a study, while it runs or after."""
+    study, out = located(study, out)
     plan, _ = load_stored_plan(study, out)
     with open_store(study, out) as stored:
         progress = study_status(plan, stored)
@@ -130,6 +136,7 @@ def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
 @app.command()
 def report(study: StudyArg, out: Out = None, open_: OpenReport = False, json: Json = False) -> None:
     """Write the report of a study, finished or not, and print its table."""
+    study, out = located(study, out)
     plan, overrides = load_stored_plan(study, out)
     write_report(plan, study, out, overrides, json, open_)
 
@@ -148,6 +155,7 @@ def export(
     """Write a study's results for other tools."""
     from skysim.experiments.study.report import export as study_export
 
+    study, out = located(study, out)
     plan, _ = load_stored_plan(study, out)
     with open_store(study, out) as stored:
         for path in to:
@@ -169,6 +177,7 @@ def replay(
     """Repeat one trial and write its frames."""
     from skysim.experiments.study.execution import replay as execution
 
+    study, out = located(study, out)
     plan, _ = load_stored_plan(study, out, program or [])
     with open_store(study, out) as stored:
         repeated = execution.replay(plan, stored, trial, folder_of(study, out) / f"trial_{trial}")
@@ -210,6 +219,7 @@ def worst(
     from skysim.experiments.study.analysis import worst as analysis
     from skysim.results import metrics
 
+    study, out = located(study, out)
     plan, _ = load_stored_plan(study, out)
     name = response or plan.study.responses[0]
     metrics.response(name, "--response")
@@ -239,20 +249,6 @@ SEARCH_HELP = (
     "Search a study's factors for the best point, or the Pareto front of two objectives. `resume` continues it."
 )
 app.command("optimize", help=SEARCH_HELP)(run)
-
-
-def names_in(plan: Plan) -> set[str | None]:
-    """All texts that are values of a study, and the names of its scene's tracker and controller."""
-    from skysim.experiments.study.plan import resolve_point
-
-    def texts(value: Any) -> Iterator[str]:
-        if isinstance(value, str):
-            yield value
-        for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ():
-            yield from texts(inner)
-
-    scene, _ = resolve_point(plan.spec, {})
-    return {*texts(plan.study.model_dump(mode="json")), *scene_names(scene)}
 
 
 def run_and_report(
@@ -345,20 +341,41 @@ def analysis(plan: Plan, stored: Store) -> dict[str, Any]:
     return {"indices": sensitivity.indices(plan, stored)} if plan.study.design.kind == "saltelli" else {}
 
 
-def load_stored_plan(study: str, out: Path | None, program: list[str] | None = None) -> tuple[Plan, dict[str, str]]:
+def located(study: str, out: Path | None) -> tuple[str, Path | None]:
+    """The study's file and its output folder, where `study` may be the folder with its store. Raises InputError."""
+    from skysim.experiments.study import store
+
+    if out is not None or not (Path(study) / store.STORE).is_file():
+        return study, out
+    with store.open_store(Path(study) / store.STORE) as stored:
+        file = stored.meta("file")
+    if not Path(file).is_file():
+        raise InputError(f"{study}: no such file as its study, {file or 'not stored'}; allowed: STUDY --out {study}")
+    return file, Path(study)
+
+
+def load_stored_plan(
+    study: str, out: Path | None, program: list[str] | None = None, set_: list[str] | None = None, grows: bool = False
+) -> tuple[Plan, dict[str, str]]:
     """Load the study with the overrides saved in its store; return the plan and the overrides.
 
     program : external trackers of the command line; None if no trial will be run
+    set_    : more overrides
+    grows   : whether the study may have more replicates than its store
 
     Raises InputError if the store holds another study, or this one before it was changed.
     """
+    from skysim.core.io.yaml_reader import parse_overrides
     from skysim.experiments.study import loader
+    from skysim.experiments.study.execution import runner
     from skysim.tracking.external import process
 
     with open_store(study, out) as stored:
-        overrides, digest, path = stored.overrides(), stored.meta("digest"), stored.path
-    plan = loader.load(study, overrides, None if program is None else process.program_commands(program))
-    if plan.digest != digest:
+        overrides = stored.overrides() | parse_overrides(set_)
+        plan = loader.load(study, overrides, None if program is None else process.program_commands(program))
+        known = plan.digest == stored.meta("digest") or (grows and runner.stored_replicates(plan, stored))
+        path = stored.path
+    if not known:
         raise InputError(f"{path}: contains another study or an earlier version of this one; allowed: another --out")
     return plan, overrides
 

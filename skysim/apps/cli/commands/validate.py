@@ -6,6 +6,7 @@ will show and how accurate its tracker will be.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -13,7 +14,17 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from skysim.apps.cli.options import Json, Overrides, Programs, SceneArg, load, scene_names, used_programs, with_location
+from skysim.apps.cli.options import (
+    Json,
+    Overrides,
+    Programs,
+    SceneArg,
+    load,
+    scene_names,
+    study_names,
+    used_programs,
+    with_location,
+)
 from skysim.apps.cli.terminal import print_check, print_error, print_json
 from skysim.core.errors import InputError
 from skysim.scene.data_sheet.sheet import PLACEHOLDER_LENS
@@ -59,6 +70,8 @@ def validate(
 
         programs = process.program_commands(program)
     verdicts = [check_file(path, programs) for path in files]
+    if program and not any(verdict.fault for verdict in verdicts):
+        used_programs(program, {name for path in files for name in names_in_file(path)})
     if json:
         print_json([verdict._asdict() for verdict in verdicts])
     for verdict in verdicts if not json else []:
@@ -128,6 +141,19 @@ def describe_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})
         camera = load_camera(path, PLACEHOLDER_LENS)
         return f"a camera of {camera.width_px} x {camera.height_px} pixels", ()
     return check_scene(path, programs)
+
+
+def names_in_file(path: Path) -> set[str | None]:
+    """The names of trackers and controllers in a scene or a study; empty for other files."""
+    from skysim.experiments.study import loader as studies
+    from skysim.scene import loader
+
+    path = path if path.suffix else find_shipped(path)
+    with contextlib.suppress(InputError):
+        return set(scene_names(loader.load(path)))
+    with contextlib.suppress(InputError):
+        return study_names(studies.load(path))
+    return set()
 
 
 def find_shipped(path: Path) -> Path:

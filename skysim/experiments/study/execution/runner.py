@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -101,13 +101,16 @@ class ChunkQueue:
 def prepare_store(plan: Plan, store: Store, resume: bool, overrides: Mapping[str, str] | None = None) -> None:
     """Initialize a store for a plan, or check that it belongs to the plan.
 
+    The store may be of the same study with fewer replicates: its trials are kept, and numbered anew.
+
     resume    : whether to continue a store that already has trials
     overrides : study keys from the command line, saved in the store
 
     Raises InputError if the store holds another study or rows of another code version, or if `resume` does not fit.
     """
     stored, done, fault = store.meta("digest"), store.counts()["done"], ""
-    if stored and stored != plan.digest:
+    fewer = stored_replicates(plan, store) if stored and stored != plan.digest else plan.study.replicates
+    if not fewer:
         fault = "contains another study, or an earlier version of this one; allowed: another --out"
     elif resume and not stored:
         fault = "contains no trials to resume; allowed: skysim study run"
@@ -120,10 +123,29 @@ def prepare_store(plan: Plan, store: Store, resume: bool, overrides: Mapping[str
         raise InputError(f"{store.path}: {fault}")
     if done:
         check_scene(plan, store)
-    else:
-        text = plan.path.read_text(encoding="utf-8")
-        meta = {"study": text, "title": plan.study.title, "code": code_version(), "digest": plan.digest}
-        store.begin(plan.points, overrides=json.dumps(dict(overrides or {})), **meta)
+    if stored != plan.digest or not done:
+        text, file = plan.path.read_text(encoding="utf-8"), str(plan.path.resolve())
+        store.begin(
+            plan.points,
+            grown=(fewer, plan.study.replicates) if done else None,
+            study=text,
+            file=file,
+            title=plan.study.title,
+            code=code_version(),
+            digest=plan.digest,
+            replicates=str(plan.study.replicates),
+            overrides=json.dumps(dict(overrides or {})),
+        )
+
+
+def stored_replicates(plan: Plan, store: Store) -> int:
+    """Replicates of the store's trials if its study is the plan's with fewer of them, else 0."""
+    if plan.study.optimize is not None:  # a search has chosen its candidates by all replicates
+        return 0
+    with store.corruption_as_input_error():
+        fewer = int(store.meta("replicates") or 0)
+    same = replace(plan, study=plan.study.model_copy(update={"replicates": fewer})).digest == store.meta("digest")
+    return fewer if same and 0 < fewer < plan.study.replicates else 0
 
 
 def check_scene(plan: Plan, store: Store) -> None:
