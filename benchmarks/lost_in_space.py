@@ -1,4 +1,4 @@
-"""Lost-in-space identification on twelve workloads, from centroids and magnitudes, compared with an oracle.
+"""Lost-in-space identification on sixteen workloads, from centroids and magnitudes, compared with an oracle.
 
 `python -m benchmarks.lost_in_space [FIELDS] [SEED] [IDENTIFIER ...]` prints success, wrong attitudes and time. The sky
 is Hipparcos to the workload's limiting magnitude, without the fainter of any two stars closer than 30". Attitudes are
@@ -43,6 +43,7 @@ class Workload:
     brightest     : maximum number of centroids; false_share : fraction of the centroids that are false, after this cut
     false, missing: number of false lights, and fraction of the stars not detected
     false_brighter: whether every false light is brighter than any star
+    focal_error   : relative error of the focal length that the tracker is told; focal_uncertainty : as it is told
     """
 
     name: str
@@ -55,6 +56,8 @@ class Workload:
     false: int = 0
     missing: float = 0.0
     false_brighter: bool = False
+    focal_error: float = 0.0
+    focal_uncertainty: float = 0.0
 
     @property
     def camera(self) -> Camera:
@@ -66,6 +69,7 @@ class Workload:
 
 PTASE_PX = 1024
 SHEFEX = (14.87, 11.15)
+DENSE = ((17, 13), 1024, 6.0, 0.2)
 WORKLOADS = (
     Workload("PTASE", (20, 20), PTASE_PX, 6.0, 3 * ARCSEC_RAD * PTASE_PX / 2 / np.tan(np.radians(10))),
     Workload("SHEFEX", SHEFEX, 659, 5.75, 0.1, brightest=15),
@@ -79,6 +83,10 @@ WORKLOADS = (
     Workload("6 x 6 deg, 70 % false", (6, 6), 1024, 7.5, 0.2, false_share=0.7),
     Workload("35 x 20 deg, 70 % false", (35, 20), 1280, 5.5, 0.2, false_share=0.7),
     Workload("23 x 23 deg, 70 % false", (23, 23), 1024, 5.5, 0.2, false_share=0.7),
+    Workload("SHEFEX, focal told to 5 %, off 5 %", SHEFEX, 659, 5.75, 0.1, focal_error=0.05, focal_uncertainty=0.05),
+    Workload("17 x 13 deg, half false, the same", *DENSE, false_share=0.5, focal_error=0.05, focal_uncertainty=0.05),
+    Workload("SHEFEX, focal off 1 %, told as known", SHEFEX, 659, 5.75, 0.1, focal_error=0.01),
+    Workload("17 x 13 deg, half false, the same", *DENSE, false_share=0.5, focal_error=0.01),
 )
 
 
@@ -146,7 +154,8 @@ Solve = Callable[[Field], Rotation | None]
 def ours(work: Workload, stars: catalog.StarCatalog, identifier: str) -> Solve:
     """The skysim star tracker with one of its identifiers."""
     settings = Settings(identifier=identifier, centroid_sigma_px=0.0, field_stars=1e9, merge_px=0.0, zero_point_mag=0.0)
-    tracker = StarTracker(work.camera, stars, stars.vectors, settings)
+    camera = work.camera.zoomed(1 + work.focal_error)
+    tracker = StarTracker(camera, stars, stars.vectors, settings, 1.05 * work.focal_uncertainty)
     return lambda frame: tracker.solve_centroids(frame.centroids).cam_from_ref
 
 
@@ -172,7 +181,7 @@ def compare(work: Workload, count: int, seed: int, identifier: str) -> str:
         solved += right
         wrong += not right and (oracle_right or best is None)
     return (
-        f"{work.name:30s} {identifier:10s} {100 * solved / count:8.2f} {100 * wrong / count:7.2f}"
+        f"{work.name:36s} {identifier:10s} {100 * solved / count:8.2f} {100 * wrong / count:7.2f}"
         f" {100 * possible / count:8.2f} {np.median(ms):8.3f} {np.percentile(ms, 99):8.2f} {build_s:7.2f}"
     )
 
@@ -180,7 +189,7 @@ def compare(work: Workload, count: int, seed: int, identifier: str) -> str:
 if __name__ == "__main__":
     arguments = sys.argv[1:]
     count, seed = (int(text) for text in (arguments[:2] + ["1000", "1"][len(arguments[:2]) :]))
-    print(f"{'workload':30s} {'':10s}  found %  wrong % oracle %       ms   p99 ms build s")
+    print(f"{'workload':36s} {'':10s}  found %  wrong % oracle %       ms   p99 ms build s")
     for work in WORKLOADS:
         for identifier in arguments[2:] or ["pyramid", "default"]:
             print(compare(work, count, seed, identifier), flush=True)

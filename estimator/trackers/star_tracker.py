@@ -1,14 +1,17 @@
 """Star tracker for the real sky: from a frame to an attitude, lost in space. `dome_tracker` does the same for a dome.
 
-Stages: detect and centroid (`pipeline`), identify, solve. The default identifier (`identification/stars/search.py`)
-computes identity, attitude and covariance in one step by Bayesian evidence. The candidates of a published identifier
-(`registry`) are matched to the full catalog, refined, and accepted if the match is significant. If the focal length
-is uncertain, it and the first radial distortion coefficient are fitted to each frame's stars.
+Stages: detect and centroid (`pipeline`), identify, solve. The default identifier computes identity, attitude and
+covariance in one step by Bayesian evidence, from pairs of stars (`identification/stars/search.py`). If the focal length
+is uncertain, quads of stars (`quads.py`) are searched first, and the focal length and the first radial distortion
+coefficient are fitted to each frame's stars. Quads also find a calibrated focal length that is wrong: where a short
+search by pairs fails, or where its residuals are too great. The candidates of a published identifier (`registry`) are
+matched to the full catalog, refined, and accepted if the match is significant.
 """
 
 from __future__ import annotations
 
 import datetime
+import functools
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
@@ -20,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.attitude.systematic import focal_error_px, with_focal_error
-from estimator.catalog import catalog, pair_index, sky_index
+from estimator.catalog import catalog, pair_index, quad_index, sky_index
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
@@ -32,7 +35,7 @@ from estimator.identification.chance import (
     MIN_MATCHES,
     log10_tail,
 )
-from estimator.identification.stars import search
+from estimator.identification.stars import quads, search
 from estimator.identification.stars.evidence import Detections, Solution
 from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, process_frame
 
@@ -47,19 +50,32 @@ class SearchModel(NamedTuple):
     min_error_px   : least centroid error
     relative_error : additional error, as a fraction of the distance from the principal point
     max_checks     : greatest number of star look-ups; 400,000 take about 0.02 s
+    by_quads       : whether quads are searched in place of pairs
+    focal_uncertainty : relative, if it is greater than that of the tracker
     """
 
     min_error_px: float
     relative_error: float
     max_checks: int
+    by_quads: bool = False
+    focal_uncertainty: float = 0.0
 
 
-CALIBRATED_SEARCHES = (SearchModel(MIN_ERROR_PX, 0.0, 400_000),)
-UNCALIBRATED_SEARCHES = (
-    SearchModel(0.5, 0.0, 200_000),
-    SearchModel(1.0, 0.005, 600_000),
-    SearchModel(2.0, 0.01, 300_000),
+CALIBRATED_SEARCHES = (
+    SearchModel(MIN_ERROR_PX, 0.0, 25_000),
+    SearchModel(MIN_ERROR_PX, 0.0, 200_000, True, search.WRONG_FOCAL),
+    SearchModel(MIN_ERROR_PX, 0.0, 400_000),
 )
+UNCALIBRATED_SEARCHES = (
+    SearchModel(MIN_ERROR_PX, 0.0, 100_000, True),
+    SearchModel(0.5, 0.0, 100_000, True),
+    SearchModel(1.0, 0.005, 100_000, True),
+    SearchModel(2.0, 0.01, 100_000, True),
+    SearchModel(0.5, 0.0, 100_000),
+    SearchModel(1.0, 0.005, 200_000),
+    SearchModel(2.0, 0.01, 100_000),
+)
+MAX_DISTORTION_SIGMA = 1.5  # of an undistorted lens
 # A detection brighter than its star by this much is a mismatch: more than colors, variables and doubles explain.
 TOO_BRIGHT_MAG = 2.0
 CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
@@ -106,6 +122,13 @@ class StarTracker:
             self.pairs = len(self.index.pair)
         corners = camera.tangents(CORNERS * [camera.width_px, camera.height_px] - 0.5)
         self.field = np.array([corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max()])
+
+    @functools.cached_property
+    def quads(self) -> quad_index.QuadIndex:
+        """The quads of the pattern index, built when they are first needed."""
+        assert self.patterns is not None
+        height_rad = 2 * np.arctan(min(self.camera.width_px, self.camera.height_px) / 2 / self.camera.focal_px)
+        return quad_index.build(self.patterns, height_rad)
 
     @classmethod
     def for_sky(
@@ -201,10 +224,10 @@ class StarTracker:
         radius_px = np.linalg.norm(centroids.xy_px - self.camera.center_px, axis=1)
         return np.hypot(sigma_px, relative_error * radius_px)
 
-    def detections(self, centroids: Centroids, sigma_px: Floats) -> Detections:
+    def detections(self, centroids: Centroids, sigma_px: Floats, focal_uncertainty: float = 0.0) -> Detections:
         """The centroids as input of the search, with magnitudes if the zero point is known.
 
-        sigma_px : (N,) total errors
+        sigma_px : (N,) total errors;  focal_uncertainty : relative, if it is greater than that of the tracker
         """
         settings = self.settings
         mag = np.full(len(centroids), np.nan)
@@ -220,7 +243,7 @@ class StarTracker:
             mag,
             settings.magnitude_sigma,
             self.field,
-            self.focal_uncertainty,
+            max(self.focal_uncertainty, focal_uncertainty),
         )
 
     def _identify_by_evidence(
@@ -234,29 +257,68 @@ class StarTracker:
 
         If that fit fails, a search without relative_error returns the solution; otherwise the next search follows.
         """
-        for min_error_px, relative_error, checks in searches:
-            sigma_px = self.sigma_px(centroids, min_error_px, relative_error)
-            most, detections = self.settings.searched_stars, self.detections(centroids, sigma_px)
-            solution = search.lost_in_space(detections, patterns, self.sky, most, checks)
+        for model in searches:
+            sigma_px = self.sigma_px(centroids, model.min_error_px, model.relative_error)
+            solution = self._search(centroids, sigma_px, patterns, model)
+            if not self.focal_uncertainty and _residuals_too_great(solution):
+                # Of a camera with a wrong focal length a part of the stars may match, at a wrong attitude.
+                other = self._search(centroids, sigma_px, patterns, CALIBRATED_SEARCHES[1])
+                solution = other if other.dex > solution.dex + search.WRONG_FOCAL_DEX else solution
             clock.lap("identify")
             if not len(solution.star):
                 continue
             attitude = self.attitude_of(centroids, solution, sigma_px)
-            if self.focal_uncertainty:
+            if self.focal_uncertainty and not (
+                model.min_error_px == MIN_ERROR_PX and self._fits(solution, centroids, sigma_px)
+            ):
                 fitted = self._refine(
                     centroids,
                     self.camera.zoomed(solution.focal_ratio),
                     Rotation.from_quat(solution.cam_from_ref_xyzw),
                 )
-                attitude = attitude if not (fitted.solved or relative_error) else fitted
+                attitude = attitude if not (fitted.solved or model.relative_error) else fitted
             clock.lap("solve")
             if attitude.solved:
                 return attitude
         return Attitude(NO_MATCH)
 
+    def _search(
+        self, centroids: Centroids, sigma_px: Floats, patterns: sky_index.SkyIndex, model: SearchModel
+    ) -> Solution:
+        """One search of the default identifier."""
+        detections, most = self.detections(centroids, sigma_px, model.focal_uncertainty), self.settings.searched_stars
+        if not model.by_quads:
+            return search.lost_in_space(detections, patterns, self.sky, most, model.max_checks)
+        known = not self.focal_uncertainty
+        return quads.identify(detections, self.quads, patterns, self.sky, most, model.max_checks, known)
+
+    def _fits(self, solution: Solution, centroids: Centroids, sigma_px: Floats) -> bool:
+        """Whether an undistorted lens explains a solution.
+
+        The residuals have their expected size, they have no part q = r^3 - c r by a radial distortion (c makes q
+        orthogonal to r, which a focal length explains), and no more stars than by chance are near other detections.
+        """
+        count, observed = len(solution.star), solution.observed
+        if solution.chi2 > 1 + 1 / np.sqrt(count):
+            return False
+        camera, cam_from_ref = self.camera.zoomed(solution.focal_ratio), Rotation.from_quat(solution.cam_from_ref_xyzw)
+        xy_px = centroids.xy_px[observed]
+        residual_px = xy_px - camera.pixels(cam_from_ref.apply(self.stars.vectors[solution.star]))
+        offset = (xy_px - camera.center_px) / camera.focal_px
+        r2 = np.sum(offset**2, axis=1)
+        q = r2 - np.sum(r2**2) / np.sum(r2)  # over r
+        score = np.sum(q * np.sum(offset * residual_px, axis=1)) / np.sqrt(np.sum(q**2 * r2 * sigma_px[observed] ** 2))
+        if abs(score) > MAX_DISTORTION_SIGMA:
+            return False
+        radius_px = self._lens_radii_px[0]
+        near, _ = self._nearest(centroids, camera, cam_from_ref, radius_px)
+        rows, _ = self.in_field(camera, cam_from_ref)
+        covered = len(rows) * np.pi * radius_px**2 / (camera.width_px * camera.height_px)
+        return len(near) <= count + 1 + 2 * covered * (len(centroids) - count)
+
     def attitude_of(self, centroids: Centroids, solution: Solution, sigma_px: Floats) -> Attitude:
         """The attitude of a solution; solved again from its matches if the settings name another solver."""
-        camera = self.camera.zoomed(solution.focal_ratio) if self.focal_uncertainty else self.camera
+        camera = self.camera if solution.focal_ratio == 1 else self.camera.zoomed(solution.focal_ratio)
         cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
         covariance_rad2 = solution.covariance_rad2
         solver = self.settings.solver
@@ -303,6 +365,12 @@ class StarTracker:
                 if match:
                     yield camera, match.cam_from_ref
 
+    @property
+    def _lens_radii_px(self) -> list[float]:
+        """Matching radii with an uncertain lens: the first allow for its error at the corner; each fit permits less."""
+        reach_px = np.hypot(self.camera.width_px, self.camera.height_px) / 2
+        return [0.008 * reach_px + 2, 0.004 * reach_px + 2, 4, 3, 2.5, 2.5]
+
     def _refine(self, centroids: Centroids, camera: Camera, cam_from_ref: Rotation) -> Attitude:
         """Refine an attitude: match the field to the full catalog and fit, with decreasing radii; test against chance.
 
@@ -310,10 +378,7 @@ class StarTracker:
         1.2 times the uncertainty.
         """
         fit_lens = self.focal_uncertainty > 0
-        reach_px = np.hypot(camera.width_px, camera.height_px) / 2
-        # With an uncertain lens the first radii allow for its error at the corner; each fit permits a smaller radius.
-        radii_px = [0.008 * reach_px + 2, 0.004 * reach_px + 2, 4, 3, 2.5, 2.5] if fit_lens else [3, 2.5, 2.5]
-        for radius_px in radii_px:
+        for radius_px in self._lens_radii_px if fit_lens else [3, 2.5, 2.5]:
             observed, star = self._nearest(centroids, camera, cam_from_ref, radius_px)
             if len(observed) < MIN_MATCHES:
                 return Attitude(NO_MATCH)
@@ -338,7 +403,7 @@ class StarTracker:
         )
         if chance > ACCEPT_LOG10_CHANCE:
             return Attitude(NO_MATCH)
-        if abs(camera.fov_rad / self.camera.fov_rad - 1) > 1.2 * self.focal_uncertainty + 1e-9:
+        if abs(camera.focal_px / self.camera.focal_px - 1) > 1.2 * self.focal_uncertainty + 1e-9:
             return Attitude(NO_MATCH)
         seen_cam = cam_from_ref.apply(vectors)
         rms_px = float(np.sqrt(np.mean((camera.pixels(seen_cam) - xy) ** 2)))
@@ -370,6 +435,11 @@ class StarTracker:
         excess_mag = zero_mag - np.median(zero_mag)
         plausible = excess_mag < max(TOO_BRIGHT_MAG, 4 * float(np.median(np.abs(excess_mag))))
         return observed[plausible], star[plausible]
+
+
+def _residuals_too_great(solution: Solution) -> bool:
+    """Whether the residuals of a solution exceed their errors by more than three standard deviations of chi-square."""
+    return bool(solution.chi2 > 1 + 3 / np.sqrt(max(len(solution.star), 1)))
 
 
 def log10_chance(

@@ -78,6 +78,7 @@ class Solution(NamedTuple):
     observed, star : (K,) rows of detections and of stars; empty if there is no solution
     cam_from_ref_xyzw : (4,);  covariance_rad2 : (3, 3) of the small rotation in camera axes
     focal_ratio: ratio of the true to the assumed focal length;  rms : of the residuals, tangents
+    chi2 : squared Mahalanobis distances of the matches per degree of freedom
     dex  : log10 of the Bayes factor
     """
 
@@ -87,6 +88,7 @@ class Solution(NamedTuple):
     covariance_rad2: Floats
     focal_ratio: float
     rms: float
+    chi2: float
     dex: float
 
 
@@ -360,15 +362,22 @@ def build_solution(detections: Detections, stars: SkyIndex, hypothesis: Hypothes
 
     The covariance is marginalized over the focal ratio if the focal length is uncertain.
     """
-    covariance, total, count = np.zeros((3, 3)), 0.0, 4 if detections.focal_uncertainty > 0 else 3
+    covariance, total, chi2, count = np.zeros((3, 3)), 0.0, 0.0, 4 if detections.focal_uncertainty > 0 else 3
     for axis in range(3):
         unit = np.zeros(count)
         unit[axis] = 1.0
         covariance[axis] = cholesky_solve(hypothesis.info[:count, :count].copy(), unit)[:3]
     for k in range(len(hypothesis.star)):
+        observed, star = hypothesis.observed[k], hypothesis.star[k]
+        chi2 += squared_mahalanobis(
+            detections, stars, hypothesis.R_cam_from_ref, hypothesis.focal_ratio, observed, star
+        )
         x, y, _ = project(stars.vectors, hypothesis.R_cam_from_ref, hypothesis.star[k])
         tx, ty = detections.tangent[hypothesis.observed[k], 0], detections.tangent[hypothesis.observed[k], 1]
         total += (tx - hypothesis.focal_ratio * x) ** 2 + (ty - hypothesis.focal_ratio * y) ** 2
     rms = sqrt(total / max(2 * len(hypothesis.star), 1))
+    chi2 /= max(2 * len(hypothesis.star) - count, 1)
     xyzw = vectors.quaternion_xyzw(hypothesis.R_cam_from_ref)
-    return Solution(hypothesis.observed, hypothesis.star, xyzw, covariance, hypothesis.focal_ratio, rms, hypothesis.dex)
+    return Solution(
+        hypothesis.observed, hypothesis.star, xyzw, covariance, hypothesis.focal_ratio, rms, chi2, hypothesis.dex
+    )

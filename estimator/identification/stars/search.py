@@ -56,6 +56,8 @@ MAG_GATE_SIGMA = 4.0  # greatest difference of magnitudes in the first round, in
 EVALUATION_COST = 6  # of one evaluation in units of one star look-up, so that frames without a solution end
 FEW = 20  # number of detections of the first search
 SHORT_EFFORT, MANY_EFFORT = 1 / 16, 1 / 4  # fractions of the effort: of the first search at first, and of the second
+WRONG_FOCAL = 0.05  # greatest relative error of a calibrated focal length that is found
+WRONG_FOCAL_DEX = 2.0  # evidence by which another focal length must beat the calibrated one
 MAX_MISSES = 4  # detections without a star after which the first round drops a candidate
 
 
@@ -76,32 +78,75 @@ def lost_in_space(
     few, many = min(FEW, max_detections, len(detections.sigma)), min(max_detections, len(detections.sigma))
     if many == few:
         accept_dex = ACCEPT_DEX
-        candidate = search(_brightest(detections, few), patterns, max_checks)
+        candidate = search(brightest(detections, few), patterns, max_checks)
     else:
         accept_dex = ACCEPT_DEX + log10(2.0)
         for count, effort in ((few, SHORT_EFFORT), (many, MANY_EFFORT), (few, 1.0)):
-            candidate = search(_brightest(detections, count), patterns, int(effort * max_checks))
+            candidate = search(brightest(detections, count), patterns, int(effort * max_checks))
             if candidate.dex >= accept_dex:
                 break
+    if detections.focal_uncertainty == 0 and candidate.dex >= accept_dex:
+        return fit_with_calibration(with_focal_uncertainty(detections, WRONG_FOCAL), stars, candidate)
+    return fit_to_all(detections, stars, candidate, accept_dex)
+
+
+@jit
+def fit_to_all(detections: Detections, stars: SkyIndex, candidate: Hypothesis, accept_dex: float) -> Solution:
+    """Fit a candidate of some detections to all of them and all stars.
+
+    The solution is empty if the candidate has less than `accept_dex`, or keeps no more than half of its matches.
+    """
     if candidate.dex < accept_dex:
         return build_solution(detections, stars, no_hypothesis())
     gates = 1.5 * GATE_SIGMA * detections.sigma
     full = evaluate(detections, stars, candidate.R_cam_from_ref.copy(), candidate.focal_ratio, gates, -np.inf)
     if 2 * len(full.observed) <= len(candidate.observed):
         return build_solution(detections, stars, no_hypothesis())
-    best = Hypothesis(
-        full.observed,
-        full.star,
-        full.R_cam_from_ref,
-        full.focal_ratio,
-        full.info,
-        max(full.dex, candidate.dex),
-    )
-    return build_solution(detections, stars, best)
+    return build_solution(detections, stars, with_evidence(full, max(full.dex, candidate.dex)))
 
 
 @jit
-def _brightest(detections: Detections, count: int) -> Detections:
+def with_evidence(hypothesis: Hypothesis, dex: float) -> Hypothesis:
+    """The same hypothesis with other evidence."""
+    return Hypothesis(
+        hypothesis.observed, hypothesis.star, hypothesis.R_cam_from_ref, hypothesis.focal_ratio, hypothesis.info, dex
+    )
+
+
+@jit
+def fit_with_calibration(detections: Detections, stars: SkyIndex, candidate: Hypothesis) -> Solution:
+    """Fit a candidate to all detections and stars with the calibrated focal length and with a free one.
+
+    The calibrated one is kept unless the other has WRONG_FOCAL_DEX more evidence. With a wrong focal length a part of
+    the stars may still match, at a wrong attitude.
+    detections : with the focal uncertainty of the free fit
+    """
+    exact, gates = with_focal_uncertainty(detections, 0.0), 1.5 * GATE_SIGMA * detections.sigma
+    R, ratio = candidate.R_cam_from_ref, candidate.focal_ratio
+    kept = evaluate(exact, stars, R.copy(), 1.0, gates, -np.inf)
+    free = evaluate(detections, stars, R.copy(), ratio, gates, -np.inf)
+    chosen, best = (detections, free) if free.dex > kept.dex + WRONG_FOCAL_DEX else (exact, kept)
+    if 2 * len(best.observed) <= len(candidate.observed):
+        return build_solution(exact, stars, no_hypothesis())
+    return build_solution(chosen, stars, with_evidence(best, max(best.dex, candidate.dex)))
+
+
+@jit
+def with_focal_uncertainty(detections: Detections, focal_uncertainty: float) -> Detections:
+    """The same detections of a camera with another uncertainty of its focal length."""
+    return Detections(
+        detections.tangent,
+        detections.sigma,
+        detections.weight,
+        detections.mag,
+        detections.mag_sigma,
+        detections.field,
+        focal_uncertainty,
+    )
+
+
+@jit
+def brightest(detections: Detections, count: int) -> Detections:
     """The first `count` detections."""
     return Detections(
         detections.tangent[:count],
@@ -216,9 +261,8 @@ def _test_pair(
     start  : the other detections are looked up from this one on
     checks : (1,) effort so far, increased in place
     """
-    gates, order = _pair_gates(detections, a, b), _other_detections(len(detections.sigma), a, b, start)
-    attitude_dex = _attitude_dex(detections, a, b)
-    required = required_matches(detections.sigma, field_area(detections), attitude_dex, ACCEPT_DEX)
+    gates, order = pair_gates(detections, a, b), other_detections(len(detections.sigma), a, b, start)
+    required = required_matches(detections.sigma, field_area(detections), attitude_dex(detections, a, b), ACCEPT_DEX)
     in_cam, in_ref = np.empty((3, 3)), np.empty((3, 3))
     R = np.empty((3, 3))  # R_ref_from_cam
     best, focal_ratio = no_hypothesis(), 1.0
@@ -240,7 +284,7 @@ def _test_pair(
         star_i, star_j = vectors.row(star, i), vectors.row(star, j)
         catalog_chord = vectors.chord(star_i, star_j)
         if focal_uncertainty > 0:
-            focal_ratio = _fit_focal_ratio(tangent, a, b, chord, catalog_chord)
+            focal_ratio = fit_focal_ratio(tangent, a, b, chord, catalog_chord)
             if abs(focal_ratio - 1) > focal_uncertainty:
                 continue
             vectors.pair_frame(ray(tangent, a, focal_ratio), ray(tangent, b, focal_ratio), in_cam)
@@ -254,7 +298,7 @@ def _test_pair(
             if not (backward if flip else forward):
                 continue
             vectors.multiply_transposed(in_ref, in_cam, R)
-            lookups, fits = _quick_check(
+            lookups, fits = quick_check(
                 tangent, star, cell_first, cell_star, side, R, focal_ratio, gates, order, required, max_misses
             )
             checks[0] += 1 + lookups
@@ -281,7 +325,7 @@ def _pair_range(detections: Detections, sky: SkyIndex, a: int, b: int) -> tuple[
 
 
 @jit
-def _other_detections(total: int, a: int, b: int, start: int) -> NDArray[np.int64]:
+def other_detections(total: int, a: int, b: int, start: int) -> NDArray[np.int64]:
     """(N - 2,) all detections but a and b, from number `start` on and around."""
     out, count = np.empty(total, np.int64), 0
     for step in range(total):
@@ -293,7 +337,7 @@ def _other_detections(total: int, a: int, b: int, start: int) -> NDArray[np.int6
 
 
 @jit
-def _fit_focal_ratio(tangent: Floats, a: int, b: int, chord: float, target: float) -> float:
+def fit_focal_ratio(tangent: Floats, a: int, b: int, chord: float, target: float) -> float:
     """The focal ratio at which the chord between two detections is `target`, by two fixed-point iterations."""
     focal_ratio = chord / target
     for _ in range(2):
@@ -302,7 +346,7 @@ def _fit_focal_ratio(tangent: Floats, a: int, b: int, chord: float, target: floa
 
 
 @jit
-def _pair_gates(detections: Detections, a: int, b: int) -> Floats:
+def pair_gates(detections: Detections, a: int, b: int) -> Floats:
     """(N,) matching radius of each detection at a pair's attitude: its own error and that of the attitude.
 
     The variance of the pair's midpoint is (sa^2 + sb^2) / 4; that of its direction, and of its relative length, is
@@ -320,7 +364,7 @@ def _pair_gates(detections: Detections, a: int, b: int) -> Floats:
 
 
 @jit
-def _attitude_dex(detections: Detections, a: int, b: int) -> float:
+def attitude_dex(detections: Detections, a: int, b: int) -> float:
     """Contribution of a pair's attitude alone to the evidence, for `required_matches`.
 
     The uncertainty is sqrt(2) sigma / separation about the boresight (and of the focal ratio), sigma / sqrt(2) across
@@ -335,7 +379,7 @@ def _attitude_dex(detections: Detections, a: int, b: int) -> float:
 
 
 @jit
-def _quick_check(
+def quick_check(
     tangent: Floats,
     vectors_ref: Floats,
     cell_first: NDArray,
@@ -351,7 +395,7 @@ def _quick_check(
     """Quick check of an attitude: number of detections looked up, and whether `required` of them have a star nearby.
 
     The two detections of the pair count as matched. Stops as soon as the count is reached or out of reach, or after
-    `max_misses` detections without any match.
+    `max_misses` of them without any match.
     """
     count, remaining = 2, len(order)
     for step in range(remaining):

@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 from laws import ANY, NUMBERS, SEEDS, answered, drawn, law, units
 from numpy.typing import NDArray
 
-from estimator.catalog import catalog, pair_buckets, pair_index, ptase, shefex, sky_index, spatial_grid
+from estimator.catalog import catalog, pair_buckets, pair_index, ptase, quad_index, shefex, sky_index, spatial_grid
 from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.sky_index import SkyIndex
 from estimator.core.camera import Camera
@@ -189,6 +189,15 @@ def test_three_indexes_hold_the_pairs_that_there_are(rng: np.random.Generator, m
 def test_any_array_is_indexed_or_refused(vectors: NDArray, mag: NDArray, most_rad: float) -> None:
     answered(lambda: pair_index.build(vectors, most_rad))
     answered(lambda: pair_index.build(vectors, 1.0, None, mag))
+
+
+@law(quad_index.build)
+@given(rng=SEEDS, count=some.integers(8, 50), height_rad=ANY)
+def test_quads_are_of_four_stars_and_by_their_cell(rng: np.random.Generator, count: int, height_rad: float) -> None:
+    index = quad_index.build(sky_index.build(units(rng, count), np.sort(rng.uniform(0, 6, count)), 3.2), height_rad)
+    assert len(index.star) == len(index.code) == index.first[-1]
+    assert all(len(set(star)) == 4 for star in index.star.tolist())
+    assert not len(index.code) or np.abs(index.code).max() <= 1
 
 
 def test_the_shipped_catalog_is_brightest_first() -> None:

@@ -7,6 +7,20 @@ from hypothesis import strategies as st
 from interpreted import interpreted
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from star_fields import (
+    CHECKS,
+    FIELD,
+    MAG,
+    SEARCHED,
+    SIGMA,
+    SKY,
+    VECTORS,
+    WIDE_RAD,
+    attitude_error,
+    detections_of,
+    observe,
+    random_sky,
+)
 
 from estimator.catalog import sky_index
 from estimator.core.errors import ImageError
@@ -14,50 +28,9 @@ from estimator.core.vectors import quaternion_xyzw
 from estimator.identification.stars import evidence, search
 from estimator.identification.stars.evidence import Solution
 
-WIDE_RAD = np.radians(12.0)
-FIELD = np.tan(np.radians([-5.0, 5.0, -4.0, 4.0]))
-SIGMA = 2e-5
-CHECKS = 200_000
-SEARCHED = 80
-
-
-def random_sky(count: int, seed: int):
-    """Uniform directions, and magnitudes that grow as the real sky's: ten to the half."""
-    rng = np.random.default_rng(seed)
-    vectors = rng.normal(size=(count, 3))
-    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors, np.sort(6.0 + 2 * np.log10(rng.uniform(1e-4, 1, count)))
-
-
-VECTORS, MAG = random_sky(6000, 1)
-SKY = sky_index.build(VECTORS, MAG, WIDE_RAD)
-
-
-def observe(truth: Rotation, rng, sigma=SIGMA, zoom=1.0, vectors=VECTORS, mag=MAG):
-    """Tangents, magnitudes and rows of the stars in the field, brightest first, through a focal length `zoom` times."""
-    x, y, z = truth.apply(vectors).T
-    tangent = zoom * np.column_stack([x, y]) / np.where(z > 0.1, z, np.inf)[:, None]
-    inside = (z > 0.1) & (tangent > FIELD[[0, 2]]).all(axis=1) & (tangent < FIELD[[1, 3]]).all(axis=1)
-    row = np.flatnonzero(inside)
-    noisy = tangent[row] + sigma * rng.standard_normal((len(row), 2))
-    shown = mag[row] + 0.25 * rng.standard_normal(len(row))
-    order = np.argsort(shown)
-    return noisy[order], shown[order], row[order]
-
-
-def detections_of(tangent, mag, sigma=SIGMA, zoom=0.0) -> evidence.Detections:
-    sigmas = np.full(len(tangent), sigma)
-    weight = np.stack([sigmas**-2, sigmas**-2, 0 * sigmas], axis=1)
-    return evidence.Detections(np.ascontiguousarray(tangent), sigmas, weight, np.array(mag), 0.25, FIELD, zoom)
-
 
 def solve(detections: evidence.Detections, sky: sky_index.SkyIndex = SKY) -> Solution:
     return search.lost_in_space(detections, sky, sky, SEARCHED, CHECKS)
-
-
-def attitude_error(solution: Solution, truth: Rotation):
-    """The small turn from the truth to the answer, in camera axes."""
-    return (Rotation.from_quat(solution.cam_from_ref_xyzw) * truth.inv()).as_rotvec()
 
 
 @pytest.mark.slow
@@ -291,7 +264,7 @@ def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
     )
     middle = (noisy[:, [a]] + noisy[:, [b]]) / 2
     errors = middle + turn[:, None] * (seen - (seen[a] + seen[b]) / 2) - noisy
-    gates = PLAIN._pair_gates(unequal(), a, b)
+    gates = PLAIN.pair_gates(unequal(), a, b)
     for n in (1, 2, 3):
         worst2 = np.linalg.eigvalsh(np.cov(errors[:, n].real, errors[:, n].imag)).max()
         assert gates[n] == pytest.approx(3.5 * np.sqrt(worst2), rel=0.02)  # 4 deviations of a variance of 20,000
@@ -321,7 +294,7 @@ def test_a_pair_s_focal_ratio_makes_its_angle_the_catalog_s() -> None:
         target = PLAIN.vectors.chord(PLAIN.ray(PLACES, 1, ratio), PLAIN.ray(PLACES, 2, ratio))
         seen = PLAIN.vectors.chord(PLAIN.ray(PLACES, 1, 1.0), PLAIN.ray(PLACES, 2, 1.0))
         # The fixed point contracts by about the square of a tangent, 5e-3, each time.
-        assert PLAIN._fit_focal_ratio(PLACES, 1, 2, seen, target) == pytest.approx(ratio, abs=1e-6)
+        assert PLAIN.fit_focal_ratio(PLACES, 1, 2, seen, target) == pytest.approx(ratio, abs=1e-6)
 
 
 def test_pairs_come_by_length_and_rarity_and_none_twice() -> None:
@@ -360,7 +333,7 @@ def test_a_pair_s_attitude_counts_as_laplace_s_integral(zoom: float) -> None:
     count = 4 if zoom else 3
     volume = 8 * np.pi**2 * (2 * zoom if zoom else 1)
     wanted = np.log10(np.sqrt(2 * np.pi) ** count / np.sqrt(np.linalg.det(info[:count, :count])) / volume)
-    assert PLAIN._attitude_dex(detections, 0, 1) == pytest.approx(wanted, abs=1e-3)
+    assert PLAIN.attitude_dex(detections, 0, 1) == pytest.approx(wanted, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -384,9 +357,9 @@ def test_the_quick_check_stops_as_soon_as_it_knows(
     sky = sky_index.build_without_pairs(
         (rays / np.linalg.norm(rays, axis=1, keepdims=True))[there], np.ones(len(there))
     )
-    order = PLAIN._other_detections(6, 0, 1, 0)
+    order = PLAIN.other_detections(6, 0, 1, 0)
     assert order.tolist() == [2, 3, 4, 5]
-    assert PLAIN._other_detections(6, 2, 4, 9).tolist() == [3, 5, 0, 1]
+    assert PLAIN.other_detections(6, 2, 4, 9).tolist() == [3, 5, 0, 1]
     tables = sky.vectors, sky.cell_first, sky.cell_star, sky.side
-    found = PLAIN._quick_check(places, *tables, np.eye(3), 1.0, np.full(6, 1e-4), order, required, max_misses)
+    found = PLAIN.quick_check(places, *tables, np.eye(3), 1.0, np.full(6, 1e-4), order, required, max_misses)
     assert found == (lookups, fits)

@@ -1,0 +1,169 @@
+"""Index of star quads by a code that does not depend on the scale: for a camera whose focal length is uncertain.
+
+A quad is four stars. A and B are the two farthest apart; m is the bisector of their directions, n the normal A x B and
+w the third axis, which points from B to A. The code of the quad is where C and D lie on these axes, in units of the
+chord L between A and B (after Lang et al. 2010, Astron. J. 139, 1782, who use the circle over A and B):
+
+    (C.w / L, C.n / L, D.w / L, D.n / L)
+
+A wrong focal length multiplies all small angles by the same factor, and leaves the code. The quad is turned by half a
+turn where the sum of the first and the third number would be negative, and C is the one with the smaller first number,
+so that the same four stars always have the same code.
+
+The quads are of stars that are bright for their surroundings, PER_CIRCLE in a circle as high as the field, so that the
+brightest detections of a frame are among them everywhere in the sky. Codes are binned on a grid of four dimensions.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.catalog.sky_index import SkyIndex
+from estimator.catalog.spatial_grid import cell_of
+from estimator.core import vectors
+from estimator.core.arrays import Floats
+from estimator.core.jit import jit
+
+PER_CIRCLE = 6  # stars of quads in a circle as high as the field
+LONGEST, SHORTEST = 1.0, 0.15  # distance of A and B, in units of the field's height
+NEIGHBORS = 60  # greatest number of stars near one star that are combined with it
+SIDE = 20  # cells along each of the four axes
+ALONG, ACROSS = 0.5, 0.87  # bounds of the coordinates along B to A and across, since C is nearer to A than B is
+
+
+class QuadIndex(NamedTuple):
+    """Quads by the cell of their code. A named tuple, so that compiled code accepts it.
+
+    star : (Q, 4) rows of the sky index: A, B, C, D;  code : (Q, 4)
+    first : (SIDE^4 + 1,) quads first[k] to first[k + 1] are in cell k
+    """
+
+    star: NDArray[np.int32]
+    code: Floats
+    first: NDArray[np.int32]
+
+
+def build(sky: SkyIndex, height_rad: float) -> QuadIndex:
+    """Build the index of the stars and pairs of `sky` for fields of the given height."""
+    chosen = _locally_bright(sky.pair, sky.first, sky.bin_rad, height_rad / 2, len(sky.vectors))
+    neighbor, first = _neighbors(sky.pair, sky.first, sky.bin_rad, LONGEST * height_rad, chosen)
+    total, found, code = 1, np.empty((0, 4), np.int32), np.empty((0, 4))
+    while total > len(found):
+        found, code = np.empty((total, 4), np.int32), np.empty((total, 4))
+        total = _quads(sky.vectors, neighbor, first, SHORTEST * height_rad, found, code)
+    return QuadIndex(*_sort_into_cells(found[:total], code[:total]))
+
+
+@jit
+def _locally_bright(pair: NDArray, first: NDArray, bin_rad: float, radius_rad: float, count: int) -> NDArray[np.bool_]:
+    """(count,) stars with fewer than PER_CIRCLE brighter ones within the radius. Stars are sorted by brightness."""
+    brighter = np.zeros(count, np.int64)
+    for p in range(first[cell_of(radius_rad / bin_rad, len(first) - 1)]):
+        brighter[max(pair[p, 0], pair[p, 1])] += 1
+    return brighter < PER_CIRCLE
+
+
+@jit
+def _neighbors(
+    pair: NDArray, first: NDArray, bin_rad: float, reach_rad: float, chosen: NDArray
+) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Of every chosen star the chosen ones within reach: those of star s are neighbor[start[s] : start[s + 1]]."""
+    end, start = first[cell_of(reach_rad / bin_rad, len(first) - 1)], np.zeros(len(chosen) + 1, np.int64)
+    for p in range(end):
+        if chosen[pair[p, 0]] and chosen[pair[p, 1]]:
+            start[pair[p, 0] + 1] += 1
+            start[pair[p, 1] + 1] += 1
+    for s in range(len(chosen)):
+        start[s + 1] += start[s]
+    neighbor, free = np.empty(start[-1], np.int32), start.copy()
+    for p in range(end):
+        i, j = pair[p, 0], pair[p, 1]
+        if chosen[i] and chosen[j]:
+            neighbor[free[i]], neighbor[free[j]] = j, i
+            free[i] += 1
+            free[j] += 1
+    return neighbor, start
+
+
+@jit
+def _quads(xyz: Floats, neighbor: NDArray, start: NDArray, shortest_rad: float, found: NDArray, code: Floats) -> int:
+    """Find all quads of neighbors, and their codes; return their number. No more than the arrays hold are stored."""
+    total, frame = 0, np.empty((3, 3))
+    near, place = np.empty(NEIGHBORS, np.int64), np.empty((NEIGHBORS, 2))
+    for a in range(len(start) - 1):
+        for entry in range(start[a], start[a + 1]):
+            b = neighbor[entry]
+            star_a, star_b = vectors.row(xyz, a), vectors.row(xyz, b)
+            length = vectors.chord(star_a, star_b)
+            if b < a or length < shortest_rad:
+                continue
+            vectors.pair_frame(star_a, star_b, frame)
+            count = 0
+            for other in range(start[a], min(start[a + 1], start[a] + NEIGHBORS)):
+                c = neighbor[other]
+                star_c = vectors.row(xyz, c)
+                if max(vectors.chord(star_a, star_c), vectors.chord(star_b, star_c)) < length and c != b:
+                    near[count] = c
+                    place[count, 0], place[count, 1] = in_frame(frame, star_c, length)
+                    count += 1
+            for k in range(count):
+                for m in range(k):
+                    if vectors.chord(vectors.row(xyz, near[k]), vectors.row(xyz, near[m])) >= length:
+                        continue
+                    if total < len(found):
+                        found[total, 0], found[total, 1], found[total, 2], found[total, 3] = a, b, near[k], near[m]
+                        code[total, :2], code[total, 2:] = place[k], place[m]
+                        arrange(code[total], found[total])
+                    total += 1
+    return total
+
+
+@jit
+def in_frame(frame: Floats, star: vectors.Vector, length: float) -> tuple[float, float]:
+    """A star's coordinates along B to A and across, in units of their chord; `frame` is that of `pair_frame`."""
+    along = frame[0, 2] * star[0] + frame[1, 2] * star[1] + frame[2, 2] * star[2]
+    across = frame[0, 1] * star[0] + frame[1, 1] * star[1] + frame[2, 1] * star[2]
+    return along / length, across / length
+
+
+@jit
+def arrange(code: Floats, star: NDArray) -> None:
+    """Bring a quad's code (4,) and its stars A, B, C, D (4,) into the order that the module names, in place."""
+    if code[0] + code[2] < 0:
+        for k in range(4):
+            code[k] = -code[k]
+        star[0], star[1] = star[1], star[0]
+    if code[0] > code[2]:
+        code[0], code[2] = code[2], code[0]
+        code[1], code[3] = code[3], code[1]
+        star[2], star[3] = star[3], star[2]
+
+
+@jit
+def code_cell(value: float, axis: int) -> int:
+    """The cell of a code's coordinate along its axis."""
+    bound = ACROSS if axis % 2 else ALONG
+    return cell_of((value + bound) * (SIDE / (2 * bound)), SIDE - 1)
+
+
+@jit
+def _sort_into_cells(star: NDArray, code: Floats) -> tuple[NDArray[np.int32], Floats, NDArray[np.int32]]:
+    """Counting sort of quads by the cell of their code."""
+    cell, first = np.empty(len(code), np.int64), np.zeros(SIDE**4 + 1, np.int32)
+    for n in range(len(code)):
+        k = 0
+        for axis in range(4):
+            k = k * SIDE + code_cell(code[n, axis], axis)
+        cell[n] = k
+        first[k + 1] += 1
+    for k in range(SIDE**4):
+        first[k + 1] += first[k]
+    sorted_star, sorted_code, free = np.empty_like(star), np.empty_like(code), first.copy()
+    for n in range(len(code)):
+        slot = free[cell[n]]
+        sorted_star[slot], sorted_code[slot] = star[n], code[n]
+        free[cell[n]] += 1
+    return sorted_star, sorted_code, first

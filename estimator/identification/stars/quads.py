@@ -1,0 +1,173 @@
+"""Lost-in-space star identification by quads of detections: for a camera whose focal length is uncertain.
+
+The code of four detections (`catalog.quad_index`) hardly depends on the focal length, so that the few catalog quads
+with the same code are the only candidates, however uncertain it is. The two detections farthest apart and their stars
+determine the attitude and the focal length. A quick check and the Bayes factor then decide as in `search`. Quads are
+tried in the order of brightness: first those of the four brightest detections, then all with the fifth, and so on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimator.catalog import quad_index
+from estimator.catalog.quad_index import SIDE, QuadIndex
+from estimator.catalog.sky_index import SkyIndex
+from estimator.core import vectors
+from estimator.core.arrays import Floats, Ints
+from estimator.core.jit import jit
+from estimator.identification.chance import GATE_SIGMA, required_matches
+from estimator.identification.stars import search
+from estimator.identification.stars.evidence import (
+    Detections,
+    Hypothesis,
+    Solution,
+    evaluate,
+    field_area,
+    no_hypothesis,
+    ray,
+)
+
+COMBINED = 24  # number of brightest detections that are combined to quads
+
+
+@jit
+def identify(
+    detections: Detections,
+    quads: QuadIndex,
+    patterns: SkyIndex,
+    stars: SkyIndex,
+    max_detections: int,
+    max_checks: int,
+    calibrated: bool,
+) -> Solution:
+    """Identify the detections and solve attitude and focal length; an empty solution below DECISIVE_DEX.
+
+    The candidates are tested on the `max_detections` brightest; the attitude is then fitted to all detections and all
+    `stars`.
+    max_checks : bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
+    calibrated : whether the focal length should be right (`search.fit_with_calibration`)
+    """
+    searched = search.brightest(detections, min(max_detections, len(detections.sigma)))
+    best = _search(searched, quads, patterns, max_checks)
+    if calibrated and best.dex >= search.DECISIVE_DEX:
+        return search.fit_with_calibration(detections, stars, best)
+    return search.fit_to_all(detections, stars, best, search.DECISIVE_DEX)
+
+
+@jit
+def _search(detections: Detections, quads: QuadIndex, sky: SkyIndex, max_checks: int) -> Hypothesis:
+    """The first hypothesis of the quads with DECISIVE_DEX, else the empty one."""
+    quad, checks = np.empty(4, np.int64), np.zeros(1, np.int64)
+    for d in range(3, min(len(detections.sigma), COMBINED)):
+        for c in range(2, d):
+            for b in range(1, c):
+                for a in range(b):
+                    quad[0], quad[1], quad[2], quad[3] = a, b, c, d
+                    candidate = _test_quad(detections, quads, sky, quad, checks)
+                    if candidate.dex >= search.DECISIVE_DEX:
+                        return candidate
+                    if checks[0] > max_checks:
+                        return no_hypothesis()
+    return no_hypothesis()
+
+
+@jit
+def _test_quad(detections: Detections, quads: QuadIndex, sky: SkyIndex, quad: Ints, checks: Ints) -> Hypothesis:
+    """Test four detections against every catalog quad of the same code; the first with DECISIVE_DEX.
+
+    checks : (1,) effort so far, increased in place
+    """
+    _longest_first(detections.tangent, quad)
+    a, b = quad[0], quad[1]
+    ray_a, ray_b = ray(detections.tangent, a, 1.0), ray(detections.tangent, b, 1.0)
+    length = vectors.chord(ray_a, ray_b)
+    code, frame = np.empty(4), np.empty((3, 3))
+    vectors.pair_frame(ray_a, ray_b, frame)
+    code[0], code[1] = quad_index.in_frame(frame, ray(detections.tangent, quad[2], 1.0), length)
+    code[2], code[3] = quad_index.in_frame(frame, ray(detections.tangent, quad[3], 1.0), length)
+    quad_index.arrange(code, quad)
+    gate = _code_gate(detections, quad, length)
+    low, high = np.empty(4, np.int64), np.empty(4, np.int64)
+    for axis in range(4):
+        low[axis], high[axis] = (
+            quad_index.code_cell(code[axis] - gate, axis),
+            quad_index.code_cell(code[axis] + gate, axis),
+        )
+    for i in range(low[0], high[0] + 1):
+        for j in range(low[1], high[1] + 1):
+            for k in range(low[2], high[2] + 1):
+                # The cells along the last axis are contiguous: one loop covers them.
+                row = ((i * SIDE + j) * SIDE + k) * SIDE
+                for q in range(quads.first[row + low[3]], quads.first[row + high[3] + 1]):
+                    if np.abs(quads.code[q] - code).max() > gate:
+                        continue
+                    candidate = _test_match(detections, sky, quad, quads.star[q], length, checks)
+                    if candidate.dex >= search.DECISIVE_DEX:
+                        return candidate
+    return no_hypothesis()
+
+
+@jit
+def _longest_first(tangent: Floats, quad: Ints) -> None:
+    """Reorder four detections in place, so that the first two are the ones farthest apart."""
+    longest, first, second = -1.0, 0, 1
+    for m in range(4):
+        for k in range(m):
+            length = vectors.chord(ray(tangent, quad[k], 1.0), ray(tangent, quad[m], 1.0))
+            if length > longest:
+                longest, first, second = length, k, m
+    quad[0], quad[first] = quad[first], quad[0]
+    second = first if second == 0 else second
+    quad[1], quad[second] = quad[second], quad[1]
+
+
+@jit
+def _code_gate(detections: Detections, quad: Ints, length: float) -> float:
+    """Greatest difference of the codes of a quad and of its image.
+
+    The errors of C or D and of the two ends are each sigma / L; a wrong focal length changes an angle at the tangent t
+    by up to a fraction t^2 more than a small one, of C and of L.
+    """
+    sigma, edge = 0.0, np.abs(detections.field).max()
+    for n in quad:
+        sigma = max(sigma, detections.sigma[n])
+    return GATE_SIGMA * sigma / length + detections.focal_uncertainty * edge * edge
+
+
+@jit
+def _test_match(
+    detections: Detections, sky: SkyIndex, quad: Ints, star: Ints, length: float, checks: Ints
+) -> Hypothesis:
+    """The hypothesis that four detections are four stars, if a quick check and the evidence confirm it."""
+    tangent, a, b = detections.tangent, quad[0], quad[1]
+    star_a, star_b = vectors.row(sky.vectors, star[0]), vectors.row(sky.vectors, star[1])
+    ratio = search.fit_focal_ratio(tangent, a, b, length, vectors.chord(star_a, star_b))
+    if abs(ratio - 1) > detections.focal_uncertainty:
+        return no_hypothesis()
+    in_cam, in_ref, R_ref_from_cam = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    vectors.pair_frame(ray(tangent, a, ratio), ray(tangent, b, ratio), in_cam)
+    vectors.pair_frame(star_a, star_b, in_ref)
+    vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
+    gates, total = search.pair_gates(detections, a, b), len(detections.sigma)
+    required = required_matches(
+        detections.sigma, field_area(detections), search.attitude_dex(detections, a, b), search.DECISIVE_DEX
+    )
+    lookups, fits = search.quick_check(
+        tangent,
+        sky.vectors,
+        sky.cell_first,
+        sky.cell_star,
+        sky.side,
+        R_ref_from_cam,
+        ratio,
+        gates,
+        search.other_detections(total, a, b, 0),
+        required,
+        total,
+    )
+    checks[0] += 1 + lookups
+    if not fits:
+        return no_hypothesis()
+    checks[0] += search.EVALUATION_COST
+    return evaluate(detections, sky, R_ref_from_cam.T.copy(), ratio, gates, search.DECISIVE_DEX)
