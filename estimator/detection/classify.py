@@ -26,7 +26,9 @@ MAX_SIZE_FRACTION = 0.05  # of the frame's shorter side: no star is that wide; t
 MAX_NOISE_RATIO = 4.0  # local noise over the frame's median noise
 CLEAR_SIGMA = 10.0  # of a pixel: bright enough for its shape to be significant
 VOTING_BLOBS = 15  # number of brightest blobs that decide whether the frame is smeared
-MIN_STREAK_PX, MIN_TRACK_PX = 6.0, 6.0  # shortest lines not explained by noise, a pair of stars or defocus
+# Shortest streak that most of the brightest blobs share, and shortest line of one blob: shorter ones are explained by
+# noise or, of one blob, by a pair of stars or defocus.
+MIN_STREAK_PX, MIN_TRACK_PX = 2.0, 6.0
 
 
 class Flag(IntFlag):
@@ -112,8 +114,7 @@ def _flags(
         spike = neighbor_light + 6 * pixel_noise < MIN_NEIGHBOR_RATIO * peak_light
         # A track differs from the shared line, is narrow, and is at least twice as long as wide (in rms).
         track = diff2 > MIN_TRACK_PX**2 and width2 < 4 * typical_width2 and diff2 > 12 * 4 * width2
-        if smeared:  # no star is a spike there, and noise dominates the shape of a faint streak
-            spike = False
+        if smeared:  # noise dominates the shape of a faint streak
             track = track and peak_light > CLEAR_SIGMA * pixel_noise
         side = max(boxes[n, 2] - boxes[n, 0], boxes[n, 3] - boxes[n, 1]) + 1
         flag[n] |= SATURATED if peak[n] >= saturation else 0

@@ -403,7 +403,8 @@ class StarTracker:
         )
         if chance > ACCEPT_LOG10_CHANCE:
             return Attitude(NO_MATCH)
-        if abs(camera.focal_px / self.camera.focal_px - 1) > 1.2 * self.focal_uncertainty + 1e-9:
+        # The field, not the focal length: a distortion changes what a focal length means.
+        if abs(self.camera.fov_rad / camera.fov_rad - 1) > 1.2 * self.focal_uncertainty + 1e-9:
             return Attitude(NO_MATCH)
         seen_cam = cam_from_ref.apply(vectors)
         rms_px = float(np.sqrt(np.mean((camera.pixels(seen_cam) - xy) ** 2)))

@@ -146,6 +146,39 @@ def test_smeared_stars_are_no_tracks_and_tell_their_streak() -> None:
     assert np.degrees(np.arctan(y / x)) == pytest.approx(np.degrees(np.arctan(-0.6)), abs=3)
 
 
+def smeared_frame(rng: np.random.Generator, streak: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """A frame of 15 streaks, drawn in steps of less than half a pixel, and where their middles are."""
+    steps = 4 * int(np.hypot(*streak)) + 1
+    light, xy = np.zeros(SHAPE), sky_frame(rng, 15, 0.7)[1]
+    for at in xy:
+        corner = np.rint(at).astype(int) - 12
+        for t in (np.arange(steps) + 0.5) / steps - 0.5:
+            patch = star(*(at + t * np.array(streak) - corner), 2e4 / steps, 0.7, (25, 25))
+            light[corner[1] : corner[1] + 25, corner[0] : corner[0] + 25] += patch
+    return exposed(rng, light), xy
+
+
+@pytest.mark.parametrize("streak", [(2.5, 1.0), (4.0, -3.0)])
+def test_a_short_streak_is_seen_without_a_gyro_and_centered_as_with_one(streak: tuple[float, float]) -> None:
+    """A round star in place of a streak of some pixels would double the error, and claim too little."""
+    image, xy = smeared_frame(np.random.default_rng(47), streak)
+    alone, guided = (detect_and_centroid(image, CAMERA, Settings(), Clock(), known) for known in (None, streak))
+    rms_px = [np.sqrt(np.mean(off_px(found, xy) ** 2)) for found in (alone, guided)]
+    assert len(alone) == len(guided) == 15
+    assert rms_px[0] < 1.1 * rms_px[1] < 0.06
+
+
+def test_a_hot_pixel_is_no_star_of_a_smeared_frame() -> None:
+    image, _ = smeared_frame(np.random.default_rng(48), (3.5, 2.0))
+    hot = [(25, 25), (640, 480)]
+    for x, y in hot:
+        image[y, x] += 20_000
+    for known in (None, (3.5, 2.0)):
+        blobs = detect.default(image, priors=FramePriors(known))
+        assert [flags_near(blobs, x, y) for x, y in hot] == [Flag.HOT] * 2
+        assert np.count_nonzero(blobs.flag == 0) == 15
+
+
 @pytest.mark.parametrize(("peak_sigma", "flag"), [(6.0, 0), (30.0, Flag.TRACK)])
 def test_only_a_clear_line_is_a_track_among_streaks(peak_sigma: float, flag: int) -> None:
     """Lines across the streak that the gyros predict; the shape of a line of 6 sigma per pixel is mostly noise."""
