@@ -28,7 +28,7 @@ STUDY: dict[str, Any] = {
     "factors": {"leds": {"key": "light.layout.count", "values": [500, 900]}},
     "responses": ["identified", "roll_arcsec_p95", "misidentified"],
 }
-NEVER = {"misidentified": 0, "roll_noise": 0, "wrong": 0, "ambiguous": 0, "identified": 0}
+NEVER = {"misidentified": 0, "roll_noise": 0, "wrong": 0, "ambiguous": 0, "refused": 0, "identified": 0}
 
 
 def study(**keys: Any) -> Study:
@@ -68,6 +68,21 @@ def test_ambiguous_somewhere_says_where_and_how_sure_it_is_of_the_rest() -> None
         f" frames ({100 * interval.low:.3g} to {100 * interval.high:.3g} %); none in 400 (less than 0.75 % at 95 %"
         " confidence) at the other points."
     )
+
+
+def test_refusals_are_named_where_they_are_most_frequent() -> None:
+    """None is ambiguous, and yet 4 of 200 attitudes are not solved at 500 LEDs."""
+    lines = [line(0, 500, 200, refused=4), line(1, 900, 400)]
+    interval = metrics.proportion(4, 200)
+    texts = answer.headline(study(), lines, True, "skysim study worst leds.yaml")
+    assert said(texts, "Is it ambiguous anywhere?").startswith("Is it ambiguous anywhere? No.")
+    assert said(texts, "Is every attitude solved?") == (
+        "Is every attitude solved? No. Refused (no attitude is returned): at 1 of 2 points, most at leds = 500: 2 % of"
+        f" the frames ({100 * interval.low:.3g} to {100 * interval.high:.3g} %); none in 400 (less than 0.75 % at 95 %"
+        " confidence) at the other points. `skysim study worst leds.yaml --response refused` names the worst."
+    )
+    solved = answer.headline(study(trial={"kind": "frames"}), [line(0, 500, 100)], True)
+    assert said(solved, "Is every frame solved?").startswith("Is every frame solved? Yes. Refused")
 
 
 def test_misidentification_and_roll_noise_are_kept_apart() -> None:
