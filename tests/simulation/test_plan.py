@@ -174,6 +174,30 @@ def test_the_cap_s_margin_is_the_angle_beyond_the_field() -> None:
     at_bearing = half - math.asin(15 / 48 * math.sin(half))
     assert found.tilt_deg == pytest.approx(25, abs=1e-3)
     assert found.needed_deg == pytest.approx(25 + math.degrees(at_bearing), abs=1e-3)
+    corner = math.atan(testbed.scene.camera.corner_px / testbed.scene.camera.focal_px)
+    at_bearing = corner - math.asin(15 / 48 * math.sin(corner))
+    assert found.corner_deg == pytest.approx(25 + math.degrees(at_bearing), abs=1e-3)
+
+
+def test_the_cap_s_margin_at_the_tilt_stop_is_stated_and_a_study_is_warned_of_it() -> None:
+    """The maneuver tilts by 9.6 deg, the stop is at 30: 5 deg of tilt more need 5 deg of LEDs more on a sphere."""
+    testbed = bed(
+        "afit_simsat",
+        light__surface="{kind: sphere, apex: 48 in, radius: 48 in}",
+        light__layout="{kind: fibonacci, count: 900, cap_deg: 30}",
+        vehicle__camera="[0 in, 0 in, 15 in]",
+    )
+    planned = check(testbed)
+    cap = fact(planned, "LED cap")
+    assert cap.values["stop_deg"] == 30
+    beyond_deg = 30 - cap.values["tilt_deg"]
+    assert cap.values["stop_margin_deg"] == pytest.approx(cap.values["margin_deg"] - beyond_deg, abs=1e-3)
+    assert cap.lines[1].startswith("at the tilt stop, 30°, the field's edge reaches 33.")
+    assert not [line for line in planned.findings if "cap_deg" in line]
+    (warned,) = [line for line in check(testbed, 30.0).findings if "cap_deg" in line]
+    assert "at a tilt of 30.0 deg" in warned
+    free = check(bed("afit_simsat", motion__control="none", motion__maneuver="[]"))
+    assert all("tilt stop" not in line for one in free.facts if one.name == "LED cap" for line in one.lines)
 
 
 @pytest.mark.slow

@@ -89,7 +89,7 @@ def lights_in_field(context: Context, samples: Samples) -> Fact:
 
 def reached(context: Context, samples: Samples) -> str:
     """What directions the motion could reach, in words."""
-    tilt_deg = math.degrees(attitudes.greatest_tilt_rad(context.testbed.scene, samples.frames.attitudes))
+    tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
     return f"any azimuth and yaw to {tilt_deg:.1f}° of tilt"
 
 
@@ -142,30 +142,52 @@ def smear(context: Context, samples: Samples) -> Fact:
 
 
 class CapMargin(NamedTuple):
-    """The cap of a dome's LEDs, the greatest tilt, and what the field needs there; degrees from the zenith."""
+    """The cap of a dome's LEDs, a tilt, and what the field needs there; degrees from the zenith.
+
+    needed_deg : for the middle of the field's longer side;  corner_deg : for its corner
+    """
 
     cap_deg: float
     tilt_deg: float
     needed_deg: float
+    corner_deg: float
+
+    @property
+    def text(self) -> str:
+        """What the field needs, and the margins, in words."""
+        edge, corner = (self.cap_deg - needed for needed in (self.needed_deg, self.corner_deg))
+        return (
+            f"the field's edge reaches {self.needed_deg:.1f}°, its corner {self.corner_deg:.1f}°: margin {edge:+.1f}°"
+            f" and {corner:+.1f}°"
+        )
 
 
-def cap_margin(context: Context, samples: Samples) -> CapMargin | None:
-    """How far the LEDs reach beyond the field at the greatest tilt; None without a layout that fills a cap.
+def cap_margin(context: Context, samples: Samples, tilt_deg: float | None = None) -> CapMargin | None:
+    """How far the LEDs reach beyond the field at a tilt; None without a layout that fills a cap.
 
-    The field is taken as the circle of half its longer side, since any side may point outward. Rays of that circle are
-    traced to the surface from the pupil, at the greatest tilt to all sides; their angle from the zenith, as seen from
-    the bearing, is what `light.layout.cap_deg` is compared with.
+    tilt_deg : the greatest of the attitudes in reach if None
+    Any side or corner of the field may point outward. Rays at these angles from the boresight are traced to the surface
+    from the pupil, at the tilt to all sides; their angle from the zenith, as seen from the bearing, is what
+    `light.layout.cap_deg` is compared with.
     """
-    light, surface, camera = context.testbed.scene.light, context.surface, context.camera.optics.camera
-    if not isinstance(light, DomeConfig) or surface is None:
+    light, camera = context.testbed.scene.light, context.camera.optics.camera
+    if not isinstance(light, DomeConfig) or context.surface is None:
         return None
     points = getattr(light.layout, "points", light.layout)
     if points.kind == "listed" or getattr(points, "boards", ()):
         return None
-    mount = context.testbed.mount
-    tilt_rad = attitudes.greatest_tilt_rad(context.testbed.scene, samples.frames.attitudes)
-    azimuth = 2 * np.pi * np.arange(SIDES) / SIDES
-    radius = max(camera.width_px, camera.height_px) / 2 / camera.focal_px
+    if tilt_deg is None:
+        tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
+    size_px = (camera.width_px, camera.height_px)
+    edge, corner = (field_reach_deg(context, radius_px, tilt_deg) for radius_px in (max(size_px) / 2, camera.corner_px))
+    return CapMargin(float(points.cap_deg), tilt_deg, edge, corner)
+
+
+def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> float:
+    """Greatest angle from the zenith, at the bearing, at which a circle of the field meets the dome at a tilt."""
+    mount, surface, azimuth = context.testbed.mount, context.surface, 2 * np.pi * np.arange(SIDES) / SIDES
+    assert surface is not None
+    radius, tilt_rad = radius_px / context.camera.optics.camera.focal_px, math.radians(tilt_deg)
     rays_cam = np.column_stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.ones(SIDES)])
     needed_deg = 0.0
     for lab_from_body in Rotation.from_euler("ZYZ", np.column_stack([azimuth, np.full(SIDES, tilt_rad), -azimuth])):
@@ -174,20 +196,22 @@ def cap_margin(context: Context, samples: Samples) -> CapMargin | None:
         # A ray that misses the surface passes below its rim: its own direction is the least that it needs.
         met = np.where(np.isnan(met), rays, met)
         needed_deg = max(needed_deg, float(np.degrees(np.arctan2(np.hypot(*met.T[:2]), met[:, 2])).max()))
-    return CapMargin(float(points.cap_deg), math.degrees(tilt_rad), needed_deg)
+    return needed_deg
 
 
 def cap(context: Context, samples: Samples) -> Fact | None:
-    """Margin of the LED cap over the tilt plus half the field."""
-    found = cap_margin(context, samples)
+    """Margin of the LED cap over the tilt plus half the field, at the greatest tilt in reach and at the tilt stop."""
+    found, vehicle = cap_margin(context, samples), context.testbed.scene.vehicle
     if found is None:
         return None
-    margin_deg = found.cap_deg - found.needed_deg
-    text = (
-        f"LEDs to {found.cap_deg:.3g}° from the zenith; the field's edge reaches {found.needed_deg:.1f}° at a tilt of"
-        f" {found.tilt_deg:.1f}°: margin {margin_deg:+.1f}°"
-    )
-    return Fact("LED cap", [text], {**found._asdict(), "margin_deg": margin_deg})
+    lines = [f"LEDs to {found.cap_deg:.3g}° from the zenith; at a tilt of {found.tilt_deg:.1f}° {found.text}"]
+    values = {**found._asdict(), "margin_deg": found.cap_deg - found.needed_deg}
+    if vehicle.mount == "air_bearing" and vehicle.tilt_stop_deg > found.tilt_deg + 0.05:
+        stop = cap_margin(context, samples, vehicle.tilt_stop_deg)
+        assert stop is not None
+        lines.append(f"at the tilt stop, {stop.tilt_deg:g}°, {stop.text}")
+        values |= {"stop_deg": stop.tilt_deg, "stop_margin_deg": stop.cap_deg - stop.needed_deg}
+    return Fact("LED cap", lines, values)
 
 
 def depth_of_focus(context: Context, samples: Samples) -> Fact:

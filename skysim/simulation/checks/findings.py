@@ -230,7 +230,8 @@ def cap_too_small(context: Context, samples: Samples) -> str:
     uncovered = "the tilt itself is not covered" if found.tilt_deg > found.cap_deg else "its edge has no LED"
     return (
         f"{key}: LEDs end at {found.cap_deg:.3g} deg from the zenith, but at a tilt of {found.tilt_deg:.1f} deg the"
-        f" field reaches {found.needed_deg:.1f} deg: {uncovered}; change it to {math.ceil(found.needed_deg)}"
+        f" field reaches {found.needed_deg:.1f} deg: {uncovered}; change it to {math.ceil(found.needed_deg)}, or"
+        f" {math.ceil(found.corner_deg)} for its corners"
     )
 
 

@@ -149,6 +149,21 @@ def test_the_scene_is_in_a_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_dome_is_checked_up_to_the_tilt_of_the_trials(tmp_path: Path) -> None:
+    """LEDs end at 27 deg: within the reach of the scene's maneuver, 20 deg, and not of trials at 20 deg and more."""
+    layout = {"light.layout": {"kind": "random", "count": 900, "cap_deg": 27}}
+    factors = {"leds": {"key": "light.layout.count", "values": [900]}}
+
+    def warned(tilt_deg: int) -> list[str]:
+        trial = {"kind": "centroids", "tilt_deg": [0, tilt_deg]}
+        told = overview.overview(loaded(tmp_path, set=layout, trial=trial, factors=factors))
+        return [one for one in told.findings if "LEDs end at 27 deg" in one]
+
+    assert not warned(10)
+    assert "at a tilt of 25.0 deg" in warned(25)[0]
+
+
+@pytest.mark.slow
 def test_the_checks_are_made_at_every_level_and_say_where_they_found_something(tmp_path: Path) -> None:
     """The image of a disk of 10 mm at 0.8 m is 110 px wide, which the detector takes for background."""
     levels = {"small": {}, "large": {"light.led.disk_diameter": "10 mm"}}

@@ -7,13 +7,15 @@ import re
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import numpy as np
+
 from skysim.core.errors import InputError
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.experiments.study.analysis.table import format_level
 from skysim.experiments.study.designs import Point, make_point
 from skysim.experiments.study.factors import Distribution, Factor, Range
 from skysim.experiments.study.loader import may_report_ambiguity
-from skysim.experiments.study.plan import Plan, resolve_point
+from skysim.experiments.study.plan import FlightTrial, Plan, Trial, resolve_point
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import DomeConfig, StarsConfig
@@ -46,9 +48,9 @@ def overview(plan: Plan) -> Overview:
         if checked == MAX_CHECKED:
             break
         try:
-            scene, _ = resolve_point(plan.spec, plan.spec.trial_settings(point.settings, 0))
+            scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(point.settings, 0))
             testbed = build_testbed(scene, plan.spec.programs)
-            lines = checks.check(testbed).findings
+            lines = checks.check(testbed, greatest_tilt_deg(scene, trial)).findings
         except InputError:
             continue
         checked += 1
@@ -57,6 +59,12 @@ def overview(plan: Plan) -> Overview:
         for line in lines:
             found.setdefault(NUMBER.sub("#", line), []).append((line, levels))
     return Overview(rows, [finding_text(at, checked) for at in found.values()], may_be_ambiguous)
+
+
+def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:
+    """The greatest tilt of a trial's random attitudes under a dome; None if there are none."""
+    drawn = trial.start if isinstance(trial, FlightTrial) else trial
+    return None if drawn is None or not isinstance(scene.light, DomeConfig) else float(np.max(drawn.tilt_deg))
 
 
 def finding_text(at: list[tuple[str, str]], checked: int) -> str:
