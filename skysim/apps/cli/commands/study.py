@@ -205,7 +205,10 @@ def replay(
 def worst(
     study: StudyArg,
     response: Annotated[
-        str, typer.Option(help="Response by which trials are ranked; default: the first of the study.")
+        str,
+        typer.Option(
+            help="Response or quantity (roll_arcsec) that ranks the trials; default: the study's first response."
+        ),
     ] = "",
     where: Annotated[
         list[str] | None,
@@ -222,7 +225,8 @@ def worst(
     study, out = located(study, out)
     plan, _ = load_stored_plan(study, out)
     name = response or plan.study.responses[0]
-    metrics.response(name, "--response")
+    if name not in metrics.QUANTITIES:
+        metrics.response(name, "--response")
     with open_store(study, out) as stored:
         points = stored.points()
         try:
@@ -234,7 +238,8 @@ def worst(
     if json:
         print_json([row | {"command": f"{repeat} {row['trial']}"} for row in rows])
     else:
-        print_worst(name, found, [points[one.point].levels for one in found], repeat)
+        instead = f"{command(study, out, 'worst')} --response roll_arcsec"
+        print_worst(name, found, [points[one.point].levels for one in found], repeat, instead)
 
 
 def chosen_levels(words: list[str]) -> dict[str, Any]:
