@@ -23,6 +23,7 @@ GAUSSIAN_WIDTH = 4.0  # width of an image over its rms radius: D4sigma (ISO 1114
 SIDES = 12  # to which the greatest tilt is tried, and rays around the field
 MIN_SHARE = 0.005  # of the variance of a cause that is printed
 ARCSEC = "″"
+TRACKER_KNOWS = "tracker knows"
 
 
 def short(value: float, digits: int = 3) -> str:
@@ -248,7 +249,7 @@ def tracker_beliefs(context: Context, samples: Samples) -> Fact:
         "distortion": list(believed.camera.distortion),
         "catalog_epoch_jyear": believed.epoch_jyear,
     }
-    return Fact("tracker knows", beliefs.describe(believed, context.testbed.scene), values)
+    return Fact(TRACKER_KNOWS, beliefs.describe(believed, context.testbed.scene), values)
 
 
 def expected_error(context: Context, samples: Samples) -> Fact:

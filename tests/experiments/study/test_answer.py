@@ -13,10 +13,12 @@ from study_stores import done
 from skysim.experiments.study import loader, store
 from skysim.experiments.study.analysis import answer
 from skysim.experiments.study.analysis.table import PointRow, format_summary, table
-from skysim.experiments.study.plan import Study
+from skysim.experiments.study.plan import Study, resolve_point
 from skysim.experiments.study.report import overview, page
 from skysim.results import metrics
 from skysim.results.metrics import Summary
+from skysim.simulation import checks
+from skysim.simulation.testbed import build_testbed
 
 STUDY: dict[str, Any] = {
     "schema": 1,
@@ -146,6 +148,19 @@ def test_the_scene_is_in_a_table(tmp_path: Path) -> None:
     assert rows["varied: leds"] == "500, 900 (light.layout.count)"
     assert rows["trials"] == "2 at each of 2 points, the same attitudes at every point; seed 1"
     assert rows["drawn in every trial"] == "light.layout.hardware_seed"
+
+
+@pytest.mark.slow
+def test_the_tracker_s_knowledge_is_told_as_by_the_check(tmp_path: Path) -> None:
+    station = {"kind": "total_station", "position": ["1 m", "0 m", "-0.5 m"], "angle_sigma_arcsec": 2}
+    survey = {"tracker.survey": {"instrument": station | {"distance_sigma": "1 mm"}, "led_sigma": "0.1 mm"}}
+    plan = loaded(tmp_path, set=STUDY["set"] | survey)
+    scene, _ = resolve_point(plan.spec, plan.points[0].settings)
+    (fact,) = [one for one in checks.check(build_testbed(scene)).facts if one.name == "tracker knows"]
+    told = dict(overview.overview(plan).rows)["tracker knows"]
+    assert told == "; ".join(fact.lines)
+    assert "measured by a total station" in told
+    assert "LEDs to 0.1 mm" not in told
 
 
 @pytest.mark.slow
