@@ -18,6 +18,7 @@ from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, full_scale_e
 from skysim.simulation.checks.expected_error import Expected, mean_root
 from skysim.simulation.checks.views import View
+from skysim.sources.dome.shell.room import fit
 
 GAUSSIAN_WIDTH = 4.0  # width of an image over its rms radius: D4sigma (ISO 11146), the diameter of a uniform disk
 SIDES = 12  # to which the greatest tilt is tried, and rays around the field
@@ -215,6 +216,25 @@ def cap(context: Context, samples: Samples) -> Fact | None:
     return Fact("LED cap", lines, values)
 
 
+def room(context: Context, samples: Samples) -> Fact | None:
+    """How the dome fits into the room where it is to be built, which a scene that does not fit refuses."""
+    light, surface = context.testbed.scene.light, context.surface
+    if not isinstance(light, DomeConfig) or light.room is None or surface is None:
+        return None
+    limits, values = light.room, fit(light.room, surface, light.layout.cap_deg)
+    x_m, y_m, _ = values["extent_m"]
+    floor = [f"{size:.2f} m" if size is not None else "any" for size in (limits.width_m, limits.length_m)]
+    text = f"{x_m:.2f} x {y_m:.2f} m wide (room: {floor[0]} x {floor[1]})"
+    if limits.bearing_height_m is not None:
+        ceiling = f" of {limits.height_m:.2f} m" if limits.height_m is not None else ""
+        text = f"top {values['top_m']:.2f} m{ceiling}, rim {values['rim_m']:.2f} m above the floor; {text}"
+    if limits.door_m is not None:
+        part = "the shell" if limits.segments == 1 else f"shell in {limits.segments} segments of"
+        sides, door = (" x ".join(f"{side:.2f}" for side in box) for box in (values["part_m"], limits.door_m))
+        text += f"; {part} {sides} m: fits the door of {door} m"
+    return Fact("room", [text], values)
+
+
 def depth_of_focus(context: Context, samples: Samples) -> Fact:
     """Distances at which the defocus disk is one pixel wide: 1 / u = 1 / focus ± pixel / (pupil image_distance)."""
     camera = context.camera.optics.camera
@@ -302,6 +322,7 @@ FACTS: tuple[Callable[[Context, Samples], Fact | None], ...] = (
     peak,
     smear,
     cap,
+    room,
     depth_of_focus,
     tracker_beliefs,
     expected_error,
