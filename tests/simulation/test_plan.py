@@ -227,6 +227,15 @@ def test_causes_are_in_order_and_each_is_found_where_it_is_put() -> None:
     assert next(iter(values["cross_causes_arcsec"])) in ("lever survey", "survey rotation")
 
 
+def test_what_cross_and_sigma_are_of_is_said() -> None:
+    """Cross is of two axes; a survey's error is constant in one dome, unlike the noise of centroids."""
+    over_surveys = "of the survey: 1σ over surveys; one dome has one survey, whose error stays the same"
+    surveyed, exact = check(bed("afit_simsat")), check(bed("afit_simsat_ideal"))
+    assert over_surveys in fact(surveyed, "expected error").lines
+    assert over_surveys not in fact(exact, "expected error").lines
+    assert [one for one in fact(exact, "expected error").lines if one.startswith("cross: sqrt(x² + y²)")]
+
+
 def test_a_solver_s_own_error_is_a_cause() -> None:
     """`infinity` ignores the lever: half a degree on this dome at every tilt (nearfield.py)."""
     values = fact(check(bed("afit_simsat_ideal", tracker__solver="infinity")), "expected error").values["frames"]

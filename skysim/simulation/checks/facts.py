@@ -292,7 +292,15 @@ def expected_error(context: Context, samples: Samples) -> Fact:
         values[key] |= {f"{angle}_causes_arcsec": causes(sampled, angle) for angle in ("cross", "roll")}
     chosen = samples.frames if np.isfinite(values["frames"]["roll_arcsec"]) else samples.reach
     lines += [f"{angle}: {cause_text(chosen, angle)}" for angle in ("cross", "roll") if causes(chosen, angle)]
+    lines.append("cross: sqrt(x² + y²), x and y the errors about both axes across the boresight")
+    named = {name for angle in ("cross", "roll") for name in causes(chosen, angle)}
+    if named & {*SURVEYED, *(["focal length"] if context.beliefs.focal_sigma else [])}:
+        lines.append("of the survey: 1σ over surveys; one dome has one survey, whose error stays the same")
     return Fact("expected error", lines, values)
+
+
+# Causes of the expected error that are drawn with the survey.
+SURVEYED = ("LED survey", "survey set-up", "lever survey", "surface survey")
 
 
 def causes(sampled: Sampled, angle: str) -> dict[str, float]:

@@ -164,6 +164,22 @@ def test_the_tracker_s_knowledge_is_told_as_by_the_check(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
+def test_intervals_of_one_dome_say_which_hardware_is_fixed(tmp_path: Path) -> None:
+    survey, layout = "tracker.survey.seed", "light.layout.hardware_seed"
+    (said_,) = answer.one_unit(overview.overview(loaded(tmp_path)).fixed)
+    assert said_ == (
+        "Intervals cover other attitudes, with one survey and one draw of the LEDs:"
+        f" `hardware: [{survey}, {layout}]` in the study draws the hardware anew in every replicate, and they cover it"
+        " too."
+    )
+    (said_,) = answer.one_unit(overview.overview(loaded(tmp_path, hardware=[survey])).fixed)
+    assert f"with one draw of the LEDs: `hardware: [{layout}]`" in said_
+    assert answer.one_unit(overview.overview(loaded(tmp_path, hardware=[survey, layout])).fixed) == []
+    units = {"unit": {"levels": {"a": {survey: 1}, "b": {survey: 2}}}}
+    assert overview.overview(loaded(tmp_path, factors=units)).fixed == (layout,)
+
+
+@pytest.mark.slow
 def test_a_dome_is_checked_up_to_the_tilt_of_the_trials(tmp_path: Path) -> None:
     """LEDs end at 27 deg: within the reach of the scene's maneuver, 20 deg, and not of trials at 20 deg and more."""
     layout = {"light.layout": {"kind": "random", "count": 900, "cap_deg": 27}}

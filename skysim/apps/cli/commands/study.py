@@ -317,6 +317,7 @@ def write_report(plan: Plan, study: str, out: Path | None, overrides: dict[str, 
         repeat = command(study, out, "optimize" if plan.study.optimize else "run", overrides)
         lines = table.table(stored, list(dict.fromkeys([*page.responses(plan.study), *answer.RESPONSES])))
         headline = answer.headline(plan.study, lines, about.may_be_ambiguous, command(study, out, "worst"))
+        headline += answer.one_unit(about.fixed) if headline else []
         answers = headline + answer.ranges(plan.study, lines)
         texts: dict[str, Any] = {"about": about, "answers": answers, "replay": command(study, out, "replay")}
         shown = table.select_responses(lines, page.responses(plan.study))

@@ -121,6 +121,17 @@ def solved_everywhere(study: Study, lines: Sequence[PointRow], place: Place, wor
     return f"Is every {what} solved? No. {text} `{worst} --response refused` names the worst."
 
 
+def one_unit(fixed: Sequence[str]) -> list[str]:
+    """That the intervals are of one unit of hardware, and how to cover others; nothing without a seed drawn once."""
+    if not fixed:
+        return []
+    units = " and ".join("one survey" if seed.startswith("tracker.") else "one draw of the LEDs" for seed in fixed)
+    return [
+        f"Intervals cover other attitudes, with {units}: `hardware: [{', '.join(fixed)}]` in the study draws"
+        " the hardware anew in every replicate, and they cover it too."
+    ]
+
+
 def none_of(shares: Sequence[Summary]) -> str:
     """That an event was never seen, and the exact upper bound of its frequency (Clopper & Pearson 1934)."""
     fewest = min(share.trials for share in shares)

@@ -14,7 +14,7 @@ from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.experiments.study.analysis.table import format_level
 from skysim.experiments.study.designs import Point, make_point
 from skysim.experiments.study.factors import Distribution, Factor, Range
-from skysim.experiments.study.loader import may_report_ambiguity
+from skysim.experiments.study.loader import fixed_seeds, may_report_ambiguity
 from skysim.experiments.study.plan import FlightTrial, Plan, Trial, resolve_point
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
@@ -33,18 +33,20 @@ class Overview(NamedTuple):
     rows     : names and texts of the scene table, for the first level of every factor
     findings : of the checks, each with the levels at which it was found
     may_be_ambiguous : whether the tracker can refuse a frame as ambiguous
+    fixed    : seeds of hardware that all trials share, see `loader.fixed_seeds`
     """
 
     rows: list[tuple[str, str]]
     findings: list[str]
     may_be_ambiguous: bool
+    fixed: tuple[str, ...] = ()
 
 
 def overview(plan: Plan) -> Overview:
     """The overview of a study; scenes that cannot be built are left out, as their trials tell why."""
     rows: list[tuple[str, str]] = []
     found: dict[str, list[tuple[str, str]]] = {}
-    checked, may_be_ambiguous = 0, False
+    checked, may_be_ambiguous, fixed = 0, False, dict[str, None]()
     for levels, point in checked_points(plan):
         if checked == MAX_CHECKED:
             break
@@ -56,10 +58,12 @@ def overview(plan: Plan) -> Overview:
             continue
         checked += 1
         may_be_ambiguous |= may_report_ambiguity(scene)
+        fixed |= dict.fromkeys(fixed_seeds(plan.study, scene))
         rows = rows or scene_rows(plan, testbed, found_here.facts)
         for line in found_here.findings:
             found.setdefault(NUMBER.sub("#", line), []).append((line, levels))
-    return Overview(rows, [finding_text(at, checked) for at in found.values()], may_be_ambiguous)
+    findings = [finding_text(at, checked) for at in found.values()]
+    return Overview(rows, findings, may_be_ambiguous, tuple(fixed))
 
 
 def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:
