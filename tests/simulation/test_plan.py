@@ -318,9 +318,34 @@ def test_a_mistake_is_warned_of_with_its_key(scene: str, changes: dict[str, str]
 )
 def test_following_the_advice_silences_the_warning(changes: dict[str, str], key: str) -> None:
     (line,) = [one for one in check(build_testbed(loader.load("afit_simsat", changes))).findings if one.startswith(key)]
-    value = line.rpartition("change it to ")[2]
+    value = line.rpartition("change it to ")[2].partition(", or ")[0]
     again = check(build_testbed(loader.load("afit_simsat", changes | {key: value}))).findings
     assert not [one for one in again if one.startswith(key)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("intensity", "keys"),
+    [
+        ("60 mcd", ["exposure.time", "camera.f_number"]),
+        ("3 cd", ["exposure.time", "camera.transmission"]),
+        ("60 cd", ["camera.transmission"]),
+    ],
+)
+def test_saturation_can_be_cured_by_light_exposure_or_lens(intensity: str, keys: list[str]) -> None:
+    """Each cure alone ends the warning; LEDs 90 times too bright are not cured by f/76, nor 1,800 times by 3 us."""
+    direct = {"light.led.drive": "{kind: direct}", "light.led.intensity": intensity}
+
+    def warned(**changes: str) -> list[str]:
+        found = check(build_testbed(loader.load("afit_simsat", direct | changes))).findings
+        return [one for one in found if "are saturated" in one]
+
+    (line,) = warned()
+    first, *cures = line.rpartition("change it to ")[2].split(", or ")
+    settings = dict(cure.removesuffix(", a gray filter").split(" to ") for cure in cures)
+    assert list(settings) == keys
+    for key, value in {"light.led.intensity": first, **settings}.items():
+        assert not warned(**{key: value})
 
 
 def test_a_bright_background_is_the_only_warning_that_it_causes() -> None:
