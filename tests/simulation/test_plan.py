@@ -29,6 +29,11 @@ TILTED = '[{kind: slew, pitch_deg: 25, rate_deg_s: 5}, {kind: hold, duration: "3
 AT_REST = {"motion.control": "none", "motion.maneuver": "[]", "exposure.frames": "1"}
 
 
+STATION = (
+    "{kind: total_station, position: [1 m, 0 m, -0.5 m], angle_sigma_arcsec: 2, distance_sigma: 0.2 mm, distance_ppm: 2"
+)
+
+
 def bed(name: str, **changes: str) -> Testbed:
     return build_testbed(loader.load(name, {key.replace("__", "."): value for key, value in changes.items()}))
 
@@ -289,6 +294,18 @@ def test_a_solver_s_own_error_is_a_cause() -> None:
             "shefex2",
             {"tracker__assumed_distortion": "[1, 0, 0, 0, 0]"},
             "tracker.assumed_distortion",
+            "matching radius",
+        ),
+        (
+            "afit_simsat",
+            {"tracker__survey__instrument": STATION + ", zero_sigma: 20 mm}", "camera__focal_length": "20 mm"},
+            "tracker.survey.instrument",
+            "matching radius",
+        ),
+        (
+            "afit_simsat",
+            {"light__surface__error": "50 mm", "camera__focal_length": "20 mm"},
+            "light.surface.error",
             "matching radius",
         ),
         ("afit_simsat", {"camera__preset": "lu205c"}, "camera.shutter", "rows are read one after another"),

@@ -230,6 +230,8 @@ MISMATCH_KEYS = {
     "distortion": "tracker.assumed_distortion",
     "assumed lever": "tracker.assumed_camera_body",
     "rolling shutter": "camera.shutter",
+    "survey set-up": "tracker.survey.instrument",
+    "surface survey": "light.surface.error",
 }
 # What to change, from the scene and how many times too large the displacement is.
 CHANGES: dict[str, Callable[[Scene, float], str]] = {
@@ -240,6 +242,10 @@ CHANGES: dict[str, Callable[[Scene, float], str]] = {
         f"change it to {{kind: global}}, or turn {short(excess, 2)} times slower: rows are read one after another, and"
         " the tracker takes them as simultaneous"
     ),
+    "survey set-up": lambda scene, excess: (
+        f"change it to one of smaller errors of the set-up, by a factor of {short(excess, 2)}"
+    ),
+    "surface survey": lambda scene, excess: f"change it to {short(1e3 * scene.light.surface.error_m / excess, 2)} mm",
 }
 
 
