@@ -225,6 +225,11 @@ def not_where_expected(context: Context, samples: Samples) -> str:
     return f"{MISMATCH_KEYS[cause]}: {text}; {CHANGES[cause](scene, excess)}"
 
 
+def surface_error_m(scene: Scene) -> float:
+    """The survey error of the dome's surface; 0 without a dome."""
+    return float(scene.light.surface.error_m) if isinstance(scene.light, DomeConfig) else 0.0
+
+
 MISMATCH_KEYS = {
     "focal length": "tracker.assumed_focal_length",
     "distortion": "tracker.assumed_distortion",
@@ -245,7 +250,7 @@ CHANGES: dict[str, Callable[[Scene, float], str]] = {
     "survey set-up": lambda scene, excess: (
         f"change it to one of smaller errors of the set-up, by a factor of {short(excess, 2)}"
     ),
-    "surface survey": lambda scene, excess: f"change it to {short(1e3 * scene.light.surface.error_m / excess, 2)} mm",
+    "surface survey": lambda scene, excess: f"change it to {short(1e3 * surface_error_m(scene) / excess, 2)} mm",
 }
 
 
