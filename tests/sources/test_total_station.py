@@ -97,6 +97,18 @@ def test_the_common_errors_have_the_covariance_that_is_claimed() -> None:
     assert (np.abs(error_m.T @ error_m / DRAWS - claimed) / spread).max() < 5
 
 
+def test_no_leds_and_no_errors_of_the_set_up_are_empty() -> None:
+    """A camera that looks beside the dome sees none: (errors, LEDs, 3)."""
+    perfect = {
+        "kind": "total_station",
+        "position": STATION["position"],
+        "angle_sigma_arcsec": 1,
+        "distance_sigma": "1 mm",
+    }
+    for config, errors in ((TotalStationConfig.model_validate(perfect), 0), (station(), 8)):
+        assert total_station.common_displacements_m(config, np.zeros((0, 3))).shape == (errors, 0, 3)
+
+
 def test_range_and_angle_errors_are_along_and_across_the_sight() -> None:
     """A data sheet's 1 mm along the sight; 1" at 100 m is half a millimeter across (Leica MS60 manual)."""
     place_m = np.array([[100.0, 0.0, 0.0]])

@@ -243,11 +243,13 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
     A known error displaces every image by its vector; an error that is drawn once for all lights by 1 sigma of each of
     its parts, which add in quadrature.
     """
+    if len(view) < MIN_EVIDENCE_MATCHES:
+        return None
     causes = {name: CAUSES[name](view, lab_from_cam, context) for name in (*UNKNOWN_TO_TRACKER, *OUTSIDE_OF_GATE)}
     shifts = {name: errors.displacement_px for name, errors in causes.items() if isinstance(errors, Common)}
     if context.beliefs.focal_sigma:
         shifts.pop("focal length", None)  # the tracker allows for it
-    if not shifts or len(view) < MIN_EVIDENCE_MATCHES:
+    if not shifts:
         return None
     sigma_px = believed_sigma_px(view, Independent(centroid_variance(view, context)), context)
     try:

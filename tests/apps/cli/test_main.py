@@ -602,7 +602,8 @@ def test_check_prints_facts_and_warnings_in_eighty_columns(skysim: Skysim) -> No
         assert f"\n{name} " in f"\n{ran.out}"
     words = " ".join(ran.out.split())
     assert "warning: light.led.intensity: " in words
-    assert words.endswith("mcd (--set)")
+    assert "; change it to 17 mcd, or exposure.time to " in words
+    assert words.endswith(" (--set)")
     assert "no warnings" in skysim("check", "shefex2").out
 
 
