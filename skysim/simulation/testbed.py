@@ -17,6 +17,7 @@ from skysim.camera.detector.detector import Detector
 from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT
 from skysim.camera.render import Window
+from skysim.core.errors import InputError
 from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import CAMERA_TIMING, random_stream
 from skysim.core.types import Mount, Sources, Telemetry, Trajectory
@@ -34,6 +35,7 @@ from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
 from skysim.sources.dome import display
 from skysim.sources.dome.clocks import Clocks, build_clocks
+from skysim.sources.dome.layouts.led_list import led_list
 from skysim.sources.dome.led import Emitter
 from skysim.sources.dome.shell import surface
 from skysim.sources.photometry import Band
@@ -204,6 +206,14 @@ def build_obstacles(scene: Scene, vehicle: multibody.VehicleModel) -> multibody.
 def export_mjcf(testbed: Testbed) -> str:
     """The test bed as MJCF text, for MuJoCo's viewer and for pictures."""
     return mjcf_export.mjcf(testbed.vehicle, testbed.scene, testbed.sources, testbed.trajectory.lab_from_body[0])
+
+
+def export_leds(testbed: Testbed) -> tuple[str, int]:
+    """The LEDs of the test bed's dome as `led_list` returns them. Raises InputError without a dome."""
+    scene = testbed.scene
+    if not isinstance(scene.light, DomeConfig):
+        raise InputError(f"light.kind: {scene.light.kind} has no list of LEDs; allowed: dome")
+    return led_list(scene.light, testbed.band, scene.name)
 
 
 def lab_from_body_start(scene: Scene, mount: Mount, profiles: Sequence[AttitudeSpline] = ()) -> Rotation:

@@ -24,7 +24,12 @@ from skysim.tracking import dome_map_file
 
 
 def assumed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
-    """The dome map that the tracker uses: the true LED positions and surface with the errors of the survey."""
+    """The dome map that the tracker uses: the true LED positions and surface with the errors of the survey.
+
+    The one sigma of LEDs that an instrument measured is the greatest across the line from the bearing. It sets the
+    matching radius of the identification, which must not exceed that of the final match (`DomeTracker._refine`): an LED
+    that only the first one admits makes the tracker refuse the frame.
+    """
     inside, survey = surface.build_surface(light.surface), scene.tracker.survey
     position_m = survey_errors.assumed_leds_m(inside, sources.place[:, :3], survey)
     board = registry.board_of(light.layout, sources.id)
@@ -33,7 +38,7 @@ def assumed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
     common_m = survey_errors.common_displacements_m(inside, sources.place[:, :3], survey)
     sigma_m = float(survey.led_sigma_m)
     if covariance_m2 is not None:
-        sigma_m = float(np.sqrt(np.mean(np.trace(covariance_m2, axis1=1, axis2=2)) / 3))
+        sigma_m = float(survey_errors.across_sigma_m(position_m, covariance_m2).max())
     return LedMap(sources.id, position_m, *ellipsoid, board, sigma_m, covariance_m2, common_m)
 
 

@@ -15,6 +15,7 @@ from skysim.camera.psf.kernel import Kernel
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.simulation.checks import dome as checks
+from skysim.simulation.checks import plan
 from skysim.simulation.testbed import Testbed, build_testbed
 
 RIM_RAD = np.linspace(0, 2 * np.pi, 3600, endpoint=False)
@@ -117,11 +118,14 @@ def test_peaks_are_wrong_by_what_a_convolution_of_the_ellipse_says(diameter_mm: 
     assert views.peak_error[worst] == pytest.approx(error, abs=0.04)
 
 
-def test_the_warning_says_how_wrong_the_worst_disk_is() -> None:
+def test_a_note_says_how_wrong_the_worst_disk_is() -> None:
+    """In the facts: the attitude does not depend on it, so it is no warning."""
     testbed = panel()
-    line = checks.round_disk_warning(testbed.scene, testbed.sources, testbed.mount)
-    assert line in checks.warnings(testbed.scene, testbed.sources, testbed.mount)
-    worst = re.search(r"([\d.]+) % at (\d+) deg of incidence and (\d+) deg off axis", line)
+    line = checks.round_disk_note(testbed.scene, testbed.sources, testbed.mount)
+    result = plan.check(testbed)
+    assert [one.lines for one in result.facts if one.name == "image shape"] == [[line]]
+    assert not [one for one in result.findings if "circles" in one]
+    worst = re.search(r"([\d.]+) % at (\d+)° of incidence and (\d+)° off axis", line)
     assert worst is not None
     error, incidence_deg, field_deg = (float(text) for text in worst.groups())
     assert 30 < incidence_deg < 37
@@ -131,10 +135,10 @@ def test_the_warning_says_how_wrong_the_worst_disk_is() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["afit_simsat", "apl_dome", "nps_tas2", "celestial_dome", "tas2_vscmg"])
-def test_no_shipped_dome_is_warned_of(name: str) -> None:
+def test_no_shipped_dome_needs_the_note(name: str) -> None:
     """Their LEDs face the camera and are near the axis, or are not resolved."""
     testbed = build_testbed(loader.load(name))
-    assert checks.round_disk_warning(testbed.scene, testbed.sources, testbed.mount) == ""
+    assert checks.round_disk_note(testbed.scene, testbed.sources, testbed.mount) == ""
     assert np.abs(views_of(testbed).peak_error).max() < 0.02
 
 

@@ -29,6 +29,11 @@ TILTED = '[{kind: slew, pitch_deg: 25, rate_deg_s: 5}, {kind: hold, duration: "3
 AT_REST = {"motion.control": "none", "motion.maneuver": "[]", "exposure.frames": "1"}
 
 
+STATION = (
+    "{kind: total_station, position: [1 m, 0 m, -0.5 m], angle_sigma_arcsec: 2, distance_sigma: 0.2 mm, distance_ppm: 2"
+)
+
+
 def bed(name: str, **changes: str) -> Testbed:
     return build_testbed(loader.load(name, {key.replace("__", "."): value for key, value in changes.items()}))
 
@@ -174,6 +179,30 @@ def test_the_cap_s_margin_is_the_angle_beyond_the_field() -> None:
     at_bearing = half - math.asin(15 / 48 * math.sin(half))
     assert found.tilt_deg == pytest.approx(25, abs=1e-3)
     assert found.needed_deg == pytest.approx(25 + math.degrees(at_bearing), abs=1e-3)
+    corner = math.atan(testbed.scene.camera.corner_px / testbed.scene.camera.focal_px)
+    at_bearing = corner - math.asin(15 / 48 * math.sin(corner))
+    assert found.corner_deg == pytest.approx(25 + math.degrees(at_bearing), abs=1e-3)
+
+
+def test_the_cap_s_margin_at_the_tilt_stop_is_stated_and_a_study_is_warned_of_it() -> None:
+    """The maneuver tilts by 9.6 deg, the stop is at 30: 5 deg of tilt more need 5 deg of LEDs more on a sphere."""
+    testbed = bed(
+        "afit_simsat",
+        light__surface="{kind: sphere, apex: 48 in, radius: 48 in}",
+        light__layout="{kind: fibonacci, count: 900, cap_deg: 30}",
+        vehicle__camera="[0 in, 0 in, 15 in]",
+    )
+    planned = check(testbed)
+    cap = fact(planned, "LED cap")
+    assert cap.values["stop_deg"] == 30
+    beyond_deg = 30 - cap.values["tilt_deg"]
+    assert cap.values["stop_margin_deg"] == pytest.approx(cap.values["margin_deg"] - beyond_deg, abs=1e-3)
+    assert cap.lines[1].startswith("at the tilt stop, 30°, the field's edge reaches 33.")
+    assert not [line for line in planned.findings if "cap_deg" in line]
+    (warned,) = [line for line in check(testbed, 30.0).findings if "cap_deg" in line]
+    assert "at a tilt of 30.0 deg" in warned
+    free = check(bed("afit_simsat", motion__control="none", motion__maneuver="[]"))
+    assert all("tilt stop" not in line for one in free.facts if one.name == "LED cap" for line in one.lines)
 
 
 @pytest.mark.slow
@@ -201,6 +230,15 @@ def test_causes_are_in_order_and_each_is_found_where_it_is_put() -> None:
     assert list(roll.values()) == sorted(roll.values(), reverse=True)
     assert values["roll_arcsec"] == pytest.approx(math.sqrt(math.fsum(value**2 for value in roll.values())), rel=1e-6)
     assert next(iter(values["cross_causes_arcsec"])) in ("lever survey", "survey rotation")
+
+
+def test_what_cross_and_sigma_are_of_is_said() -> None:
+    """Cross is of two axes; a survey's error is constant in one dome, unlike the noise of centroids."""
+    over_surveys = "of the survey: 1σ over surveys; one dome has one survey, whose error stays the same"
+    surveyed, exact = check(bed("afit_simsat")), check(bed("afit_simsat_ideal"))
+    assert over_surveys in fact(surveyed, "expected error").lines
+    assert over_surveys not in fact(exact, "expected error").lines
+    assert [one for one in fact(exact, "expected error").lines if one.startswith("cross: sqrt(x² + y²)")]
 
 
 def test_a_solver_s_own_error_is_a_cause() -> None:
@@ -258,6 +296,18 @@ def test_a_solver_s_own_error_is_a_cause() -> None:
             "tracker.assumed_distortion",
             "matching radius",
         ),
+        (
+            "afit_simsat",
+            {"tracker__survey__instrument": STATION + ", zero_sigma: 20 mm}", "camera__focal_length": "20 mm"},
+            "tracker.survey.instrument",
+            "matching radius",
+        ),
+        (
+            "afit_simsat",
+            {"light__surface__error": "50 mm", "camera__focal_length": "20 mm"},
+            "light.surface.error",
+            "matching radius",
+        ),
         ("afit_simsat", {"camera__preset": "lu205c"}, "camera.shutter", "rows are read one after another"),
         (
             "afit_simsat",
@@ -285,9 +335,34 @@ def test_a_mistake_is_warned_of_with_its_key(scene: str, changes: dict[str, str]
 )
 def test_following_the_advice_silences_the_warning(changes: dict[str, str], key: str) -> None:
     (line,) = [one for one in check(build_testbed(loader.load("afit_simsat", changes))).findings if one.startswith(key)]
-    value = line.rpartition("change it to ")[2]
+    value = line.rpartition("change it to ")[2].partition(", or ")[0]
     again = check(build_testbed(loader.load("afit_simsat", changes | {key: value}))).findings
     assert not [one for one in again if one.startswith(key)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("intensity", "keys"),
+    [
+        ("60 mcd", ["exposure.time", "camera.f_number"]),
+        ("3 cd", ["exposure.time", "camera.transmission"]),
+        ("60 cd", ["camera.transmission"]),
+    ],
+)
+def test_saturation_can_be_cured_by_light_exposure_or_lens(intensity: str, keys: list[str]) -> None:
+    """Each cure alone ends the warning; LEDs 90 times too bright are not cured by f/76, nor 1,800 times by 3 us."""
+    direct = {"light.led.drive": "{kind: direct}", "light.led.intensity": intensity}
+
+    def warned(**changes: str) -> list[str]:
+        found = check(build_testbed(loader.load("afit_simsat", direct | changes))).findings
+        return [one for one in found if "are saturated" in one]
+
+    (line,) = warned()
+    first, *cures = line.rpartition("change it to ")[2].split(", or ")
+    settings = dict(cure.removesuffix(", a gray filter").split(" to ") for cure in cures)
+    assert list(settings) == keys
+    for key, value in {"light.led.intensity": first, **settings}.items():
+        assert not warned(**{key: value})
 
 
 def test_a_bright_background_is_the_only_warning_that_it_causes() -> None:

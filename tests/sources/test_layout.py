@@ -20,9 +20,11 @@ from skysim.scene.sections.light import DomeConfig
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
 from skysim.sources.dome.layouts import boards, spreads
+from skysim.sources.dome.layouts.led_list import led_list
 from skysim.sources.dome.led import lit_moments_s
 from skysim.sources.dome.shell import surface
 from skysim.sources.photometry import Band, led_strength_e_s_sr
+from skysim.tracking.dome_map_file import DomeMap, write_dome_map
 
 INCH_M = 0.0254
 MEASURED = {"kind": "ellipsoid", "apex": "48 in", "semi_axes": ["38.88 in", "38.88 in", "28.60 in"]}
@@ -402,8 +404,67 @@ def test_a_file_says_what_a_list_says(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "layout",
+    [
+        {"kind": "poisson_disk", "count": 100},
+        {"kind": "string", "pitch": "0.1 m", "spacing": "0.1 m", "lit_fraction": 0.6, "levels": [0.2, 1.0]},
+        {"kind": "string", "pitch": "0.1 m", "spacing": "0.1 m", "winding": "spiral", "lit_fraction": 0.6},
+        BOARDS,
+        SKY | {"count": 50},
+    ],
+    ids=["poisson_disk", "circles", "spiral", "boards", "sky"],
+)
+def test_the_list_of_leds_is_read_back(tmp_path: Path, layout: dict[str, Any]) -> None:
+    path, direct = tmp_path / "leds.csv", {"drive": {"kind": "direct"}, "scatter": 0.0}
+    config = {"kind": "dome", "surface": SPHERE, "layout": {"cap_deg": 40} | layout, "led": LED | direct}
+    text, cap_deg = led_list(DomeConfig.model_validate(config), BAND, "mine")
+    path.write_text(text)
+    planned = lit(layout, SPHERE, **direct)
+    read = lit({"kind": "listed", "cap_deg": cap_deg, "file": str(path)}, SPHERE, **direct)
+    np.testing.assert_allclose(read.place, planned.place, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(read.strength, planned.strength, rtol=1e-8, atol=0)
+    np.testing.assert_array_equal(read.id, planned.id)
+    # The LEDs of a board have its normal, those of a list the surface's.
+    np.testing.assert_allclose(read.normal, planned.normal, rtol=0, atol=0.02 if layout is BOARDS else 1e-11)
+
+
+@pytest.mark.parametrize("winding", ["latitude", "spiral"])
+def test_an_led_is_on_its_tape_where_the_list_says(winding: str) -> None:
+    """LEDs that follow each other on one tape are a pitch apart: by the chord, which is a little less."""
+    layout = {"kind": "string", "pitch": "2 cm", "spacing": "0.1 m", "winding": winding, "cap_deg": 40}
+    config = DomeConfig.model_validate({"kind": "dome", "surface": SPHERE, "layout": layout, "led": LED})
+    text, _ = led_list(config, BAND, "mine")
+    rows = np.genfromtxt(text.splitlines(), delimiter=",", names=True, skip_header=text.count("#"))
+    place_m = np.column_stack([rows[name] for name in ("x_m", "y_m", "z_m")])
+    same = np.diff(rows["tape"]) == 0
+    far = rows["tilt_deg"][:-1] > 10
+    np.testing.assert_allclose(np.diff(rows["tape_m"])[same], 0.02, rtol=1e-6)
+    chord_m = np.linalg.norm(np.diff(place_m, axis=0), axis=1)[same & far]
+    np.testing.assert_allclose(chord_m, 0.02, rtol=1e-3)
+    assert rows["tape"].max() == (len(np.unique(np.round(rows["tilt_deg"], 4))) - 1 if winding == "latitude" else 0)
+    assert np.all(rows["tape_m"][np.append(True, ~same)] == 0)
+
+
+def test_the_leds_of_a_survey_are_a_list_too(tmp_path: Path) -> None:
+    place_m = lit({"kind": "fibonacci", "count": 5}, SPHERE).place[:, :3]
+    zero = (0.0, 0.0)
+    lens: dict[str, Any] = {"size_px": (640, 480), "focal_px": 1000.0, "focal_sigma_px": 0.0, "center_px": zero}
+    lens |= {"center_sigma_px": zero, "distortion": (0.0,) * 5, "distortion_sigma": (0.0,) * 5}
+    found = np.array([7, 3, 11, 4, 9])
+    surveyed = DomeMap(found, place_m, np.full(5, 1e-4), np.zeros(3), 1e-4, **lens)
+    write_dome_map(tmp_path / "leds.ecsv", surveyed)
+    read = lit({"kind": "listed", "file": str(tmp_path / "leds.ecsv")}, SPHERE)
+    np.testing.assert_array_equal(read.id, found)
+    np.testing.assert_allclose(read.place[:, :3], place_m, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
     ("text", "says"),
     [
+        ("x_m,y_m,z_m,size\n0,0,1,1\n", "not a list of LEDs"),
+        ("x_m,y_m,z_m,id\n0,0,1.2,1\n0,0.1,1.2,1\n", "id 1; allowed: whole numbers from 0, each once"),
+        ("x_m,y_m,z_m,id\n0,0,1.2,0.5\n", "id 0.5; allowed: whole numbers from 0"),
+        ("x_m,y_m,z_m,id\n0,0,1.2,1e300\n", "id 1e+300; allowed: whole numbers from 0"),
         ("x_m,y_m\n1,2\n", "not a list of LEDs; allowed: columns x_m, y_m, z_m or azimuth_deg, tilt_deg"),
         ("azimuth_deg,tilt_deg\n", "not a list of LEDs"),
         ("", "not a list of LEDs"),

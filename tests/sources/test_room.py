@@ -16,6 +16,8 @@ from skysim.experiments.study.execution import engines, runner
 from skysim.scene import loader
 from skysim.scene.sections import light
 from skysim.scene.sections.light import DomeConfig, RoomConfig
+from skysim.simulation import checks
+from skysim.simulation.testbed import build_testbed
 from skysim.sources import dome
 from skysim.sources.dome.shell import room as rooms
 from skysim.sources.dome.shell import surface
@@ -92,6 +94,35 @@ def test_a_dome_down_to_below_the_bearing_has_all_of_its_shell() -> None:
     """A rim 30 cm below the bearing: the greatest width is the sphere's, in the middle of the samples."""
     low = CAP | {"rim_height": "-0.3 m"}
     np.testing.assert_allclose(part_m(1, low), [1.8, 3.0, 3.0], rtol=2e-4)
+
+
+def test_the_check_says_how_a_dome_fits_its_room() -> None:
+    """A cap of R = 1.5 m from 0.9 m up, on a bearing 1 m above the floor, in quarters through a door."""
+    room = "{height: 2.9 m, bearing_height: 1 m, width: 4 m, door: [0.9 m, 2.1 m], segments: 4}"
+    surface_text = "{kind: sphere, apex: 1.5 m, radius: 1.5 m, rim_height: 0.9 m}"
+    layout = "{kind: fibonacci, count: 300, cap_deg: 40}"
+    changes = {"light.surface": surface_text, "light.layout": layout, "light.room": room}
+    (fact,) = [
+        one for one in checks.check(build_testbed(loader.load("afit_simsat", changes))).facts if one.name == "room"
+    ]
+    sides = " x ".join(
+        f"{side:.2f}"
+        for side in rooms.largest_part_m(
+            RoomConfig.model_validate({"door": ["0.9 m", "2.1 m"], "segments": 4}),
+            (0.9, 2.1),
+            surface.build_surface(light.SurfaceConfig.model_validate(CAP)),
+            40.0,
+            4,
+        )[0]
+    )
+    assert fact.lines == [
+        "top 2.50 m of 2.90 m, rim 1.90 m above the floor; 2.40 x 2.40 m wide (room: 4.00 m x any); shell in 4 segments"
+        f" of {sides} m: fits the door of 0.90 x 2.10 m"
+    ]
+    assert fact.values["top_m"] == pytest.approx(2.5, abs=1e-9)
+    assert fact.values["extent_m"] == pytest.approx([2.4, 2.4, 0.6], abs=1e-9)
+    free = checks.check(build_testbed(loader.load("afit_simsat"))).facts
+    assert "room" not in {one.name for one in free}
 
 
 # --- the limits

@@ -6,8 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from scipy.stats import chi2
 
+from estimator.identification.chance import GATE_SIGMA
+from estimator.identification.leds.index import build_dome_index
+from estimator.trackers.dome_tracker import DomeTracker
 from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.scene.sections import light
@@ -93,6 +97,18 @@ def test_the_common_errors_have_the_covariance_that_is_claimed() -> None:
     assert (np.abs(error_m.T @ error_m / DRAWS - claimed) / spread).max() < 5
 
 
+def test_no_leds_and_no_errors_of_the_set_up_are_empty() -> None:
+    """A camera that looks beside the dome sees none: (errors, LEDs, 3)."""
+    perfect = {
+        "kind": "total_station",
+        "position": STATION["position"],
+        "angle_sigma_arcsec": 1,
+        "distance_sigma": "1 mm",
+    }
+    for config, errors in ((TotalStationConfig.model_validate(perfect), 0), (station(), 8)):
+        assert total_station.common_displacements_m(config, np.zeros((0, 3))).shape == (errors, 0, 3)
+
+
 def test_range_and_angle_errors_are_along_and_across_the_sight() -> None:
     """A data sheet's 1 mm along the sight; 1" at 100 m is half a millimeter across (Leica MS60 manual)."""
     place_m = np.array([[100.0, 0.0, 0.0]])
@@ -160,6 +176,32 @@ def test_the_tracker_believes_what_the_station_measured() -> None:
     squares = np.einsum("di,ij,dj->d", error, np.linalg.inv(claimed), error)
     low, high = chi2.ppf([1e-6, 1 - 1e-6], 18 * surveys)
     assert low < squares.sum() < high
+
+
+def test_the_error_across_the_line_from_the_bearing_is_that_of_drawn_errors() -> None:
+    own_m2 = total_station.covariance_m2(station(), PLACES_M)
+    normal = np.random.default_rng(2).standard_normal((DRAWS, len(PLACES_M), 3))
+    error_m = np.einsum("nij,dnj->dni", np.linalg.cholesky(own_m2), normal)
+    along = PLACES_M / np.linalg.norm(PLACES_M, axis=1, keepdims=True)
+    across_m = error_m - np.sum(error_m * along, axis=2, keepdims=True) * along
+    measured_m = np.sqrt(np.mean(np.sum(across_m**2, axis=2), axis=0) / 2)
+    assert survey_errors.across_sigma_m(PLACES_M, own_m2) == pytest.approx(measured_m, rel=6 / np.sqrt(2 * DRAWS))
+
+
+def test_the_final_match_admits_what_the_identification_admits() -> None:
+    """Distances err by 1 mm along sights from beside the bearing, mostly along the line from it.
+
+    An LED that the identification matches and the final match does not makes the tracker refuse the frame: 2 % of the
+    attitudes of such a dome, when the sigma was the rms of all three axes. The final match has a radius of 4 sigma.
+    """
+    beside = {"kind": "total_station", "position": ["1 m", "0 m", "-0.5 m"], "angle_sigma_arcsec": 2}
+    survey = {"instrument": beside | {"distance_sigma": "1 mm"}, "seed": 1}
+    scene = loader.load("afit_simsat", {"tracker.survey": yaml.safe_dump(survey, default_flow_style=True, width=999)})
+    tracker = build_tracker(build_testbed(scene))
+    assert isinstance(tracker, DomeTracker)
+    index = build_dome_index(tracker.leds, tracker.lever, tracker.camera)
+    assert 0.1e-3 < tracker.leds.sigma_m < 0.6e-3
+    assert GATE_SIGMA * index.led_sigma < 4 * tracker.led_sigma_rad.max()
 
 
 def test_without_an_instrument_the_map_claims_one_sigma_for_all() -> None:

@@ -82,13 +82,20 @@ def print_answers(findings: Sequence[str], answers: Sequence[str]) -> None:
         print_wrapped(text)
 
 
-def print_worst(response: str, found: Sequence[WorstTrial], levels: Sequence[Mapping[str, Any]], repeat: str) -> None:
-    """Print the worst attitudes by a response with the commands that repeat them. levels : of each trial's point"""
+def print_worst(
+    response: str, found: Sequence[WorstTrial], levels: Sequence[Mapping[str, Any]], repeat: str, instead: str
+) -> None:
+    """Print the worst attitudes by a response, the settings that start there, and the commands that repeat them.
+
+    levels : of each trial's point;  instead : the command to give if no trial counts for the response
+    """
     if not found:
-        print(f"no trial counts for {response}")
+        print(f"no trial counts for {response}; rank them by an error: {instead}")
     for rank, (one, level) in enumerate(zip(found, levels, strict=True), 1):
         at = ", ".join(f"{name} = {value}" for name, value in level.items())
         print(f"{rank}. {one.direction}, {one.lights:.0f} lights: {printable(one.event)} ({printable(at)})")
+        if one.start:
+            print(f"   {one.start}")
         print(f"   {repeat} {one.trial}")
 
 

@@ -32,9 +32,11 @@ from skysim.experiments.study.plan import (
 )
 from skysim.results import metrics
 from skysim.scene.scene import Scene
+from skysim.scene.sections.layouts import FibersConfig, LcdConfig
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.tracking.external.interface import OWN, TRACKERS
 
+SURVEY_SEED = "tracker.survey.seed"
 HARDWARE_SEED = re.compile(r"(hardware_seed|survey\.(surface_)?seed)$")
 FLIGHT_QUANTITIES = (
     *("availability", "filter_arcsec", "filter_worst_arcsec", "drift_arcsec"),
@@ -161,10 +163,7 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
     """Raise InputError where the trial does not fit the scene of a level."""
     if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(trial, FlightTrial):
         raise InputError(f"trial.kind: {trial.kind} with a collimated display; allowed: flight")
-    survey, dome = scene.tracker.survey, scene.light if isinstance(scene.light, DomeConfig) else None
-    error_m = dome.surface.error_m if dome else 0.0
-    drawn = (survey.led_sigma_m, survey.lever_sigma_m, survey.focal_length_sigma_m, survey.instrument, error_m)
-    if "tracker.survey.seed" in plan.spec.hardware and not any(drawn):
+    if SURVEY_SEED in plan.spec.hardware and not has_survey_errors(scene):
         raise InputError(
             "hardware: tracker.survey.seed has no effect without errors of the survey; allowed: with"
             " tracker.survey.led_sigma, lever_sigma or light.surface.error"
@@ -178,6 +177,23 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
             CONTROLLERS.check_name(scene.motion.control.law, plan.spec.programs)
         if tracker != OWN and isinstance(trial, CentroidTrial):  # an external tracker takes images
             raise InputError(f"tracker.name: {tracker} needs frames; allowed: {OWN}, or another trial.kind")
+
+
+def has_survey_errors(scene: Scene) -> bool:
+    """Whether the survey of a scene has errors that `tracker.survey.seed` draws."""
+    survey, dome = scene.tracker.survey, scene.light if isinstance(scene.light, DomeConfig) else None
+    error_m = dome.surface.error_m if dome else 0.0
+    return any((survey.led_sigma_m, survey.lever_sigma_m, survey.focal_length_sigma_m, survey.instrument, error_m))
+
+
+def fixed_seeds(study: Study, scene: Scene) -> list[str]:
+    """Seeds of the survey and of the LEDs that a scene draws once, and the study neither draws anew nor varies."""
+    layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
+    points, prefix = (layout.points, ".points") if isinstance(layout, FibersConfig | LcdConfig) else (layout, "")
+    seeds = [SURVEY_SEED] if has_survey_errors(scene) else []
+    seeds += [f"light.layout{prefix}.hardware_seed"] if hasattr(points, "hardware_seed") else []
+    varied = {*study.hardware, *study.set}.union(*(factor.value_at(0.5)[1] for factor in study.factors.values()))
+    return [seed for seed in seeds if seed not in varied]
 
 
 def at_factor(study: Study, name: str, level: Value, error: InputError) -> str:

@@ -248,7 +248,8 @@ class ListedConfig(DimmedConfig):
     """LEDs by list: places in the lab, or directions from the bearing onto the surface, or a CSV file of either.
 
     directions_deg : azimuth from +x toward +y, and tilt from the zenith
-    file : columns x_m, y_m, z_m or azimuth_deg, tilt_deg, and level or magnitude
+    file : columns x_m, y_m, z_m or azimuth_deg, tilt_deg; optionally level or magnitude, and id, the LEDs' numbers.
+        `skysim scenes export --out leds.csv` and `skysim survey` write such files
     """
 
     kind: Literal["listed"]

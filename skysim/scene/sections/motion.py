@@ -302,7 +302,9 @@ class MotionConfig(ConfigModel):
     def check_controller(self) -> MotionConfig:
         driven = any(leg.kind not in ("bump", "hold", "jitter") for leg in self.maneuver)
         if driven and self.control is None:
-            raise ValueError("a maneuver requires a controller, such as control: pid")
+            raise ValueError(
+                "a maneuver requires a controller, such as control: pid; allowed without one: maneuver: []"
+            )
         return self
 
     @model_validator(mode="after")

@@ -94,8 +94,10 @@ def greatest_tilt_rad(scene: Scene, frames: Attitudes) -> float:
     return float(tilts_rad(frames).max())
 
 
-def within_reach(scene: Scene, mount: Mount, frames: Attitudes) -> Attitudes:
+def within_reach(scene: Scene, mount: Mount, frames: Attitudes, tilt_deg: float | None = None) -> Attitudes:
     """Attitudes that a motion could reach: under the stars all, else any azimuth and yaw up to the greatest tilt.
+
+    tilt_deg : the greatest tilt, of a study's trials for example; that of `greatest_tilt_rad` if None
 
     Directions are even on a Fibonacci spiral; the angles about them are even too.
     """
@@ -106,7 +108,8 @@ def within_reach(scene: Scene, mount: Mount, frames: Attitudes) -> Attitudes:
         lab_from_cam = Rotation.from_euler("ZYZ", np.column_stack([n * GOLDEN_RAD, zenith_rad, turn_rad]))
         lab_from_body = lab_from_cam * mount.cam_from_body
     else:
-        cosine = math.cos(greatest_tilt_rad(scene, frames))
+        greatest_rad = greatest_tilt_rad(scene, frames) if tilt_deg is None else math.radians(tilt_deg)
+        cosine = math.cos(greatest_rad)
         tilt_rad = np.arccos(1 - n / (DIRECTIONS - 1) * (1 - cosine))  # the last one is the greatest tilt
         azimuth_rad = n * GOLDEN_RAD
         # With a yaw of minus the azimuth, the tilt is about a horizontal axis.

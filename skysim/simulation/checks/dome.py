@@ -23,7 +23,7 @@ MAX_ELLIPSOID_RMS_M = 1e-3
 # Largest diameter of an LED's image: half of a background tile of the local detector (`TILE_PX` there). The detector
 # takes wider disks for background.
 MAX_IMAGE_PX = 32.0
-# Largest error of an image's peak from drawing LED disks round that gives no warning: less than the scatter of
+# Largest error of an image's peak from drawing LED disks round that gives no note: less than the scatter of
 # brightness among LEDs of one kind (7-9 %, AFIT Table 2).
 MAX_ROUND_ERROR = 0.05
 REFERENCE_POSES = 33  # of the maneuver, at which LEDs in view are collected
@@ -37,7 +37,6 @@ def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
         surface_fit_warning(scene.light, inside),
         ellipsoid_warning(inside),
         image_width_warning(scene, sources, mount),
-        round_disk_warning(scene, sources, mount),
         exposure_warning(scene, sources),
     ]
     return [line for line in lines if line]
@@ -158,19 +157,19 @@ def led_views(scene: Scene, sources: Sources, mount: Mount) -> Floats:
     return np.concatenate(views)
 
 
-def round_disk_warning(scene: Scene, sources: Sources, mount: Mount) -> str:
-    """Warn where LED disks, which are drawn round, should be ellipses."""
+def round_disk_note(scene: Scene, sources: Sources, mount: Mount) -> str:
+    """A note where LED disks, which are drawn round, should be ellipses. Attitudes do not depend on it."""
     views = round_disks(scene, sources, mount)
     if np.abs(views.peak_error).max(initial=0.0) <= MAX_ROUND_ERROR:
         return ""
     worst = int(np.abs(views.peak_error).argmax())
     axes = " and ".join(f"{axis:.2f}" for axis in views.axes[worst])
     return (
-        "light.led.disk_diameter: LED disks are drawn as circles, a limit of the renderer: places are right, but peaks"
-        f" wrong by {100 * np.median(np.abs(views.peak_error)):.2g} % (median),"
+        "LED disks are drawn as circles: places are right, peaks wrong by"
+        f" {100 * np.median(np.abs(views.peak_error)):.2g} % (median),"
         f" {100 * abs(views.peak_error[worst]):.2g} % at"
-        f" {np.degrees(views.incidence_rad[worst]):.0f} deg of incidence and {np.degrees(views.field_rad[worst]):.0f}"
-        f" deg off axis, where the image's semi-axes should be {axes} of the drawn radius"
+        f" {np.degrees(views.incidence_rad[worst]):.0f}° of incidence and {np.degrees(views.field_rad[worst]):.0f}° off"
+        f" axis, where the image's semi-axes should be {axes} of the drawn radius"
     )
 
 

@@ -181,6 +181,7 @@ CAUSES: dict[str, Callable[[View, Rotation, Context], Independent | Common | Non
     "rolling shutter": rolling_shutter,
 }
 UNKNOWN_TO_TRACKER = ("focal length", "distortion", "assumed lever", "rolling shutter")
+OUTSIDE_OF_GATE = ("survey set-up", "surface survey")  # drawn once: in the tracker's covariance, not in its radius
 CENTROIDS, SOLVER = "centroid noise", "solver"  # the causes that are not displacements of all images
 EXACT_SOLVERS = ("rotation_only", "pnp")  # without an error of their own
 
@@ -226,7 +227,8 @@ def believed_sigma_px(view: View, noise: Independent, context: Context) -> Float
 class Mismatch(NamedTuple):
     """How far images are from where the tracker expects them, after the best attitude for that.
 
-    residual_px : (n,) of all known errors together;  gate_px : (n,) at which the tracker takes a light for another
+    residual_px : (n,) of all errors together, of those drawn once 1 sigma;  gate_px : (n,) at which the tracker takes a
+        light for another
     by_cause    : rms of the residual of each cause
     """
 
@@ -236,21 +238,30 @@ class Mismatch(NamedTuple):
 
 
 def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch | None:
-    """The mismatch by errors that the tracker does not know of; None if there is none, or too few lights."""
-    causes = {name: CAUSES[name](view, lab_from_cam, context) for name in UNKNOWN_TO_TRACKER}
-    known = {name: errors.displacement_px[:, :, 0] for name, errors in causes.items() if isinstance(errors, Common)}
+    """The mismatch by errors that the tracker's matching radius leaves out; None if there is none, or too few lights.
+
+    A known error displaces every image by its vector; an error that is drawn once for all lights by 1 sigma of each of
+    its parts, which add in quadrature.
+    """
+    if len(view) < MIN_EVIDENCE_MATCHES:
+        return None
+    causes = {name: CAUSES[name](view, lab_from_cam, context) for name in (*UNKNOWN_TO_TRACKER, *OUTSIDE_OF_GATE)}
+    shifts = {name: errors.displacement_px for name, errors in causes.items() if isinstance(errors, Common)}
     if context.beliefs.focal_sigma:
-        known.pop("focal length", None)  # the tracker allows for it
-    if not known or len(view) < MIN_EVIDENCE_MATCHES:
+        shifts.pop("focal length", None)  # the tracker allows for it
+    if not shifts:
         return None
     sigma_px = believed_sigma_px(view, Independent(centroid_variance(view, context)), context)
     try:
         gain = gains(view, sigma_px)
     except np.linalg.LinAlgError:
         return None
-    left = {name: shift - view.jacobian @ np.einsum("nij,nj->i", gain, shift) for name, shift in known.items()}
-    rms = {name: float(np.sqrt((shift**2).sum(axis=1).mean())) for name, shift in left.items()}
-    return Mismatch(np.linalg.norm(sum(left.values()), axis=1), GATE_SIGMA * sigma_px, rms)
+    left = {name: shift - view.jacobian @ np.einsum("nij,njk->ik", gain, shift) for name, shift in shifts.items()}
+    rms = {name: float(np.sqrt((shift**2).sum(axis=(1, 2)).mean())) for name, shift in left.items()}
+    known = sum((shift for name, shift in left.items() if name in UNKNOWN_TO_TRACKER), np.zeros((len(view), 2, 1)))
+    drawn = [shift for name, shift in left.items() if name in OUTSIDE_OF_GATE]
+    residual_px = np.linalg.norm(np.concatenate([known, *drawn], axis=2), axis=(1, 2))
+    return Mismatch(residual_px, GATE_SIGMA * sigma_px, rms)
 
 
 def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:

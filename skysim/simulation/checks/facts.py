@@ -13,16 +13,18 @@ from skysim.camera.psf.otf import blur_radius_px
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.light import DomeConfig, StarsConfig
-from skysim.simulation.checks import attitudes, beliefs
+from skysim.simulation.checks import attitudes, beliefs, dome
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, full_scale_e
 from skysim.simulation.checks.expected_error import Expected, mean_root
 from skysim.simulation.checks.views import View
+from skysim.sources.dome.shell.room import fit
 
 GAUSSIAN_WIDTH = 4.0  # width of an image over its rms radius: D4sigma (ISO 11146), the diameter of a uniform disk
 SIDES = 12  # to which the greatest tilt is tried, and rays around the field
 MIN_SHARE = 0.005  # of the variance of a cause that is printed
 ARCSEC = "″"
+TRACKER_KNOWS = "tracker knows"
 
 
 def short(value: float, digits: int = 3) -> str:
@@ -89,7 +91,7 @@ def lights_in_field(context: Context, samples: Samples) -> Fact:
 
 def reached(context: Context, samples: Samples) -> str:
     """What directions the motion could reach, in words."""
-    tilt_deg = math.degrees(attitudes.greatest_tilt_rad(context.testbed.scene, samples.frames.attitudes))
+    tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
     return f"any azimuth and yaw to {tilt_deg:.1f}° of tilt"
 
 
@@ -104,6 +106,15 @@ def spot(context: Context, samples: Samples) -> Fact:
     text = f"{width:.1f} px wide (D4σ): lens {lens_px:.1f}, LED {disk_px:.1f}, defocus {defocus_px:.1f} px"
     values = {"width_px": width, "lens_px": lens_px, "led_px": disk_px, "defocus_px": defocus_px}
     return Fact("image size", [text], values)
+
+
+def image_shape(context: Context, samples: Samples) -> Fact | None:
+    """By how much round images err from the ellipses of inclined LEDs, where it matters to the peaks."""
+    testbed = context.testbed
+    if not isinstance(testbed.scene.light, DomeConfig):
+        return None
+    note = dome.round_disk_note(testbed.scene, testbed.sources, testbed.mount)
+    return Fact("image shape", [note], {}) if note else None
 
 
 def fill(context: Context, samples: Samples) -> Floats:
@@ -142,30 +153,52 @@ def smear(context: Context, samples: Samples) -> Fact:
 
 
 class CapMargin(NamedTuple):
-    """The cap of a dome's LEDs, the greatest tilt, and what the field needs there; degrees from the zenith."""
+    """The cap of a dome's LEDs, a tilt, and what the field needs there; degrees from the zenith.
+
+    needed_deg : for the middle of the field's longer side;  corner_deg : for its corner
+    """
 
     cap_deg: float
     tilt_deg: float
     needed_deg: float
+    corner_deg: float
+
+    @property
+    def text(self) -> str:
+        """What the field needs, and the margins, in words."""
+        edge, corner = (self.cap_deg - needed for needed in (self.needed_deg, self.corner_deg))
+        return (
+            f"the field's edge reaches {self.needed_deg:.1f}°, its corner {self.corner_deg:.1f}°: margin {edge:+.1f}°"
+            f" and {corner:+.1f}°"
+        )
 
 
-def cap_margin(context: Context, samples: Samples) -> CapMargin | None:
-    """How far the LEDs reach beyond the field at the greatest tilt; None without a layout that fills a cap.
+def cap_margin(context: Context, samples: Samples, tilt_deg: float | None = None) -> CapMargin | None:
+    """How far the LEDs reach beyond the field at a tilt; None without a layout that fills a cap.
 
-    The field is taken as the circle of half its longer side, since any side may point outward. Rays of that circle are
-    traced to the surface from the pupil, at the greatest tilt to all sides; their angle from the zenith, as seen from
-    the bearing, is what `light.layout.cap_deg` is compared with.
+    tilt_deg : the greatest of the attitudes in reach if None
+    Any side or corner of the field may point outward. Rays at these angles from the boresight are traced to the surface
+    from the pupil, at the tilt to all sides; their angle from the zenith, as seen from the bearing, is what
+    `light.layout.cap_deg` is compared with.
     """
-    light, surface, camera = context.testbed.scene.light, context.surface, context.camera.optics.camera
-    if not isinstance(light, DomeConfig) or surface is None:
+    light, camera = context.testbed.scene.light, context.camera.optics.camera
+    if not isinstance(light, DomeConfig) or context.surface is None:
         return None
     points = getattr(light.layout, "points", light.layout)
     if points.kind == "listed" or getattr(points, "boards", ()):
         return None
-    mount = context.testbed.mount
-    tilt_rad = attitudes.greatest_tilt_rad(context.testbed.scene, samples.frames.attitudes)
-    azimuth = 2 * np.pi * np.arange(SIDES) / SIDES
-    radius = max(camera.width_px, camera.height_px) / 2 / camera.focal_px
+    if tilt_deg is None:
+        tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
+    size_px = (camera.width_px, camera.height_px)
+    edge, corner = (field_reach_deg(context, radius_px, tilt_deg) for radius_px in (max(size_px) / 2, camera.corner_px))
+    return CapMargin(float(points.cap_deg), tilt_deg, edge, corner)
+
+
+def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> float:
+    """Greatest angle from the zenith, at the bearing, at which a circle of the field meets the dome at a tilt."""
+    mount, surface, azimuth = context.testbed.mount, context.surface, 2 * np.pi * np.arange(SIDES) / SIDES
+    assert surface is not None
+    radius, tilt_rad = radius_px / context.camera.optics.camera.focal_px, math.radians(tilt_deg)
     rays_cam = np.column_stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.ones(SIDES)])
     needed_deg = 0.0
     for lab_from_body in Rotation.from_euler("ZYZ", np.column_stack([azimuth, np.full(SIDES, tilt_rad), -azimuth])):
@@ -174,20 +207,41 @@ def cap_margin(context: Context, samples: Samples) -> CapMargin | None:
         # A ray that misses the surface passes below its rim: its own direction is the least that it needs.
         met = np.where(np.isnan(met), rays, met)
         needed_deg = max(needed_deg, float(np.degrees(np.arctan2(np.hypot(*met.T[:2]), met[:, 2])).max()))
-    return CapMargin(float(points.cap_deg), math.degrees(tilt_rad), needed_deg)
+    return needed_deg
 
 
 def cap(context: Context, samples: Samples) -> Fact | None:
-    """Margin of the LED cap over the tilt plus half the field."""
-    found = cap_margin(context, samples)
+    """Margin of the LED cap over the tilt plus half the field, at the greatest tilt in reach and at the tilt stop."""
+    found, vehicle = cap_margin(context, samples), context.testbed.scene.vehicle
     if found is None:
         return None
-    margin_deg = found.cap_deg - found.needed_deg
-    text = (
-        f"LEDs to {found.cap_deg:.3g}° from the zenith; the field's edge reaches {found.needed_deg:.1f}° at a tilt of"
-        f" {found.tilt_deg:.1f}°: margin {margin_deg:+.1f}°"
-    )
-    return Fact("LED cap", [text], {**found._asdict(), "margin_deg": margin_deg})
+    lines = [f"LEDs to {found.cap_deg:.3g}° from the zenith; at a tilt of {found.tilt_deg:.1f}° {found.text}"]
+    values = {**found._asdict(), "margin_deg": found.cap_deg - found.needed_deg}
+    if vehicle.mount == "air_bearing" and vehicle.tilt_stop_deg > found.tilt_deg + 0.05:
+        stop = cap_margin(context, samples, vehicle.tilt_stop_deg)
+        assert stop is not None
+        lines.append(f"at the tilt stop, {stop.tilt_deg:g}°, {stop.text}")
+        values |= {"stop_deg": stop.tilt_deg, "stop_margin_deg": stop.cap_deg - stop.needed_deg}
+    return Fact("LED cap", lines, values)
+
+
+def room(context: Context, samples: Samples) -> Fact | None:
+    """How the dome fits into the room where it is to be built, which a scene that does not fit refuses."""
+    light, surface = context.testbed.scene.light, context.surface
+    if not isinstance(light, DomeConfig) or light.room is None or surface is None:
+        return None
+    limits, values = light.room, fit(light.room, surface, light.layout.cap_deg)
+    x_m, y_m, _ = values["extent_m"]
+    floor = [f"{size:.2f} m" if size is not None else "any" for size in (limits.width_m, limits.length_m)]
+    text = f"{x_m:.2f} x {y_m:.2f} m wide (room: {floor[0]} x {floor[1]})"
+    if limits.bearing_height_m is not None:
+        ceiling = f" of {limits.height_m:.2f} m" if limits.height_m is not None else ""
+        text = f"top {values['top_m']:.2f} m{ceiling}, rim {values['rim_m']:.2f} m above the floor; {text}"
+    if limits.door_m is not None:
+        part = "the shell" if limits.segments == 1 else f"shell in {limits.segments} segments of"
+        sides, door = (" x ".join(f"{side:.2f}" for side in box) for box in (values["part_m"], limits.door_m))
+        text += f"; {part} {sides} m: fits the door of {door} m"
+    return Fact("room", [text], values)
 
 
 def depth_of_focus(context: Context, samples: Samples) -> Fact:
@@ -224,7 +278,7 @@ def tracker_beliefs(context: Context, samples: Samples) -> Fact:
         "distortion": list(believed.camera.distortion),
         "catalog_epoch_jyear": believed.epoch_jyear,
     }
-    return Fact("tracker knows", beliefs.describe(believed, context.testbed.scene), values)
+    return Fact(TRACKER_KNOWS, beliefs.describe(believed, context.testbed.scene), values)
 
 
 def expected_error(context: Context, samples: Samples) -> Fact:
@@ -247,7 +301,15 @@ def expected_error(context: Context, samples: Samples) -> Fact:
         values[key] |= {f"{angle}_causes_arcsec": causes(sampled, angle) for angle in ("cross", "roll")}
     chosen = samples.frames if np.isfinite(values["frames"]["roll_arcsec"]) else samples.reach
     lines += [f"{angle}: {cause_text(chosen, angle)}" for angle in ("cross", "roll") if causes(chosen, angle)]
+    lines.append("cross: sqrt(x² + y²), x and y the errors about both axes across the boresight")
+    named = {name for angle in ("cross", "roll") for name in causes(chosen, angle)}
+    if named & {*SURVEYED, *(["focal length"] if context.beliefs.focal_sigma else [])}:
+        lines.append("of the survey: 1σ over surveys; one dome has one survey, whose error stays the same")
     return Fact("expected error", lines, values)
+
+
+# Causes of the expected error that are drawn with the survey.
+SURVEYED = ("LED survey", "survey set-up", "lever survey", "surface survey")
 
 
 def causes(sampled: Sampled, angle: str) -> dict[str, float]:
@@ -274,9 +336,11 @@ FACTS: tuple[Callable[[Context, Samples], Fact | None], ...] = (
     field_of_view,
     lights_in_field,
     spot,
+    image_shape,
     peak,
     smear,
     cap,
+    room,
     depth_of_focus,
     tracker_beliefs,
     expected_error,

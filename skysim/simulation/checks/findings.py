@@ -26,6 +26,8 @@ from skysim.sources.photometry import SUN, star_flux_e_s_m2
 
 MAX_SATURATED = 0.25  # fraction of saturated lights that gives no warning: a bright star or LED now and then
 TARGET_FILL = 0.7  # of full well, for the light that a fraction MAX_SATURATED exceeds
+SHORTEST_S, LARGEST_F_NUMBER = 10e-6, 22.0  # of the cameras and lenses that advice names
+FILTER_BELOW = 0.1  # factor of the light that calls for a filter
 MIN_LIGHTS = 4  # that an identification needs
 MIN_DETECTED = 0.5  # fraction of the lights on the chip that the tracker should detect
 MAX_FEW, MAX_FEW_SKY = 0.02, 0.5  # fraction of the directions in reach that may have fewer; of the whole sky
@@ -50,12 +52,32 @@ def saturation(context: Context, samples: Samples) -> str:
         f"{100 * full:.0f} % of the lights are saturated, the median light at {short(np.median(ratio), 2)} times"
         f" {full_scale_e(scene.camera.detector):.0f} electrons; change it to"
     )
+    cures = dimmer(context, factor)
+    first, value = next(iter(cures.items()))
+    others = "".join(f", or {key} to {other}" for key, other in cures.items() if key != first)
+    if factor < FILTER_BELOW:
+        others += f", or camera.transmission to {short(factor * scene.camera.transmission, 2)}, a gray filter"
+    return f"{first}: {text} {value}{others}"
+
+
+def dimmer(context: Context, factor: float) -> dict[str, str]:
+    """Keys with values that make every light dimmer by this factor, the LEDs first; those that a camera can have.
+
+    An exposure is no shorter than SHORTEST_S and than the LED drive's cycle, in which each LED is lit once; a lens is
+    not stopped down beyond LARGEST_F_NUMBER.
+    """
+    scene, sources, cures = context.testbed.scene, context.testbed.sources, dict[str, str]()
     led = getattr(scene.light, "led", None)
-    if led is None:
-        return f"exposure.time: {text} {short(1e3 * factor * scene.exposure.time_s, 2)} ms"
-    if led.intensity_cd is not None:
-        return f"light.led.intensity: {text} {short(1e3 * factor * led.intensity_cd, 2)} mcd"
-    return f"light.led.radiant_intensity: {text} {short(1e6 * factor * led.radiant_intensity_w_sr, 2)} uW / sr"
+    if led is not None and led.intensity_cd is not None:
+        cures["light.led.intensity"] = f"{short(1e3 * factor * led.intensity_cd, 2)} mcd"
+    elif led is not None:
+        cures["light.led.radiant_intensity"] = f"{short(1e6 * factor * led.radiant_intensity_w_sr, 2)} uW / sr"
+    cycle_s = float(sources.period_s[sources.on_s < sources.period_s].max(initial=0.0))
+    if factor * scene.exposure.time_s >= max(cycle_s, SHORTEST_S) or led is None:
+        cures["exposure.time"] = f"{short(1e3 * factor * scene.exposure.time_s, 2)} ms"
+    if scene.camera.f_number / math.sqrt(factor) <= LARGEST_F_NUMBER:
+        cures["camera.f_number"] = short(scene.camera.f_number / math.sqrt(factor), 2)
+    return cures
 
 
 def bright_background(context: Context, samples: Samples) -> str:
@@ -203,11 +225,18 @@ def not_where_expected(context: Context, samples: Samples) -> str:
     return f"{MISMATCH_KEYS[cause]}: {text}; {CHANGES[cause](scene, excess)}"
 
 
+def surface_error_m(scene: Scene) -> float:
+    """The survey error of the dome's surface; 0 without a dome."""
+    return float(scene.light.surface.error_m) if isinstance(scene.light, DomeConfig) else 0.0
+
+
 MISMATCH_KEYS = {
     "focal length": "tracker.assumed_focal_length",
     "distortion": "tracker.assumed_distortion",
     "assumed lever": "tracker.assumed_camera_body",
     "rolling shutter": "camera.shutter",
+    "survey set-up": "tracker.survey.instrument",
+    "surface survey": "light.surface.error",
 }
 # What to change, from the scene and how many times too large the displacement is.
 CHANGES: dict[str, Callable[[Scene, float], str]] = {
@@ -218,6 +247,10 @@ CHANGES: dict[str, Callable[[Scene, float], str]] = {
         f"change it to {{kind: global}}, or turn {short(excess, 2)} times slower: rows are read one after another, and"
         " the tracker takes them as simultaneous"
     ),
+    "survey set-up": lambda scene, excess: (
+        f"change it to one of smaller errors of the set-up, by a factor of {short(excess, 2)}"
+    ),
+    "surface survey": lambda scene, excess: f"change it to {short(1e3 * surface_error_m(scene) / excess, 2)} mm",
 }
 
 
@@ -230,7 +263,8 @@ def cap_too_small(context: Context, samples: Samples) -> str:
     uncovered = "the tilt itself is not covered" if found.tilt_deg > found.cap_deg else "its edge has no LED"
     return (
         f"{key}: LEDs end at {found.cap_deg:.3g} deg from the zenith, but at a tilt of {found.tilt_deg:.1f} deg the"
-        f" field reaches {found.needed_deg:.1f} deg: {uncovered}; change it to {math.ceil(found.needed_deg)}"
+        f" field reaches {found.needed_deg:.1f} deg: {uncovered}; change it to {math.ceil(found.needed_deg)}, or"
+        f" {math.ceil(found.corner_deg)} for its corners"
     )
 
 

@@ -53,7 +53,7 @@ def of(context: Context, samples: Samples) -> Lookalike | None:
     place_m = context.beliefs.lights.place[:, :3]
     most = int(MAX_WORK / np.mean([len(view) for view in samples.reach.seen]))
     zenith_rad = np.sort(np.arctan2(np.hypot(*place_m.T[:2]), place_m[:, 2]))
-    tilt_rad = attitudes.greatest_tilt_rad(testbed.scene, samples.frames.attitudes)
+    tilt_rad = float(attitudes.tilts_rad(samples.reach.attitudes).max())
     found = field_ambiguity(
         place_m,
         float(np.linalg.norm(testbed.mount.camera_body_m)),

@@ -30,9 +30,10 @@ class Check(NamedTuple):
         return {"facts": numbers, "findings": self.findings}
 
 
-def check(testbed: Testbed) -> Check:
+def check(testbed: Testbed, tilt_deg: float | None = None) -> Check:
     """Check the plan of a test bed whose motion need not be simulated.
 
+    tilt_deg : greatest tilt under a dome, if it is not that of the scene's motion (random attitudes of a study)
     Raises InputError for unreadable files, and for a maneuver that a run would refuse.
     """
     scene = testbed.scene
@@ -42,7 +43,7 @@ def check(testbed: Testbed) -> Check:
     context = context_of(testbed)
     frames = attitudes.of_frames(testbed)
     check_reference(guidance.plan(scene.motion, testbed.trajectory.lab_from_body[0], testbed.profiles), testbed)
-    reach = attitudes.within_reach(scene, testbed.mount, frames)
+    reach = attitudes.within_reach(scene, testbed.mount, frames, tilt_deg)
     samples = Samples(sampled(frames, context), sampled(reach, context))
     facts = [fact for build in FACTS if (fact := build(context, samples)) is not None]
     findings = [line for find in FINDINGS if (line := find(context, samples))]

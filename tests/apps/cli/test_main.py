@@ -115,6 +115,15 @@ def test_export_writes_a_scene_that_mujoco_s_own_loader_takes(skysim: Skysim, tm
     assert "nothing: no such scene" in skysim("scenes", "export", "nothing").one_line()
 
 
+def test_export_writes_the_list_of_leds_that_a_scene_takes(skysim: Skysim, tmp_path: Path) -> None:
+    path = tmp_path / "leds.csv"
+    done = skysim("scenes", "export", "afit_simsat", "--out", path)
+    layout = f"{{kind: listed, cap_deg: 28, file: {path}}}"
+    assert (done.code, done.out) == (0, f"{path}: light.layout: {layout}\n")
+    assert skysim("check", "afit_simsat", "--set", f"light.layout={layout}").code == 0
+    assert "allowed: dome" in skysim("scenes", "export", "shefex2", "--out", path).one_line()
+
+
 @pytest.mark.long
 def test_a_picture_without_opengl_is_a_word_and_the_run_goes_on(
     skysim: Skysim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -593,7 +602,8 @@ def test_check_prints_facts_and_warnings_in_eighty_columns(skysim: Skysim) -> No
         assert f"\n{name} " in f"\n{ran.out}"
     words = " ".join(ran.out.split())
     assert "warning: light.led.intensity: " in words
-    assert words.endswith("mcd (--set)")
+    assert "; change it to 17 mcd, or exposure.time to " in words
+    assert words.endswith(" (--set)")
     assert "no warnings" in skysim("check", "shefex2").out
 
 

@@ -13,10 +13,12 @@ from study_stores import done
 from skysim.experiments.study import loader, store
 from skysim.experiments.study.analysis import answer
 from skysim.experiments.study.analysis.table import PointRow, format_summary, table
-from skysim.experiments.study.plan import Study
+from skysim.experiments.study.plan import Study, resolve_point
 from skysim.experiments.study.report import overview, page
 from skysim.results import metrics
 from skysim.results.metrics import Summary
+from skysim.simulation import checks
+from skysim.simulation.testbed import build_testbed
 
 STUDY: dict[str, Any] = {
     "schema": 1,
@@ -28,7 +30,7 @@ STUDY: dict[str, Any] = {
     "factors": {"leds": {"key": "light.layout.count", "values": [500, 900]}},
     "responses": ["identified", "roll_arcsec_p95", "misidentified"],
 }
-NEVER = {"misidentified": 0, "roll_noise": 0, "wrong": 0, "ambiguous": 0, "identified": 0}
+NEVER = {"misidentified": 0, "roll_noise": 0, "wrong": 0, "ambiguous": 0, "refused": 0, "identified": 0}
 
 
 def study(**keys: Any) -> Study:
@@ -68,6 +70,21 @@ def test_ambiguous_somewhere_says_where_and_how_sure_it_is_of_the_rest() -> None
         f" frames ({100 * interval.low:.3g} to {100 * interval.high:.3g} %); none in 400 (less than 0.75 % at 95 %"
         " confidence) at the other points."
     )
+
+
+def test_refusals_are_named_where_they_are_most_frequent() -> None:
+    """None is ambiguous, and yet 4 of 200 attitudes are not solved at 500 LEDs."""
+    lines = [line(0, 500, 200, refused=4), line(1, 900, 400)]
+    interval = metrics.proportion(4, 200)
+    texts = answer.headline(study(), lines, True, "skysim study worst leds.yaml")
+    assert said(texts, "Is it ambiguous anywhere?").startswith("Is it ambiguous anywhere? No.")
+    assert said(texts, "Is every attitude solved?") == (
+        "Is every attitude solved? No. Refused (no attitude is returned): at 1 of 2 points, most at leds = 500: 2 % of"
+        f" the frames ({100 * interval.low:.3g} to {100 * interval.high:.3g} %); none in 400 (less than 0.75 % at 95 %"
+        " confidence) at the other points. `skysim study worst leds.yaml --response refused` names the worst."
+    )
+    solved = answer.headline(study(trial={"kind": "frames"}), [line(0, 500, 100)], True)
+    assert said(solved, "Is every frame solved?").startswith("Is every frame solved? Yes. Refused")
 
 
 def test_misidentification_and_roll_noise_are_kept_apart() -> None:
@@ -131,6 +148,50 @@ def test_the_scene_is_in_a_table(tmp_path: Path) -> None:
     assert rows["varied: leds"] == "500, 900 (light.layout.count)"
     assert rows["trials"] == "2 at each of 2 points, the same attitudes at every point; seed 1"
     assert rows["drawn in every trial"] == "light.layout.hardware_seed"
+
+
+@pytest.mark.slow
+def test_the_tracker_s_knowledge_is_told_as_by_the_check(tmp_path: Path) -> None:
+    station = {"kind": "total_station", "position": ["1 m", "0 m", "-0.5 m"], "angle_sigma_arcsec": 2}
+    survey = {"tracker.survey": {"instrument": station | {"distance_sigma": "1 mm"}, "led_sigma": "0.1 mm"}}
+    plan = loaded(tmp_path, set=STUDY["set"] | survey)
+    scene, _ = resolve_point(plan.spec, plan.points[0].settings)
+    (fact,) = [one for one in checks.check(build_testbed(scene)).facts if one.name == "tracker knows"]
+    told = dict(overview.overview(plan).rows)["tracker knows"]
+    assert told == "; ".join(fact.lines)
+    assert "measured by a total station" in told
+    assert "LEDs to 0.1 mm" not in told
+
+
+@pytest.mark.slow
+def test_intervals_of_one_dome_say_which_hardware_is_fixed(tmp_path: Path) -> None:
+    survey, layout = "tracker.survey.seed", "light.layout.hardware_seed"
+    (said_,) = answer.one_unit(overview.overview(loaded(tmp_path)).fixed)
+    assert said_ == (
+        "Intervals cover other attitudes, with one survey and one draw of the LEDs:"
+        f" `hardware: [{survey}, {layout}]` in the study draws the hardware anew in every replicate, and they cover it"
+        " too."
+    )
+    (said_,) = answer.one_unit(overview.overview(loaded(tmp_path, hardware=[survey])).fixed)
+    assert f"with one draw of the LEDs: `hardware: [{layout}]`" in said_
+    assert answer.one_unit(overview.overview(loaded(tmp_path, hardware=[survey, layout])).fixed) == []
+    units = {"unit": {"levels": {"a": {survey: 1}, "b": {survey: 2}}}}
+    assert overview.overview(loaded(tmp_path, factors=units)).fixed == (layout,)
+
+
+@pytest.mark.slow
+def test_a_dome_is_checked_up_to_the_tilt_of_the_trials(tmp_path: Path) -> None:
+    """LEDs end at 27 deg: within the reach of the scene's maneuver, 20 deg, and not of trials at 20 deg and more."""
+    layout = {"light.layout": {"kind": "random", "count": 900, "cap_deg": 27}}
+    factors = {"leds": {"key": "light.layout.count", "values": [900]}}
+
+    def warned(tilt_deg: int) -> list[str]:
+        trial = {"kind": "centroids", "tilt_deg": [0, tilt_deg]}
+        told = overview.overview(loaded(tmp_path, set=layout, trial=trial, factors=factors))
+        return [one for one in told.findings if "LEDs end at 27 deg" in one]
+
+    assert not warned(10)
+    assert "at a tilt of 25.0 deg" in warned(25)[0]
 
 
 @pytest.mark.slow

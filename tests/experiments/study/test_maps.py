@@ -10,8 +10,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
+from skysim.dynamics import guidance
 from skysim.experiments.study import loader
 from skysim.experiments.study.analysis import worst
 from skysim.experiments.study.analysis.table import PointRow
@@ -20,6 +23,7 @@ from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.plan import Map, Study
 from skysim.experiments.study.report import maps
 from skysim.results.metrics import Columns
+from skysim.scene.sections.motion import AttitudeConfig
 
 RNG = np.random.default_rng(12)
 STUDY: dict[str, Any] = {
@@ -208,12 +212,23 @@ def test_dome_and_sky_are_not_drawn_in_one_map() -> None:
     ],
 )
 def test_a_map_that_cannot_be_is_refused(tmp_path: Any, change: dict[str, Any], complaint: str) -> None:
-    import yaml
-
     path = tmp_path / "study.yaml"
     path.write_text(yaml.safe_dump(STUDY | {"figures": [{"kind": "map", "value": "wrong"}]} | change))
     with pytest.raises(InputError, match=complaint):
         loader.load(path)
+
+
+def test_a_cell_of_too_few_values_for_its_quantile_is_hatched() -> None:
+    """One of 20 values exceeds the 95 % quantile: of fewer it would be the largest. A median takes 5."""
+    few = maps.direction_map("", columns(40), "roll_arcsec_p95")
+    assert max(cell.values for cell in few.cells) < 20
+    assert not any(cell.shown for cell in few.cells)
+    assert any(cell.shown for cell in maps.direction_map("", columns(40), "roll_arcsec_median").cells)
+    many = maps.direction_map("", columns(3000), "roll_arcsec_p95")
+    assert np.mean([cell.shown for cell in many.cells]) > 0.9
+    assert all(cell.shown == (cell.values >= 20) for cell in many.cells)
+    figure = Map(kind="map", value="roll_arcsec_p95")
+    assert "hatched: fewer than 20" in maps.caption([few], figure, study(), LINES)
 
 
 # The worst.
@@ -250,6 +265,29 @@ def test_the_worst_of_a_proportion_count_for_it() -> None:
     assert worst.worst_trials(table, "misidentified") == []
     assert [one.trial for one in worst.worst_trials(table, "stars_least", count=2)] == [60, 150]
     assert [one.trial for one in worst.worst_trials(table, "coverage_4", count=1)] == [60]
+
+
+def test_a_plain_quantity_ranks_single_trials() -> None:
+    """Of a study in which every trial is identified the worst are those of the greatest error."""
+    table = columns(60, roll_arcsec=np.arange(60.0))
+    assert worst.worst_trials(table, "identified") == []
+    assert worst.worst_trials(table, "roll_arcsec")[0].trial == 59
+    by_quantity, by_response = (worst.worst_trials(table, name) for name in ("roll_arcsec", "roll_arcsec_p95"))
+    assert [one.trial for one in by_quantity] == [one.trial for one in by_response]
+    fewest = columns(60, stars=np.arange(60.0) + 4)
+    assert worst.worst_trials(fewest, "stars")[0].trial == 0
+
+
+def test_the_worst_can_be_pasted_as_a_start() -> None:
+    """`motion.start` turns the body by the stored attitude, to the digits printed."""
+    lab_from_body = Rotation.random(60, rng=np.random.default_rng(4))
+    quaternion = dict(zip("wxyz", lab_from_body.as_quat(scalar_first=True).T, strict=True))
+    table = columns(60, **{f"lab_from_body_{part}": column for part, column in quaternion.items()})
+    first = worst.worst_trials(table, "roll_arcsec")[0]
+    start = yaml.safe_load(first.start)["motion.start"]
+    back = guidance.attitude(AttitudeConfig.model_validate(start))
+    assert (back.inv() * lab_from_body[first.trial]).magnitude() < np.radians(2e-3)
+    assert worst.worst_trials(columns(60, sky=True), "roll_arcsec")[0].start == ""
 
 
 @pytest.mark.slow

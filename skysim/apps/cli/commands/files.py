@@ -42,20 +42,27 @@ def scenes_show(scene: SceneArg, set_: Overrides = None, json: Json = False) -> 
 @scenes_app.command("export")
 def scenes_export(
     scene: SceneArg,
-    out: Annotated[Path | None, typer.Option(help="Output file; default: out/SCENE.xml.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Output file, .xml or .csv (list of a dome's LEDs); default: out/SCENE.xml.")
+    ] = None,
     seed: Seed = None,
     set_: Overrides = None,
 ) -> None:
-    """Write a scene as one MJCF file with dome, LEDs and camera, for MuJoCo's viewer."""
+    """Write a scene as one MJCF file with dome, LEDs and camera, for MuJoCo's viewer, or a dome's LEDs as a list."""
     from skysim.core.io import files
-    from skysim.simulation.testbed import build_testbed, export_mjcf
+    from skysim.simulation.testbed import build_testbed, export_leds, export_mjcf
 
     loaded = load(scene, None, seed, set_)
     path = out or Path("out") / f"{loaded.name}.xml"
-    text = export_mjcf(build_testbed(loaded))
+    testbed, use = build_testbed(loaded), f"python -m mujoco.viewer --mjcf={path}"
+    if path.suffix.lower() == ".csv":
+        text, cap_deg = export_leds(testbed)
+        use = f"light.layout: {{kind: listed, cap_deg: {cap_deg}, file: {path}}}"
+    else:
+        text = export_mjcf(testbed)
     files.make_folder(path.parent)
     files.write_text(path, text)
-    print(f"{path}: python -m mujoco.viewer --mjcf={path}")
+    print(f"{path}: {use}")
 
 
 @catalog_app.command("build")

@@ -205,7 +205,10 @@ def replay(
 def worst(
     study: StudyArg,
     response: Annotated[
-        str, typer.Option(help="Response by which trials are ranked; default: the first of the study.")
+        str,
+        typer.Option(
+            help="Response or quantity (roll_arcsec) that ranks the trials; default: the study's first response."
+        ),
     ] = "",
     where: Annotated[
         list[str] | None,
@@ -222,7 +225,8 @@ def worst(
     study, out = located(study, out)
     plan, _ = load_stored_plan(study, out)
     name = response or plan.study.responses[0]
-    metrics.response(name, "--response")
+    if name not in metrics.QUANTITIES:
+        metrics.response(name, "--response")
     with open_store(study, out) as stored:
         points = stored.points()
         try:
@@ -234,7 +238,8 @@ def worst(
     if json:
         print_json([row | {"command": f"{repeat} {row['trial']}"} for row in rows])
     else:
-        print_worst(name, found, [points[one.point].levels for one in found], repeat)
+        instead = f"{command(study, out, 'worst')} --response roll_arcsec"
+        print_worst(name, found, [points[one.point].levels for one in found], repeat, instead)
 
 
 def chosen_levels(words: list[str]) -> dict[str, Any]:
@@ -311,7 +316,8 @@ def write_report(plan: Plan, study: str, out: Path | None, overrides: dict[str, 
     with open_store(study, out) as stored:
         repeat = command(study, out, "optimize" if plan.study.optimize else "run", overrides)
         lines = table.table(stored, list(dict.fromkeys([*page.responses(plan.study), *answer.RESPONSES])))
-        headline = answer.headline(plan.study, lines, about.may_be_ambiguous)
+        headline = answer.headline(plan.study, lines, about.may_be_ambiguous, command(study, out, "worst"))
+        headline += answer.one_unit(about.fixed) if headline else []
         answers = headline + answer.ranges(plan.study, lines)
         texts: dict[str, Any] = {"about": about, "answers": answers, "replay": command(study, out, "replay")}
         shown = table.select_responses(lines, page.responses(plan.study))

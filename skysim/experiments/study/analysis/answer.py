@@ -23,14 +23,17 @@ EVENTS = {
     "roll_noise": "Roll noise (the right lights, but a roll error beyond 10′ that the covariance allows)",
     "wrong": "Wrong attitudes (an error beyond 10′ that the covariance does not allow, or beyond 1°)",
 }
-RESPONSES = (*EVENTS, "ambiguous")  # responses that the answers need besides those of the study
+RESPONSES = (*EVENTS, "ambiguous", "refused")  # responses that the answers need besides those of the study
 
 
-def headline(study: Study, lines: Sequence[PointRow], may_be_ambiguous: bool) -> list[str]:
-    """Thresholds, ambiguity and wrong answers, one sentence or two each; none without a trial that did not fail.
+def headline(
+    study: Study, lines: Sequence[PointRow], may_be_ambiguous: bool, worst: str = "skysim study worst STUDY"
+) -> list[str]:
+    """Thresholds, refusals, ambiguity and wrong answers, one sentence or two each; none if all trials failed.
 
     lines : of all points, with the responses of the study and RESPONSES
     may_be_ambiguous : whether the tracker can refuse a frame as ambiguous
+    worst : the command that lists the worst trials
     """
     done = [line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)]
     if not done:
@@ -38,6 +41,7 @@ def headline(study: Study, lines: Sequence[PointRow], may_be_ambiguous: bool) ->
     place, found = placer(study, done), list[str]()
     for threshold in study.thresholds:
         found += thresholds.sentences(threshold, study, done)
+    found.append(solved_everywhere(study, done, place, worst))
     if may_be_ambiguous:
         found.append(ambiguity(study, done, place))
     for name, text in EVENTS.items():
@@ -105,6 +109,27 @@ def ambiguity(study: Study, lines: Sequence[PointRow], place: Place) -> str:
     text = event("Ambiguous or misidentified", shares, lines, place)
     never = all(share.value == 0 for share in shares)
     return f"Is it ambiguous anywhere{unit}? {'No' if never else 'Yes'}. {text}"
+
+
+def solved_everywhere(study: Study, lines: Sequence[PointRow], place: Place, worst: str) -> str:
+    """Whether every attitude is solved, and how often and where the tracker refuses one for any reason."""
+    shares = [line.responses["refused"] for line in lines]
+    text = event("Refused (no attitude is returned)", shares, lines, place)
+    what = "attitude" if study.trial.kind == "centroids" else "frame"
+    if all(share.value == 0 for share in shares):
+        return f"Is every {what} solved? Yes. {text}"
+    return f"Is every {what} solved? No. {text} `{worst} --response refused` names the worst."
+
+
+def one_unit(fixed: Sequence[str]) -> list[str]:
+    """That the intervals are of one unit of hardware, and how to cover others; nothing without a seed drawn once."""
+    if not fixed:
+        return []
+    units = " and ".join("one survey" if seed.startswith("tracker.") else "one draw of the LEDs" for seed in fixed)
+    return [
+        f"Intervals cover other attitudes, with {units}: `hardware: [{', '.join(fixed)}]` in the study draws"
+        " the hardware anew in every replicate, and they cover it too."
+    ]
 
 
 def none_of(shares: Sequence[Summary]) -> str:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from skysim.core.types import Floats
 from skysim.experiments.study.analysis.axes import points_at
@@ -35,6 +36,7 @@ class WorstTrial(NamedTuple):
 
     status : "misidentified" where it is solved with wrong lights
     tilt_deg, azimuth_deg : of the body's z axis under a dome;  ra_deg, dec_deg : of the boresight under the stars
+    yaw_deg, pitch_deg, roll_deg : the body's 3-2-1 angles under a dome, as of `motion.start`;  NaN under the stars
     lights : in the field;  cross_arcsec, roll_arcsec : its errors, NaN without a solution
     """
 
@@ -48,6 +50,9 @@ class WorstTrial(NamedTuple):
     ra_deg: float
     dec_deg: float
     lights: float
+    yaw_deg: float = math.nan
+    pitch_deg: float = math.nan
+    roll_deg: float = math.nan
 
     @property
     def direction(self) -> str:
@@ -55,6 +60,14 @@ class WorstTrial(NamedTuple):
         if math.isfinite(self.tilt_deg):
             return f"tilt {self.tilt_deg:.1f}°, azimuth {self.azimuth_deg:.0f}°"
         return f"RA {self.ra_deg:.1f}°, Dec {self.dec_deg:+.1f}°"
+
+    @property
+    def start(self) -> str:
+        """The setting that starts a scene at the attitude; empty under the stars, where the direction does."""
+        if math.isnan(self.yaw_deg):
+            return ""
+        angles = ", ".join(f"{name}: {getattr(self, name):.3f}" for name in ("roll_deg", "pitch_deg", "yaw_deg"))
+        return f"motion.start: {{{angles}}}"
 
     @property
     def event(self) -> str:
@@ -66,7 +79,7 @@ class WorstTrial(NamedTuple):
 
 
 def worst_trials(columns: Columns, response: str, count: int = COUNT) -> list[WorstTrial]:
-    """The worst trials by a response, worst first, of directions at least APART_DEG apart.
+    """The worst trials by a response or a quantity, worst first, of directions at least APART_DEG apart.
 
     For a proportion they are trials that count for it (for `identified`, that do not), those without a solution before
     those with one, then by error and by the number of lights; none if there is no such trial.
@@ -87,9 +100,18 @@ def worst_trials(columns: Columns, response: str, count: int = COUNT) -> list[Wo
             "misidentified" if columns["misidentified"][row] > 0 else str(columns["status"][row]),
             *(float(error[row]) for error in errors.values()),
             *(float(columns[name][row]) for name in DIRECTION),
+            *body_angles_deg(columns, row),
         )
         for row in chosen
     ]
+
+
+def body_angles_deg(columns: Columns, row: int) -> list[float]:
+    """Yaw, pitch and roll of a trial's body under a dome; none under the stars, where the lab is the sky."""
+    wxyz = [float(columns[f"lab_from_body_{part}"][row]) for part in "wxyz"]
+    if not (np.isfinite(columns["body_tilt_deg"][row]) and np.isfinite(wxyz).all()):
+        return []
+    return [float(angle) for angle in Rotation.from_quat(wxyz, scalar_first=True).as_euler("ZYX", degrees=True)]
 
 
 def unit_directions(columns: Columns) -> Floats:
@@ -104,7 +126,7 @@ def ranking(columns: Columns, response: str) -> tuple[list[Floats], NDArray[np.b
     """Sort keys, (N,) each, the first the most important and smaller the worse; and (N,) whether a trial qualifies."""
     angle = metrics.QUANTITIES["angle_arcsec"](columns)
     unsolved_first, fewest_first = np.where(np.isnan(angle), -np.inf, -angle), np.nan_to_num(columns["stars"], nan=0.0)
-    quantity, _ = metrics.split_name(response)
+    quantity = response if response in metrics.QUANTITIES else metrics.split_name(response)[0]
     if metrics.COVERAGE.match(response):
         return [fewest_first], columns["frames"] > 0
     if quantity in metrics.QUANTITIES:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from skysim.results.plots import png
 CELL_TRIALS = 25  # mean number of trials in a cell
 MAX_CELLS = 240  # of a panel
 MIN_VALUES = 5  # a cell with fewer is hatched
+SPARE = 1.6  # mean number of trials in a cell over the least that a quantile takes
 MAX_NUMBERED = 70  # cells of a panel up to which each has its number of trials written in it
 SKY_RANGE_DEG = (-90.0, 90.0)
 MARK = "#111111"  # of the worst trials
@@ -88,12 +90,23 @@ def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
         return DirectionMap(label, sky, [], [])
     radial, around = ("boresight_dec_deg", "boresight_ra_deg") if sky else ("body_tilt_deg", "body_azimuth_deg")
     radial_deg, around_deg = columns[radial], columns[around]
-    summarize, cells = metrics.response(response), []
-    for low, high, left, right in partition(*radial_range(radial_deg[known], sky), int(known.sum()), sky):
+    summarize, cells, least = metrics.response(response), [], least_values(response)
+    count = int(known.sum() * min(CELL_TRIALS / (SPARE * least), 1.0))
+    for low, high, left, right in partition(*radial_range(radial_deg[known], sky), count, sky):
         inside = (radial_deg >= low) & (radial_deg < high) & ((around_deg - left) % 360 < right - left)
         summary = summarize({name: column[inside] for name, column in columns.items()})
-        cells.append(Cell(low, high, left, right, summary.value, summary.trials))
+        value = summary.value if summary.trials >= least else math.nan
+        cells.append(Cell(low, high, left, right, value, summary.trials))
     return DirectionMap(label, sky, cells, worst_trials(columns, response))
+
+
+def least_values(response: str) -> int:
+    """Least values of a cell that is drawn: MIN_VALUES, and for the quantile p as many as have one above it.
+
+    One of 1 / (1 - p) values exceeds it; of fewer the quantile is about their largest.
+    """
+    percent = re.search(r"_p(\d+)$", response)
+    return max(MIN_VALUES, math.ceil(100 / (100 - int(percent[1])))) if percent else MIN_VALUES
 
 
 def radial_range(radial_deg: Floats, sky: bool) -> tuple[float, float]:
@@ -257,5 +270,5 @@ def caption(panels: Sequence[DirectionMap], figure: Map, study: Study, lines: Se
     text += f". Directions of the {axis_text}. n = {min(counts)} to {max(counts)} in a cell"
     if max(len(panel.cells) for panel in panels) <= MAX_NUMBERED:
         text += ", written in it"
-    text += f"; hatched: fewer than {MIN_VALUES}" if any(not cell.shown for cell in cells) else ""
+    text += f"; hatched: fewer than {least_values(figure.value)}" if any(not cell.shown for cell in cells) else ""
     return text + (". Circles: the worst." if any(panel.worst for panel in panels) else ".")

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
+
+import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.experiments.study.analysis.table import format_level
 from skysim.experiments.study.designs import Point, make_point
 from skysim.experiments.study.factors import Distribution, Factor, Range
-from skysim.experiments.study.loader import may_report_ambiguity
-from skysim.experiments.study.plan import Plan, resolve_point
+from skysim.experiments.study.loader import fixed_seeds, may_report_ambiguity
+from skysim.experiments.study.plan import FlightTrial, Plan, Trial, resolve_point
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation import checks
+from skysim.simulation.checks.facts import TRACKER_KNOWS, Fact
 from skysim.simulation.testbed import Testbed, build_testbed
 
 NUMBER = re.compile(r"\d[\d.]*")
@@ -30,33 +33,43 @@ class Overview(NamedTuple):
     rows     : names and texts of the scene table, for the first level of every factor
     findings : of the checks, each with the levels at which it was found
     may_be_ambiguous : whether the tracker can refuse a frame as ambiguous
+    fixed    : seeds of hardware that all trials share, see `loader.fixed_seeds`
     """
 
     rows: list[tuple[str, str]]
     findings: list[str]
     may_be_ambiguous: bool
+    fixed: tuple[str, ...] = ()
 
 
 def overview(plan: Plan) -> Overview:
     """The overview of a study; scenes that cannot be built are left out, as their trials tell why."""
     rows: list[tuple[str, str]] = []
     found: dict[str, list[tuple[str, str]]] = {}
-    checked, may_be_ambiguous = 0, False
+    checked, may_be_ambiguous, fixed = 0, False, dict[str, None]()
     for levels, point in checked_points(plan):
         if checked == MAX_CHECKED:
             break
         try:
-            scene, _ = resolve_point(plan.spec, plan.spec.trial_settings(point.settings, 0))
+            scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(point.settings, 0))
             testbed = build_testbed(scene, plan.spec.programs)
-            lines = checks.check(testbed).findings
+            found_here = checks.check(testbed, greatest_tilt_deg(scene, trial))
         except InputError:
             continue
         checked += 1
         may_be_ambiguous |= may_report_ambiguity(scene)
-        rows = rows or scene_rows(plan, testbed)
-        for line in lines:
+        fixed |= dict.fromkeys(fixed_seeds(plan.study, scene))
+        rows = rows or scene_rows(plan, testbed, found_here.facts)
+        for line in found_here.findings:
             found.setdefault(NUMBER.sub("#", line), []).append((line, levels))
-    return Overview(rows, [finding_text(at, checked) for at in found.values()], may_be_ambiguous)
+    findings = [finding_text(at, checked) for at in found.values()]
+    return Overview(rows, findings, may_be_ambiguous, tuple(fixed))
+
+
+def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:
+    """The greatest tilt of a trial's random attitudes under a dome; None if there are none."""
+    drawn = trial.start if isinstance(trial, FlightTrial) else trial
+    return None if drawn is None or not isinstance(scene.light, DomeConfig) else float(np.max(drawn.tilt_deg))
 
 
 def finding_text(at: list[tuple[str, str]], checked: int) -> str:
@@ -90,8 +103,8 @@ def options(factor: Factor) -> list[tuple[object, dict[str, object]]]:
 # The table.
 
 
-def scene_rows(plan: Plan, testbed: Testbed) -> list[tuple[str, str]]:
-    """The scene of a test bed, and how the study varies and repeats it."""
+def scene_rows(plan: Plan, testbed: Testbed, facts: Sequence[Fact]) -> list[tuple[str, str]]:
+    """The scene of a test bed, with what the check's facts say of its tracker; how the study varies and repeats it."""
     study, scene = plan.study, testbed.scene
     changed = "; ".join(f"{key}: {format_setting(value)}" for key, value in study.set.items())
     points = f"at each of {len(plan.points)} points" if plan.points else "a candidate"
@@ -102,6 +115,7 @@ def scene_rows(plan: Plan, testbed: Testbed) -> list[tuple[str, str]]:
         ("camera", camera_text(scene.camera)),
         ("exposure", f"{1e3 * scene.exposure.time_s:.4g} ms"),
         ("tracker", tracker_text(scene)),
+        *((fact.name, "; ".join(fact.lines)) for fact in facts if fact.name == TRACKER_KNOWS),
         ("trial", ", ".join(f"{key}: {format_setting(value)}" for key, value in plan.spec.trial.items())),
         *((f"varied: {name}", factor_text(factor)) for name, factor in study.factors.items()),
         ("trials", f"{study.replicates} {points}, {attitudes}; seed {study.seed}"),
@@ -134,16 +148,11 @@ def camera_text(camera: CameraConfig) -> str:
 
 
 def tracker_text(scene: Scene) -> str:
-    """The tracker's chain, and what its map of the dome errs by."""
-    tracker, survey = scene.tracker, scene.tracker.survey
+    """The tracker's chain."""
+    tracker = scene.tracker
     stages = ("detector", "centroider", "identifier", "solver")
     chosen = [f"{name} {getattr(tracker, name)}" for name in stages if getattr(tracker, name)]
-    text = tracker.name + (f": {', '.join(chosen)}" if chosen else ", default chain")
-    errors = {"LEDs": survey.led_sigma_m, "camera": survey.lever_sigma_m}
-    known = [f"{what} to {1e3 * sigma_m:.3g} mm" for what, sigma_m in errors.items() if sigma_m]
-    if isinstance(scene.light, DomeConfig):
-        text += f"; knows {', '.join(known)}" if known else "; knows every LED exactly"
-    return text
+    return tracker.name + (f": {', '.join(chosen)}" if chosen else ", default chain")
 
 
 def factor_text(factor: Factor) -> str:

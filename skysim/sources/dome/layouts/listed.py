@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +14,7 @@ from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import ListedConfig, relative_levels
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import (
+    Ints,
     check_cap,
     directions_from_angles,
     led_sources,
@@ -23,6 +26,16 @@ from skysim.sources.photometry import Band
 
 MAX_SURFACE_OFFSET_M = 0.05  # of a listed LED; more is an error in a unit or an axis
 COLUMNS = (("x_m", "y_m", "z_m"), ("azimuth_deg", "tilt_deg"))
+BRIGHTNESS = ("level", "magnitude")
+FURTHER = ("id", "tape", "tape_m", "sigma_m")  # `id` numbers the LEDs, the others are not used
+
+
+class LedFile(NamedTuple):
+    """A file of LEDs: (N, 3) places or (N, 2) azimuth and tilt; levels and numbers, (N,) each, if it has any."""
+
+    coordinates: Floats
+    level: Floats | None = None
+    id: Ints | None = None
 
 
 def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
@@ -31,10 +44,11 @@ def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -
     Normals are the surface's. Raises InputError for a place more than 5 cm off the surface or beyond the cap.
     """
     level: Floats | None = np.array(config.levels or relative_levels(config.magnitudes or ()))
+    number: Ints | None = None
     key = "light.layout.positions" if config.positions_m else "light.layout.directions_deg"
     if config.file:
         key = config.file
-        coordinates, level = read_csv(Path(config.file))
+        coordinates, level, number = read_csv(Path(config.file))
     else:
         coordinates = np.array(config.positions_m or config.directions_deg)
     directions = coordinates if coordinates.shape[1] == 3 else directions_from_angles(coordinates)
@@ -42,7 +56,9 @@ def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -
     place_m = coordinates if coordinates.shape[1] == 3 else project_from_bearing(surface, directions)
     check_on_surface(key, surface, place_m)
     level = level if level is not None and len(level) else np.ones(len(place_m))
-    return led_sources(on_surface(surface, place_m, level), led, band, random_stream(config.hardware_seed))
+    placed = on_surface(surface, place_m, level)
+    placed = placed if number is None else replace(placed, id=number)
+    return led_sources(placed, led, band, random_stream(config.hardware_seed))
 
 
 def check_on_surface(key: str, surface: Surface, place_m: Floats) -> None:
@@ -56,39 +72,65 @@ def check_on_surface(key: str, surface: Surface, place_m: Floats) -> None:
         )
 
 
-def read_csv(path: Path) -> tuple[Floats, Floats | None]:
+def read_csv(path: Path) -> LedFile:
     """Read a file of LEDs: columns x_m, y_m, z_m or azimuth_deg, tilt_deg; and level or magnitude, or neither.
 
-    Comments begin with #; the first other line holds the names. Returns (N, 3) or (N, 2), and levels (N,) or None.
-    Raises InputError, one line, with the line's number.
+    Comments begin with #; the first other line holds the names, in any order, separated by commas or, as in an ECSV of
+    `skysim survey`, by blanks. Places are used if there are directions too. Raises InputError, one line, with the
+    line's number.
     """
     try:
         text = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"light.layout.file: {path} cannot be read ({error})") from None
     lines = [(n, line) for n, line in enumerate(text, 1) if line.strip() and not line.startswith("#")]
-    names = tuple(name.strip() for name in lines[0][1].split(",")) if lines else ()
-    brightness = names[-1] if names and names[-1] in ("level", "magnitude") else ""
-    if names[: len(names) - bool(brightness)] not in COLUMNS or len(lines) < 2:
+    names = split_row(lines[0][1]) if lines else []
+    chosen = next((columns for columns in COLUMNS if set(columns) <= set(names)), None)
+    brightness = [name for name in names if name in BRIGHTNESS]
+    known = {*BRIGHTNESS, *FURTHER, *COLUMNS[0], *COLUMNS[1]}
+    if chosen is None or len(brightness) > 1 or len({*names}) < len(names) or {*names} - known or len(lines) < 2:
         raise InputError(
-            f"{path}: not a list of LEDs; allowed: columns {' or '.join(map(', '.join, COLUMNS))}, then"
-            " optionally level or magnitude; one LED per line"
+            f"{path}: not a list of LEDs; allowed: columns {' or '.join(map(', '.join, COLUMNS))}; optionally"
+            f" {' or '.join(BRIGHTNESS)}, {', '.join(FURTHER)}; one LED per line"
         )
-    table = np.array([parse_row(path, n, line, len(names), brightness) for n, line in lines[1:]])
-    if not brightness:
-        return table, None
-    last = table[:, -1]
-    return table[:, :-1], last if brightness == "level" else np.array(relative_levels(last.tolist()))
+    rows = [parse_row(path, n, line, names) for n, line in lines[1:]]
+    column = dict(zip(names, np.array(rows).T, strict=True))
+    level = column.get("level")
+    if "magnitude" in column:
+        level = np.array(relative_levels(column["magnitude"].tolist()))
+    return LedFile(np.column_stack([column[name] for name in chosen]), level, led_numbers(path, column.get("id")))
 
 
-def parse_row(path: Path, number: int, line: str, count: int, brightness: str) -> list[float]:
+def split_row(line: str) -> list[str]:
+    """The cells of a line, separated by commas or else by blanks."""
+    return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
+
+
+def led_numbers(path: Path, column: Floats | None) -> Ints | None:
+    """The LED numbers of a file's column `id`; None without one. Raises InputError for other numbers."""
+    if column is None:
+        return None
+    with np.errstate(invalid="ignore"):
+        number = column.astype(np.int64)
+    wrong = (number != column) | (number < 0)
+    repeated = np.ones(len(number), bool)
+    repeated[np.unique(number, return_index=True)[1]] = False
+    found = np.flatnonzero(wrong | repeated)
+    if len(found):
+        raise InputError(f"{path}: id {column[found[0]]:g}; allowed: whole numbers from 0, each once")
+    return number
+
+
+def parse_row(path: Path, number: int, line: str, names: list[str]) -> list[float]:
     """The numbers of one line of an LED file. Raises InputError."""
     try:
-        row = [float(cell) for cell in line.split(",")]
+        row = [float(cell) for cell in split_row(line)]
     except ValueError:
         row = []
-    if len(row) != count or not np.all(np.isfinite(row)) or (brightness == "level" and not 0 < row[-1] <= 1):
+    level = dict(zip(names, row, strict=False)).get("level", 1.0)
+    if len(row) != len(names) or not np.all(np.isfinite(row)) or not 0 < level <= 1:
         raise InputError(
-            f"{path}, line {number}: {line!r} is not an LED; allowed: {count} numbers, a level above 0 and at most 1"
+            f"{path}, line {number}: {line!r} is not an LED; allowed: {len(names)} numbers, a level above 0 and at most"
+            " 1"
         )
     return row

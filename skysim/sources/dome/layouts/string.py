@@ -41,9 +41,13 @@ class Meridian(NamedTuple):
 
 def string(config: StringConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
     """LEDs of a tape, one every pitch along the surface. Raises InputError for too long a tape."""
+    return lit_sources(config, surface, winding_m(config, surface), led, band)
+
+
+def winding_m(config: StringConfig, surface: Surface) -> Floats:
+    """(N, 3) places of all LEDs of a tape, in its order; an LED's number is its row. Raises as `string` does."""
     meridian = mean_meridian(surface, np.radians(config.cap_deg))
-    wind = {"latitude": circles, "spiral": spiral}[config.winding]
-    return lit_sources(config, surface, wind(config, surface, meridian), led, band)
+    return {"latitude": circles, "spiral": spiral}[config.winding](config, surface, meridian)
 
 
 def directions(tilt_rad: Floats, azimuth_rad: Floats) -> Floats:

@@ -7,6 +7,8 @@ shell bulges by 1.5e-4 of its radius at most.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,6 +49,23 @@ def check_room(room: RoomConfig, surface: Surface, cap_deg: float) -> None:
             )
     if room.door_m is not None:
         check_door(room, room.door_m, surface, cap_deg)
+
+
+def fit(room: RoomConfig, surface: Surface, cap_deg: float) -> dict[str, Any]:
+    """Size of a dome in its room, m.
+
+    extent_m : (3,) along x, y, z, thickness included
+    top_m, rim_m : above the floor, if the room has bearing_height
+    part_m   : sides of the box about the part that fits the door least, ascending, if the room has a door
+    """
+    points_m = shell_m(room, surface, cap_deg, np.linspace(0.0, 2 * np.pi, MERIDIANS, endpoint=False))
+    low_m, high_m = points_m.min(axis=0), points_m.max(axis=0)
+    found: dict[str, Any] = {"extent_m": (high_m - low_m).tolist()}
+    if room.bearing_height_m is not None:
+        found["top_m"], found["rim_m"] = (room.bearing_height_m + float(end_m[2]) for end_m in (high_m, low_m))
+    if room.door_m is not None:
+        found["part_m"] = largest_part_m(room, room.door_m, surface, cap_deg, room.segments)[0].tolist()
+    return found
 
 
 def check_door(room: RoomConfig, door_m: tuple[float, float], surface: Surface, cap_deg: float) -> None:

@@ -78,6 +78,16 @@ def led_covariance_m2(place_m: Floats, config: SurveyErrorsConfig) -> Floats | N
     return total_station.covariance_m2(config.instrument, place_m) + config.led_sigma_m**2 * np.eye(3)
 
 
+def across_sigma_m(place_m: Floats, covariance_m2: Floats) -> Floats:
+    """(N,) standard deviation of LEDs across the line from the bearing, per axis, from their (N, 3, 3) covariances.
+
+    sigma^2 = (trace C - u' C u) / 2, u the direction from the bearing. The error along u hardly moves an image.
+    """
+    along = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
+    along_m2 = np.einsum("ni,nij,nj->n", along, covariance_m2, along)
+    return np.asarray(np.sqrt((np.trace(covariance_m2, axis1=1, axis2=2) - along_m2) / 2))
+
+
 def common_displacements_m(surface: Surface, place_m: Floats, config: SurveyErrorsConfig) -> Floats | None:
     """(M, N, 3) displacement of each LED by one standard deviation of each error that all share; None without any.
 

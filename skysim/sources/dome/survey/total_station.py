@@ -117,4 +117,4 @@ def common_displacements_m(config: TotalStationConfig, place_m: Floats) -> Float
     fields += [sight_m, sight_m / np.linalg.norm(sight_m, axis=1, keepdims=True)]
     sizes = np.array([float(sigma) for sigma in setup_sigmas(config)]) * SETUP_UNITS
     chosen = [size * field for size, field in zip(sizes, fields, strict=True) if size]
-    return np.array(chosen).reshape(-1, *place_m.shape)
+    return np.array(chosen).reshape(len(chosen), *place_m.shape)
