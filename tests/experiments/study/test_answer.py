@@ -94,10 +94,49 @@ def test_ranges_name_the_points_of_the_extremes_and_pass_over_those_of_few_value
     few.responses["roll_arcsec_p95"] = Summary(1.0, math.nan, math.nan, 3, 56)
     told = answer.ranges(study(), [*lines, few])
     assert told == [
-        "identified: 0.015 (0.00511..0.0432) at leds = 200, to 1 (0.981..1) at leds = 900.",
+        "identified: 0.015 (0.00511..0.0432) at leds = 200, to 1 (0.985..1) at leds = 900.",
         "roll_arcsec_p95: 100 (90..350) at leds = 500, to 200 (90..350) at leds = 900.",
     ]
-    assert answer.ranges(study(), [few])[1] == "roll_arcsec_p95: 1 (needs 56 more)."
+    assert answer.ranges(study(), [few])[1] == "roll_arcsec_p95: 1 (needs 56 more values)."
+
+
+def test_the_next_claim_says_how_many_trials_it_needs() -> None:
+    """ln 0.05 / ln(1 - 0.001) is 2,994.2; what was seen at every point makes no claim."""
+    texts = answer.headline(study(), [line(0, 500, 1200), line(1, 900, 5000)], False)
+    assert said(texts, "None in") == (
+        "None in 1,200 is less than 0.25 % at 95 % confidence; a claim of less than 0.1 % needs 2,995 in all at each"
+        " point without any."
+    )
+    seen = line(0, 500, 1200, misidentified=1, roll_noise=1, wrong=1, ambiguous=1)
+    assert not [one for one in answer.headline(study(), [seen], False) if one.startswith("None in")]
+
+
+@pytest.mark.parametrize(
+    ("nees", "expected"),
+    [
+        ([(3.0, 2.8, 3.2), (3.1, 2.9, 3.3)], "Yes: NEES is 2.5 to 3.5 at all 2 points."),
+        (
+            [(3.0, 2.8, 3.2), (5.07, 4.6, 5.6)],
+            "No: too small by a factor of 1.3 at leds = 900 (NEES 5.07, 4.6 to 5.6; 3 if true), at 1 of 2 points.",
+        ),
+        (
+            [(0.75, 0.7, 0.8), (3.0, 2.8, 3.2)],
+            "No: too large by a factor of 2 at leds = 500 (NEES 0.75, 0.7 to 0.8; 3 if true), at 1 of 2 points.",
+        ),
+        (
+            [(3.0, 2.8, 3.2), (4.0, 2.0, 6.0)],
+            "Nothing says otherwise, but NEES is known to 2 to 6 only at leds = 900; more trials decide it.",
+        ),
+    ],
+)
+def test_claimed_errors_that_are_false_are_called_so(nees: list[tuple[float, float, float]], expected: str) -> None:
+    """The factor is sqrt(NEES / 3): 1.3 at 5.07, and 2 too large at 0.75."""
+    lines = [line(n, leds, 500) for n, leds in enumerate((500, 900))]
+    for one, values in zip(lines, nees, strict=True):
+        one.responses["nees"] = Summary(*values, 500)
+    texts = answer.headline(study(), lines, False)
+    assert said(texts, "Are the claimed errors true?") == f"Are the claimed errors true? {expected}"
+    assert len(answer.ranges(study(responses=["nees"]), lines)) == 1
 
 
 def test_before_the_first_trial_there_is_no_answer() -> None:

@@ -6,13 +6,13 @@ an error that the covariance allows). An event that was never seen has an upper 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from skysim.experiments.study.analysis import thresholds
+from skysim.experiments.study.analysis import claims, thresholds
 from skysim.experiments.study.analysis.axes import axis, distinct, unit_of
-from skysim.experiments.study.analysis.table import PointRow, format_level, format_summary, has_few_values
+from skysim.experiments.study.analysis.table import Place, PointRow, format_level, format_summary, has_few_values
 from skysim.experiments.study.factors import Value
 from skysim.experiments.study.plan import Study
 from skysim.results import metrics
@@ -23,7 +23,8 @@ EVENTS = {
     "roll_noise": "Roll noise (the right lights, but a roll error beyond 10′ that the covariance allows)",
     "wrong": "Wrong attitudes (an error beyond 10′ that the covariance does not allow, or beyond 1°)",
 }
-RESPONSES = (*EVENTS, "ambiguous")  # responses that the answers need besides those of the study
+SHARES = (*EVENTS, "ambiguous")
+RESPONSES = (*SHARES, "nees")  # responses that the answers need besides those of the study
 
 
 def headline(study: Study, lines: Sequence[PointRow], may_be_ambiguous: bool) -> list[str]:
@@ -42,17 +43,14 @@ def headline(study: Study, lines: Sequence[PointRow], may_be_ambiguous: bool) ->
         found.append(ambiguity(study, done, place))
     for name, text in EVENTS.items():
         found.append(event(text, [line.responses[name] for line in done], done, place))
-    return found
+    return [*found, *claims.runs_needed(done, SHARES), *claims.claimed_errors(done, place)]
 
 
 def ranges(study: Study, lines: Sequence[PointRow]) -> list[str]:
     """Smallest and largest value of each response over the points, but of those that the headline is about."""
     done = [line for line in lines if line.trials]
     place = placer(study, done)
-    return [response_range(name, done, place) for name in study.responses if name not in RESPONSES] if done else []
-
-
-Place = Callable[[PointRow], str]
+    return [response_range(name, done, place) for name in study.responses if name not in SHARES] if done else []
 
 
 def placer(study: Study, lines: Sequence[PointRow]) -> Place:
