@@ -277,6 +277,18 @@ def proportion_of_frames(hits: NDArray[Any], frames: NDArray[Any]) -> Summary:
     return summary._replace(low=low, high=high, trials=runs)
 
 
+def mismatched(c: Columns) -> Summary:
+    """Proportion of all matches of lights with stars or LEDs that are wrong.
+
+    Matches of one frame are not independent, so it has no interval.
+    """
+    known = np.isfinite(c["wrong_matches"]) & np.isfinite(c["matched"])
+    matches = np.sum(c["matched"][known] * c["frames"][known])  # `matched` is a mean over the frames of a flight
+    if not matches:
+        return NO_VALUE
+    return Summary(float(np.sum(c["wrong_matches"][known]) / matches), math.nan, math.nan, round(matches))
+
+
 PROPORTIONS: dict[str, Response] = {
     "overconfident": overconfident,
     "identified": lambda c: proportion_of_frames(c["solved"] - c["wrong"], c["frames"]),
@@ -284,6 +296,8 @@ PROPORTIONS: dict[str, Response] = {
     "refused": lambda c: proportion_of_frames(c["frames"] - c["solved"], c["frames"]),
     "ambiguous": lambda c: proportion_of_frames(c["ambiguous"], c["frames"]),
     "misidentified": lambda c: proportion_of_frames(c["misidentified"], c["frames"]),
+    "misled": lambda c: proportion_of_frames(c["misled"], c["frames"]),
+    "mismatched": mismatched,
     "roll_noise": lambda c: proportion_of_frames(c["roll_noise"], c["frames"]),
     "failed": lambda c: proportion(np.sum(c["frames"] == 0), len(c["frames"])),
 }
@@ -296,6 +310,8 @@ def response(name: str, where: str = "response") -> Response:
     identified, wrong, refused : proportions of the frames: solved and not wrong (`is_wrong`), wrong, without a solution
     ambiguous     : proportion of the frames refused because another attitude fits the lights as well (LEDs only)
     misidentified : proportion of the frames solved with a light that is matched with a wrong star or LED
+    misled        : proportion of the frames that are misidentified and have an error that the covariance does not allow
+    mismatched    : proportion of the matches that are wrong, of all frames; without an interval
     roll_noise    : proportion of the frames solved with the right lights and a roll error beyond ten arcminutes that
                     the tracker's covariance allows
     overconfident : proportion of the solutions with an error far outside their covariance

@@ -28,7 +28,7 @@ STUDY: dict[str, Any] = {
     "factors": {"leds": {"key": "light.layout.count", "values": [500, 900]}},
     "responses": ["identified", "roll_arcsec_p95", "misidentified"],
 }
-NEVER = {"misidentified": 0, "roll_noise": 0, "wrong": 0, "ambiguous": 0, "identified": 0}
+NEVER = {"misidentified": 0, "roll_noise": 0, "misled": 0, "wrong": 0, "ambiguous": 0, "identified": 0}
 
 
 def study(**keys: Any) -> Study:
@@ -51,20 +51,19 @@ def test_nowhere_ambiguous_has_a_confidence() -> None:
     """1 - 0.05^(1 / 10,000) is 0.02995 %."""
     texts = answer.headline(study(), [line(0, 500, 10_000)], True)
     assert said(texts, "Is it ambiguous anywhere?") == (
-        "Is it ambiguous anywhere? No. Ambiguous or misidentified:"
-        " none in 10,000 (less than 0.03 % at 95 % confidence)."
+        "Is it ambiguous anywhere? No. Ambiguous or misled: none in 10,000 (less than 0.03 % at 95 % confidence)."
     )
     assert pytest.approx(0.0002995, abs=1e-7) == 1 - 0.05 ** (1 / 10_000)
     assert [one for one in answer.headline(study(), [line(0, 500, 10_000)], False) if "ambiguous" in one] == []
 
 
 def test_ambiguous_somewhere_says_where_and_how_sure_it_is_of_the_rest() -> None:
-    """Misidentified attitudes count as ambiguous ones that the tracker did not notice."""
-    lines = [line(0, 500, 200, ambiguous=20, misidentified=10), line(1, 900, 400)]
+    """Misled attitudes count as ambiguous ones that the tracker did not notice."""
+    lines = [line(0, 500, 200, ambiguous=20, misled=10), line(1, 900, 400)]
     interval = metrics.proportion(30, 200)
     text = said(answer.headline(study(), lines, True), "Is it ambiguous anywhere?")
     assert text == (
-        "Is it ambiguous anywhere? Yes. Ambiguous or misidentified: at 1 of 2 points, most at leds = 500: 15 % of the"
+        "Is it ambiguous anywhere? Yes. Ambiguous or misled: at 1 of 2 points, most at leds = 500: 15 % of the"
         f" frames ({100 * interval.low:.3g} to {100 * interval.high:.3g} %); none in 400 (less than 0.75 % at 95 %"
         " confidence) at the other points."
     )
@@ -80,6 +79,19 @@ def test_misidentification_and_roll_noise_are_kept_apart() -> None:
 def test_the_fewest_trials_of_a_point_bound_what_was_never_seen() -> None:
     texts = answer.headline(study(), [line(0, 500, 100), line(1, 900, 1000)], False)
     assert said(texts, "Misidentified").endswith("none in 100 a point (less than 3 % at 95 % confidence).")
+
+
+def test_wrong_matches_are_counted_and_their_effect_on_the_attitude() -> None:
+    """One of 90 matches is wrong in 25 of 200 frames: not an alarm if the errors are as claimed."""
+    one, other = line(0, 500, 200, misidentified=25), line(1, 900, 200)
+    for point, share in ((one, 25 / 18_000), (other, 0.0)):
+        point.responses["mismatched"] = Summary(share, math.nan, math.nan, 18_000)
+    texts = answer.headline(study(), [one, other], True)
+    assert "There 25 of 18,000 matches are wrong; the attitude is unaffected: all errors are as claimed." in texts
+    assert said(texts, "Is it ambiguous anywhere?").startswith("Is it ambiguous anywhere? No.")
+    one.responses["misled"] = metrics.proportion(10, 200)
+    (text,) = [text for text in answer.headline(study(), [one, other], True) if text.startswith("There 25")]
+    assert "the attitude errs more than claimed at 1 of 2 points, most at leds = 500: 5 % of the frames (2.74" in text
 
 
 def test_a_tracker_that_does_not_name_its_lights_is_not_called_right() -> None:
@@ -107,7 +119,7 @@ def test_the_next_claim_says_how_many_trials_it_needs() -> None:
         "None in 1,200 is less than 0.25 % at 95 % confidence; a claim of less than 0.1 % needs 2,995 in all at each"
         " point without any."
     )
-    seen = line(0, 500, 1200, misidentified=1, roll_noise=1, wrong=1, ambiguous=1)
+    seen = line(0, 500, 1200, misidentified=1, misled=1, roll_noise=1, wrong=1, ambiguous=1)
     assert not [one for one in answer.headline(study(), [seen], False) if one.startswith("None in")]
 
 

@@ -51,12 +51,16 @@ def test_responses_are_of_what_their_names_say():
         stars=[7, 5, 4, 2, np.nan],
         ambiguous=[0, 0, 0, 1, 0],
         misidentified=[0, 0, 1, 0, np.nan],
+        misled=[0, 0, 1, 0, np.nan],
+        wrong_matches=[0, 0, 3, 0, np.nan],
+        matched=[9, 0, 20, 1, 5],
         roll_noise=[1, 0, 0, 0, np.nan],
         streak_px=[1, 2, 6, 3, np.nan],
         centroid_px=[1, 1, 7, np.nan, np.nan],
     )
     said = {
-        **{"ambiguous": 1 / 4, "misidentified": 1 / 4, "roll_noise": 1 / 4},
+        **{"ambiguous": 1 / 4, "misidentified": 1 / 4, "misled": 1 / 4, "roll_noise": 1 / 4},
+        "mismatched": 3 / 30,
         **{"streak_px": 2.5, "centroid_px": math.sqrt(17), "nees": 33335.333333333336, "streak_px_worst": 6},
         **{"identified": 2 / 4, "wrong": 1 / 4, "refused": 1 / 4, "failed": 1 / 5, "overconfident": 1 / 3},
         **{"coverage": 2 / 4, "coverage_3": 3 / 4, "stars_least": 2, "stars_mean": 4.5},

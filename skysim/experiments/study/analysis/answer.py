@@ -19,12 +19,12 @@ from skysim.results import metrics
 from skysim.results.metrics import Summary
 
 EVENTS = {
-    "misidentified": "Misidentified (a light matched with a wrong star or LED)",
+    "misidentified": "Misidentified (at least one light matched with a wrong star or LED)",
     "roll_noise": "Roll noise (the right lights, but a roll error beyond 10′ that the covariance allows)",
     "wrong": "Wrong attitudes (an error beyond 10′ that the covariance does not allow, or beyond 1°)",
 }
-SHARES = (*EVENTS, "ambiguous")
-RESPONSES = (*SHARES, "nees")  # responses that the answers need besides those of the study
+SHARES = (*EVENTS, "ambiguous", "misled")
+RESPONSES = (*SHARES, "mismatched", "nees")  # responses that the answers need besides those of the study
 
 
 def headline(study: Study, lines: Sequence[PointRow], may_be_ambiguous: bool) -> list[str]:
@@ -43,7 +43,8 @@ def headline(study: Study, lines: Sequence[PointRow], may_be_ambiguous: bool) ->
         found.append(ambiguity(study, done, place))
     for name, text in EVENTS.items():
         found.append(event(text, [line.responses[name] for line in done], done, place))
-    return [*found, *claims.runs_needed(done, SHARES), *claims.claimed_errors(done, place)]
+        found += claims.effect_of_wrong_matches(done, place) if name == "misidentified" else []
+    return [*found, *claims.runs_needed(done, list(EVENTS)), *claims.claimed_errors(done, place)]
 
 
 def ranges(study: Study, lines: Sequence[PointRow]) -> list[str]:
@@ -92,15 +93,15 @@ def event(text: str, shares: Sequence[Summary], lines: Sequence[PointRow], place
 
 
 def ambiguity(study: Study, lines: Sequence[PointRow], place: Place) -> str:
-    """Whether the lights of some attitude fit another one as well: refused as ambiguous, or misidentified."""
+    """Whether the lights of some attitude fit another one as well: refused as ambiguous, or misled."""
     shares = []
     for line in lines:
-        refused, wrong = line.responses["ambiguous"], line.responses["misidentified"]
+        refused, wrong = line.responses["ambiguous"], line.responses["misled"]
         either = refused.value + np.nan_to_num(wrong.value)
         share = metrics.proportion(round(either * refused.trials), refused.trials)
         shares.append(share._replace(value=either))
     unit = ", each with hardware of its own" if study.hardware else ""
-    text = event("Ambiguous or misidentified", shares, lines, place)
+    text = event("Ambiguous or misled", shares, lines, place)
     never = all(share.value == 0 for share in shares)
     return f"Is it ambiguous anywhere{unit}? {'No' if never else 'Yes'}. {text}"
 

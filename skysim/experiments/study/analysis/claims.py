@@ -47,6 +47,23 @@ def claimed_errors(lines: Sequence[PointRow], place: Place) -> list[str]:
     ]
 
 
+def effect_of_wrong_matches(lines: Sequence[PointRow], place: Place) -> list[str]:
+    """How many matches are wrong, and whether the attitude errs more than claimed because of them; none if none are."""
+    shares = [one for line in lines if (one := line.responses.get("mismatched", metrics.NO_VALUE)).value > 0]
+    if not shares:
+        return []
+    matches = sum(one.trials for one in shares)
+    count = round(sum(one.value * one.trials for one in shares))
+    text = f"There {count:,} of {matches:,} matches {'is' if count == 1 else 'are'} wrong"
+    misled = [(one, line) for line in lines if (one := line.responses["misled"]).value > 0]
+    if not misled:
+        return [f"{text}; the attitude is unaffected: all errors are as claimed."]
+    most, line = max(misled, key=lambda pair: pair[0].value)
+    at = f" at {len(misled)} of {len(lines)} points, most at {place(line)}:" if len(lines) > 1 else " in"
+    share = f"{100 * most.value:.3g} % of the frames ({100 * most.low:.3g} to {100 * most.high:.3g} %)"
+    return [f"{text}; the attitude errs more than claimed{at} {share}."]
+
+
 def everywhere(points: int) -> str:
     """ " at all 5 points"; empty for one."""
     return f" at all {points} points" if points > 1 else ""
