@@ -277,9 +277,9 @@ def summarize_flight(testbed: Testbed, outcomes: list[Outcome], settle_s: float)
         rms(pointing),
         float(pointing.max()) if len(pointing) else math.nan,
         sum(one.ambiguous for one in outcomes),
-        *(sum(getattr(one, name) for one in outcomes) if outcomes else math.nan for name in IDENTITY),
-        rms(finite([one.centroid_px for one in outcomes])),
-        mean(finite([one.streak_px for one in outcomes])),
+        **{name: sum(getattr(one, name) for one in outcomes) if outcomes else math.nan for name in IDENTITY},
+        centroid_px=rms(finite([one.centroid_px for one in outcomes])),
+        streak_px=mean(finite([one.streak_px for one in outcomes])),
         **{name: getattr(worst, name) for name in DIRECTION},
     )
 
