@@ -19,6 +19,8 @@ A known error is one of the second kind with p = 1. With G_i the derivative of x
     surface survey : E_i = sigma G_i R n_i, n_i the normal   focal length : E_i = relative error (x_i - center)
     survey rotation r : E_i = G_i R (r x P_i)                distortion, star places : difference of the image positions
     rolling shutter : E_i = velocity times the row's delay from the middle row
+    angular acceleration a : E_i = -J_i a T^2 / 24 against the attitude at mid-exposure: the images are rotated by
+        rate t + a t^2 / 2 at the time t from it, and the mean of t^2 / 2 over an exposure T is T^2 / 24
 
 The error of a solver's own approximation (thesis, infinity, ...) is what it errs for exact rays. `pnp` also fits the
 camera's place, so its J_i has three more columns. Variances about x and y add up to cross, that about z is roll.
@@ -163,6 +165,10 @@ def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Com
     return Common((view.streak_px / context.testbed.scene.exposure.time_s * delay_s[:, None])[:, :, None])
 
 
+def angular_acceleration(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    return Common(view.bend_px[:, :, None]) if view.bend_px.any() else None
+
+
 def displacement(view: View, shift_lab: Floats, lab_from_cam: Rotation) -> Common:
     """The displacement of the images by shifts (n, 3) of the lights in lab axes."""
     return Common(np.einsum("nij,nj->ni", view.gradient, lab_from_cam.inv().apply(shift_lab))[:, :, None])
@@ -179,6 +185,7 @@ CAUSES: dict[str, Callable[[View, Rotation, Context], Independent | Common | Non
     "distortion": distortion,
     "star places": star_places,
     "rolling shutter": rolling_shutter,
+    "angular acceleration": angular_acceleration,
 }
 UNKNOWN_TO_TRACKER = ("focal length", "distortion", "assumed lever", "rolling shutter")
 CENTROIDS, SOLVER = "centroid noise", "solver"  # the causes that are not displacements of all images

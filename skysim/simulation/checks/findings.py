@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from skysim.scene.scene import Scene
-from skysim.scene.sections.camera import TwoStopsConfig
+from skysim.scene.sections.camera import RollingShutterConfig, TwoStopsConfig
 from skysim.scene.sections.layouts import FibersConfig, Layout, LcdConfig
 from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes
@@ -198,9 +198,17 @@ def not_where_expected(context: Context, samples: Samples) -> str:
         f"{100 * beyond:.0f} % of the images are up to {short(residual_px.max(), 2)} px from where the tracker expects"
         f" them, beyond its matching radius of {short(np.median(gate_px), 2)} px"
     )
+    rate_deg_s = float(np.degrees(np.linalg.norm(frames.attitudes.rate_body_rad_s, axis=1)).max())
     cause = max(found[0].by_cause, key=lambda name: max(one.by_cause[name] for one in found))
+    text += f", at up to {rate_deg_s:.3g} deg/s" if cause == "rolling shutter" else ""
     excess = float(np.quantile(residual_px / gate_px, 1 - MAX_BEYOND))
     return f"{MISMATCH_KEYS[cause]}: {text}; {CHANGES[cause](scene, excess)}"
+
+
+def row_time_us(scene: Scene) -> float:
+    """The row time of a rolling shutter; 0 for another one."""
+    shutter = scene.camera.shutter
+    return 1e6 * shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0
 
 
 MISMATCH_KEYS = {
@@ -215,8 +223,9 @@ CHANGES: dict[str, Callable[[Scene, float], str]] = {
     "distortion": lambda scene, excess: f"change it to {list(scene.camera.distortion)}, the lens's",
     "assumed lever": lambda scene, excess: "leave it out, or fit the place with tracker.solver: pnp",
     "rolling shutter": lambda scene, excess: (
-        f"change it to {{kind: global}}, or turn {short(excess, 2)} times slower: rows are read one after another, and"
-        " the tracker takes them as simultaneous"
+        f"turn {short(excess, 2)} times slower, or change row_time to {short(row_time_us(scene) / excess, 2)} us if the"
+        " chip can: rows are read one after another, and the tracker does not correct for it (a gyro changes nothing);"
+        " a camera with shutter {kind: global} has no such error"
     ),
 }
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from skysim.camera import wcs
+from skysim.core.types import Floats
 from skysim.dynamics import guidance
 from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, dome, lookalike
@@ -30,8 +33,10 @@ class Check(NamedTuple):
         return {"facts": numbers, "findings": self.findings}
 
 
-def check(testbed: Testbed) -> Check:
+def check(testbed: Testbed, rate_body_rad_s: Floats | None = None) -> Check:
     """Check the plan of a test bed whose motion need not be simulated.
+
+    rate_body_rad_s : (3,) rate of all frames in body axes, in place of the motion's, for trials of single frames
 
     Raises InputError for unreadable files, and for a maneuver that a run would refuse.
     """
@@ -41,6 +46,9 @@ def check(testbed: Testbed) -> Check:
         return Check([], first)  # all else assumes that the camera is inside
     context = context_of(testbed)
     frames = attitudes.of_frames(testbed)
+    if rate_body_rad_s is not None:
+        rates = np.tile(rate_body_rad_s, (len(frames.t_s), 1))
+        frames = frames._replace(rate_body_rad_s=rates, acceleration_body_rad_s2=None)
     check_reference(guidance.plan(scene.motion, testbed.trajectory.lab_from_body[0], testbed.profiles), testbed)
     reach = attitudes.within_reach(scene, testbed.mount, frames)
     samples = Samples(sampled(frames, context), sampled(reach, context))
