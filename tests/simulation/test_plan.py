@@ -17,7 +17,7 @@ from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.dynamics import multibody
 from skysim.scene import loader
 from skysim.simulation import exposure, run
-from skysim.simulation.checks import attitudes, check, detection, facts, findings, plan
+from skysim.simulation.checks import attitudes, check, claims, depth, detection, facts, plan
 from skysim.simulation.checks.facts import Fact, Samples
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking.factory import solve_frame
@@ -241,6 +241,9 @@ def test_a_solver_s_own_error_is_a_cause() -> None:
         ),
         ("shefex2", {"camera__vignetting": TWO_STOPS}, "camera.vignetting.cutoff_deg", "the lens is dark beyond 4 deg"),
         ("shefex2", {"light__limit_mag": "4"}, "light.limit_mag", "of the directions in reach"),
+        ("shefex2", {"light__limit_mag": "5.9"}, "light.limit_mag", "the sky ends at V 5.9"),
+        ("shefex2", {"camera__preset": "imx174"}, "tracker.limit_mag", "knows them to V 5.8 only, 9 % of them"),
+        ("shefex2", {"camera__detector__prnu": "0.1"}, "tracker.centroid_sigma_px", "1.3 times too small (NEES 5.4"),
         ("shefex2", {"tracker__limit_mag": "3"}, "tracker.limit_mag", "of the directions in reach"),
         ("afit_simsat", {"tracker__brightest": "3"}, "tracker.brightest", "the tracker uses 3 lights"),
         ("shefex2", {"tracker__threshold_sigma": "500"}, "tracker.threshold_sigma", "below the threshold of 500 sigma"),
@@ -351,7 +354,7 @@ def test_fields_alike_are_those_that_the_tracker_refuses_as_ambiguous(layout: st
 def test_half_of_the_stars_at_the_limit_are_detected() -> None:
     """The limit that `light.catalog` is compared with, on rendered frames: most brighter by half a magnitude are."""
     testbed = bed("shefex2", exposure__frames="1", motion__rate_deg_s="[0, 0, 0]")
-    limit = findings.detection_limit_mag(*samples_of(testbed))
+    limit = depth.detection_limit_mag(*samples_of(testbed))
     tracker, rng, found, faint = build_tracker(testbed), np.random.default_rng(3), [], []
     for n in range(6):
         still = testbed.in_run(n).at_rest(Rotation.random(rng=rng))
@@ -363,6 +366,28 @@ def test_half_of_the_stars_at_the_limit_are_detected() -> None:
         faint += near[np.abs(v_mag - limit - 0.5) < 0.25].tolist()
     assert np.mean(found) > 0.7
     assert np.mean(faint) < 0.3
+
+
+def test_the_star_of_a_signal_to_noise_of_five_is_that_of_the_truth_table() -> None:
+    """V at which the rendered frames' stars pass 5, by their own color, against a star like the Sun: to 0.3 mag."""
+    testbed = bed("shefex2", exposure__frames="1")
+    limit = fact(check(testbed), "faintest star").values["snr_5_v_mag"]
+    magnitude = dict(zip(testbed.sources.id.tolist(), testbed.sources.magnitude.tolist(), strict=True))
+    _, truth = exposure.render_frame(run.simulate_motion(testbed), 0)
+    v_mag = np.array([magnitude[hip] for hip in truth.sources.id.tolist()])
+    near = np.abs(truth.sources.snr - 5) < 0.7
+    assert near.sum() > 10
+    assert np.median(v_mag[near]) == pytest.approx(limit, abs=0.3)
+
+
+def test_a_floor_that_the_check_proposes_makes_the_claims_true() -> None:
+    """Of a chip whose pixels differ by 10 %, NEES is 5.4 as expected and 5.7 (median of 40 frames) as measured."""
+    floor_px = 0.02
+    nees = [
+        claims.claimed(*samples_of(bed("shefex2", camera__detector__prnu="0.1", tracker__centroid_sigma_px=str(px))))
+        for px in (0.007, floor_px)
+    ]
+    assert nees == [pytest.approx(5.4, abs=0.3), pytest.approx(3, abs=0.15)]
 
 
 @pytest.mark.slow

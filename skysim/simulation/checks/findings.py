@@ -10,10 +10,9 @@ import numpy as np
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig, TwoStopsConfig
 from skysim.scene.sections.layouts import FibersConfig, Layout, LcdConfig
-from skysim.scene.sections.light import DomeConfig, StarsConfig
+from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import (
-    BINOMIAL_VARIANCE_PX2,
     Context,
     detected_area_px,
     full_scale_e,
@@ -21,8 +20,6 @@ from skysim.simulation.checks.detection import (
 )
 from skysim.simulation.checks.expected_error import mismatch
 from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, Samples, cap_margin, fill, short
-from skysim.simulation.checks.views import peak_share
-from skysim.sources.photometry import SUN, star_flux_e_s_m2
 
 MAX_SATURATED = 0.25  # fraction of saturated lights that gives no warning: a bright star or LED now and then
 TARGET_FILL = 0.7  # of full well, for the light that a fraction MAX_SATURATED exceeds
@@ -35,8 +32,6 @@ MAX_BEYOND = 0.25  # fraction of the images that may lie beyond the tracker's ma
 MAX_SMEAR_PX, MAX_SMEAR_WIDTHS = 4.0, 2.0  # a path that is longer than both gives a warning; in widths of the image
 MAX_DEFOCUS = 0.5  # width of the defocus disk over that of the image in focus
 MIN_DEFOCUS_PX = 1.0
-LIMIT_MARGIN_MAG = 0.3  # by which the camera may see fainter stars than the sky holds
-DEEPEST_V = 10.0  # of a sky that `skysim catalog build` makes
 
 
 def saturation(context: Context, samples: Samples) -> str:
@@ -277,36 +272,6 @@ def long_smear(context: Context, samples: Samples) -> str:
     )
 
 
-def sky_too_shallow(context: Context, samples: Samples) -> str:
-    """Warn where the camera detects fainter stars than the simulated sky holds."""
-    light, sky = context.testbed.scene.light, context.testbed.sources.magnitude
-    if not isinstance(light, StarsConfig) or light.limit_mag is not None or not len(sky):
-        return ""
-    limit_mag, faintest_mag = detection_limit_mag(context, samples), float(np.nanmax(sky))
-    if limit_mag <= min(faintest_mag + LIMIT_MARGIN_MAG, DEEPEST_V):
-        return ""
-    wanted = min(math.ceil(2 * limit_mag) / 2, DEEPEST_V)
-    return (
-        f"light.catalog: the camera detects stars to V {limit_mag:.1f}, but the sky ends at V {faintest_mag:.1f};"
-        f" change it to a file of `skysim catalog build --source gaia --limit {wanted:g}`"
-    )
-
-
-def detection_limit_mag(context: Context, samples: Samples) -> float:
-    """V of the faintest star like the Sun that is detected at the slowest frame, about half of such stars being so.
-
-    A Gaussian of variance s^2 has the least area A above the threshold T if its peak is T exp(A / (2 pi s^2)), see
-    `detection.detected_area_px`.
-    """
-    camera, lengths = context.camera, [np.median(view.streak_length_px) for view in samples.frames.seen if len(view)]
-    blur2_px2 = camera.lens_px**2 + BINOMIAL_VARIANCE_PX2
-    peak_e = threshold_e(context) * math.exp(context.settings.min_area_px / (2 * math.pi * blur2_px2))
-    none = np.zeros(1)
-    share = peak_share(np.array([blur2_px2]), none, none, np.array([min(lengths, default=0.0)]))[0]
-    reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.testbed.band))
-    return 2.5 * math.log10(reference_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s * share / peak_e)
-
-
 FINDINGS: tuple[Callable[[Context, Samples], str], ...] = (
     bright_background,
     saturation,
@@ -317,5 +282,4 @@ FINDINGS: tuple[Callable[[Context, Samples], str], ...] = (
     out_of_focus,
     long_smear,
     not_where_expected,
-    sky_too_shallow,
 )

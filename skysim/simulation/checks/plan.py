@@ -10,7 +10,7 @@ from skysim.camera import wcs
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
 from skysim.scene.sections.light import DomeConfig, StarsConfig
-from skysim.simulation.checks import attitudes, dome, lookalike
+from skysim.simulation.checks import attitudes, claims, depth, dome, lookalike
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, context_of, usable
 from skysim.simulation.checks.expected_error import expected
@@ -19,6 +19,8 @@ from skysim.simulation.checks.findings import FINDINGS
 from skysim.simulation.checks.views import views
 from skysim.simulation.reference_limits import check_reference
 from skysim.simulation.testbed import Testbed
+
+SKY_FINDINGS = (depth.sky_too_shallow, depth.tracker_too_shallow, claims.floor_too_small)
 
 
 class Check(NamedTuple):
@@ -52,8 +54,10 @@ def check(testbed: Testbed, rate_body_rad_s: Floats | None = None) -> Check:
     check_reference(guidance.plan(scene.motion, testbed.trajectory.lab_from_body[0], testbed.profiles), testbed)
     reach = attitudes.within_reach(scene, testbed.mount, frames)
     samples = Samples(sampled(frames, context), sampled(reach, context))
-    facts = [fact for build in FACTS if (fact := build(context, samples)) is not None]
-    findings = [line for find in FINDINGS if (line := find(context, samples))]
+    facts = [
+        fact for build in (*FACTS, depth.faintest_star, claims.fact) if (fact := build(context, samples)) is not None
+    ]
+    findings = [line for find in (*FINDINGS, *SKY_FINDINGS) if (line := find(context, samples))]
     alike = lookalike.of(context, samples)
     if alike is not None and isinstance(scene.light, DomeConfig):
         facts.insert(2, lookalike.fact(alike))
