@@ -37,7 +37,8 @@ class Outcome:
     frames, solved, wrong : number of frames, of solved frames, and of wrong solutions (`metrics.is_wrong`)
     x_arcsec, y_arcsec, roll_arcsec : error in camera axes, signed (RMS for a flight); NaN without a solution
     nees     : e^T P^-1 e with three degrees of freedom and the tracker's covariance P; mean for a flight
-    stars    : true sources on the detector, minimum for a flight.  detected, matched : numbers, means for a flight
+    stars    : true sources on the detector, minimum for a flight
+    detected, matched : numbers of detections and of lights matched with a star or LED, means for a flight
     availability : fraction of a flight's ticks with a filter error below ten arcminutes; without a filter, fraction
                of its frames solved correctly
     filter_arcsec, filter_worst_arcsec : angular error of a flight's filter, RMS and worst
