@@ -313,6 +313,11 @@ def test_the_brightest_hundred_of_many_lights_are_no_fault() -> None:
     assert not [line for line in result.findings if "detects" in line]
 
 
+def test_only_an_led_s_image_has_the_part_of_an_led(afit: plan.Check) -> None:
+    assert ", LED 2" in fact(afit, "image size").lines[0]
+    assert "LED" not in fact(check(bed("shefex2")), "image size").lines[0]
+
+
 def test_the_rate_at_which_an_image_is_as_long_as_wide_is_told() -> None:
     result = check(bed("shefex2"))
     rate_deg_s, width_px = (

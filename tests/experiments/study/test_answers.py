@@ -195,6 +195,20 @@ def test_exports_say_what_the_store_says(tmp_path):
     assert not list(tmp_path.glob(".*"))
 
 
+def test_a_csv_leaves_out_what_no_trial_has(tmp_path):
+    """A study of centroids has no pointing error and no streak; the columns that are left are the store's, in order."""
+    told, kept = done(tmp_path, STUDY)
+    with kept as rows:
+        export.export(rows, told.study.responses, tmp_path / "trials.csv")
+        columns = table.trial_columns(rows)
+    written = (tmp_path / "trials.csv").read_text().splitlines()[0].split(",")
+    empty = {"pointing_arcsec", "filter_arcsec", "streak_px", "body_tilt_deg"}
+    assert empty <= set(columns)
+    assert empty & set(written) == set()
+    assert {"trial", "status", "x_arcsec", "boresight_ra_deg", "strays"} <= set(written)
+    assert written == [name for name in columns if name in written]
+
+
 @pytest.mark.slow
 def test_a_trial_is_replayed_with_its_frames(tmp_path):
     told, kept = done(tmp_path, STUDY)
