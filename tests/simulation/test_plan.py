@@ -17,8 +17,9 @@ from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.dynamics import multibody
 from skysim.scene import loader
 from skysim.simulation import exposure, run
-from skysim.simulation.checks import attitudes, check, claims, depth, detection, facts, plan
+from skysim.simulation.checks import attitudes, check, detection, facts, plan
 from skysim.simulation.checks.facts import Fact, Samples
+from skysim.simulation.checks.sky import claims, depth
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking.factory import solve_frame
 

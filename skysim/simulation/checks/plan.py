@@ -10,12 +10,13 @@ from skysim.camera import wcs
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
 from skysim.scene.sections.light import DomeConfig, StarsConfig
-from skysim.simulation.checks import attitudes, claims, depth, dome, lookalike
+from skysim.simulation.checks import attitudes, dome, lookalike
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, context_of, usable
 from skysim.simulation.checks.expected_error import expected
 from skysim.simulation.checks.facts import FACTS, Fact, Sampled, Samples
 from skysim.simulation.checks.findings import FINDINGS
+from skysim.simulation.checks.sky import claims, depth
 from skysim.simulation.checks.views import views
 from skysim.simulation.reference_limits import check_reference
 from skysim.simulation.testbed import Testbed

@@ -136,6 +136,11 @@ def test_the_next_claim_says_how_many_trials_it_needs() -> None:
             "No: too large by a factor of 2 at leds = 500 (NEES 0.75, 0.7 to 0.8; 3 if true), at 1 of 2 points.",
         ),
         (
+            [(3.0, 2.8, 3.2), (1e4, math.nan, math.nan)],
+            "No: too small by a factor of 58 at leds = 900 (NEES 1e+04, 1e+04 to 1e+04; 3 if true), at 1 of 2 points.",
+        ),
+        ([(3.0, 2.8, 3.2), (9.0, math.nan, math.nan)], "Yes: NEES is 2.5 to 3.5."),
+        (
             [(3.0, 2.8, 3.2), (4.0, 2.0, 6.0)],
             "Nothing says otherwise, but NEES is known to 2 to 6 only at leds = 900; more trials decide it.",
         ),
