@@ -53,7 +53,7 @@ def overview(plan: Plan) -> Overview:
         try:
             scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(point.settings, 0))
             testbed = build_testbed(scene, plan.spec.programs)
-            lines = checks.check(testbed, trial_rate_rad_s(trial, testbed)).findings
+            lines = checks.check(testbed, rate_body_rad_s=trial_rate_rad_s(trial, testbed)).findings
         except InputError:
             continue
         checked += 1
