@@ -64,10 +64,11 @@ docs: $(READY)
 	$(PIP) -e '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-# The pages of commands and keys, from the code.
+# The pages of commands, keys and responses, from the code.
 reference: $(READY)
 	$(BIN)/python docs/site/commands.py
 	$(BIN)/python docs/site/keys.py
+	$(BIN)/python docs/site/responses.py
 
 figures: $(READY)
 	$(BIN)/python docs/site/figures.py

@@ -98,7 +98,7 @@ TEXTS = {
     "optimize.objectives.response": "a response, or `cost`",
     "optimize.constraints.response": "a response, or `cost`",
     "set": "a section: dotted keys of the scene and their values",
-    "responses": "a list of names, see [`skysim.results.metrics.response`](running.md)",
+    "responses": "a list of [responses](responses.md)",
 }
 
 

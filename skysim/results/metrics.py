@@ -3,7 +3,7 @@
 A statistic is named by a string (`response`), for example `cross_arcsec_p95` or `coverage_5`. Each is computed from
 the columns of a table of trials and returned with a 95% confidence interval: Wilson's interval for proportions, the
 percentile bootstrap for means and RMS, and order statistics for quantiles. Clopper and Pearson's exact bounds are used
-where a claim must hold: that an event never occurs, or that a proportion is on one side of a limit.
+where a claim must hold: that an event never occurs (or always), or that a proportion is on one side of a limit.
 """
 
 from __future__ import annotations
@@ -92,19 +92,24 @@ def exact(value: float) -> Summary:
 
 
 def proportion(hits: Any, total: Any) -> Summary:
-    """The proportion hits / total with Wilson's interval (Wilson 1927), which is valid at 0 and at 1 too."""
+    """The proportion hits / total with Wilson's interval (Wilson 1927).
+
+    At 0 and at 1 there is one end only: the exact one-sided bound (`exact_bounds`), which every claim that an event
+    never occurs uses too.
+    """
     if total < 1:
         return NO_VALUE
+    if hits in (0, total):
+        return Summary(float(hits / total), *exact_bounds(int(hits), int(total)), int(total))
     value, z2 = float(hits / total), SIGMAS**2
     scale = 1 + z2 / total
     middle = (value + z2 / (2 * total)) / scale
     half = SIGMAS / scale * math.sqrt(value * (1 - value) / total + z2 / (4 * total**2))
-    low, high = (middle - half if hits else 0.0), (middle + half if hits < total else 1.0)
-    return Summary(value, low, high, int(total))
+    return Summary(value, middle - half, middle + half, int(total))
 
 
 @lru_cache(maxsize=4096)
-def exact_bounds(hits: int, total: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+def exact_bounds(hits: float, total: float, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """One-sided bounds of a proportion, each at this confidence (Clopper & Pearson 1934).
 
     The upper one is the p for which hits or fewer of total have the probability 1 - confidence, the lower one
@@ -115,6 +120,11 @@ def exact_bounds(hits: int, total: int, confidence: float = CONFIDENCE) -> tuple
     low = float(scipy.stats.beta.ppf(error, hits, total - hits + 1)) if hits else 0.0
     high = float(scipy.stats.beta.isf(error, hits + 1, total - hits)) if hits < total else 1.0
     return low, high
+
+
+def trials_for_bound(share: float, confidence: float = CONFIDENCE) -> int:
+    """Fewest trials without an event whose exact upper bound is at most this share: n = ln(1 - c) / ln(1 - p)."""
+    return math.ceil(math.log(1 - confidence) / math.log1p(-share))
 
 
 def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
@@ -267,6 +277,18 @@ def proportion_of_frames(hits: NDArray[Any], frames: NDArray[Any]) -> Summary:
     return summary._replace(low=low, high=high, trials=runs)
 
 
+def mismatched(c: Columns) -> Summary:
+    """Proportion of all matches of lights with stars or LEDs that are wrong.
+
+    Matches of one frame are not independent, so it has no interval.
+    """
+    known = np.isfinite(c["wrong_matches"]) & np.isfinite(c["matched"])
+    matches = np.sum(c["matched"][known] * c["frames"][known])  # `matched` is a mean over the frames of a flight
+    if not matches:
+        return NO_VALUE
+    return Summary(float(np.sum(c["wrong_matches"][known]) / matches), math.nan, math.nan, round(matches))
+
+
 PROPORTIONS: dict[str, Response] = {
     "overconfident": overconfident,
     "identified": lambda c: proportion_of_frames(c["solved"] - c["wrong"], c["frames"]),
@@ -274,6 +296,8 @@ PROPORTIONS: dict[str, Response] = {
     "refused": lambda c: proportion_of_frames(c["frames"] - c["solved"], c["frames"]),
     "ambiguous": lambda c: proportion_of_frames(c["ambiguous"], c["frames"]),
     "misidentified": lambda c: proportion_of_frames(c["misidentified"], c["frames"]),
+    "misled": lambda c: proportion_of_frames(c["misled"], c["frames"]),
+    "mismatched": mismatched,
     "roll_noise": lambda c: proportion_of_frames(c["roll_noise"], c["frames"]),
     "failed": lambda c: proportion(np.sum(c["frames"] == 0), len(c["frames"])),
 }
@@ -286,6 +310,8 @@ def response(name: str, where: str = "response") -> Response:
     identified, wrong, refused : proportions of the frames: solved and not wrong (`is_wrong`), wrong, without a solution
     ambiguous     : proportion of the frames refused because another attitude fits the lights as well (LEDs only)
     misidentified : proportion of the frames solved with a light that is matched with a wrong star or LED
+    misled        : proportion of the frames that are misidentified and have an error that the covariance does not allow
+    mismatched    : proportion of the matches that are wrong, of all frames; without an interval
     roll_noise    : proportion of the frames solved with the right lights and a roll error beyond ten arcminutes that
                     the tracker's covariance allows
     overconfident : proportion of the solutions with an error far outside their covariance

@@ -16,6 +16,8 @@ from skysim.core.types import Floats, FrameRow, SourceTruth
 from skysim.results.plots import figure_png, stacked_axes
 from skysim.results.stretch import to_8bit
 
+LEGEND_PX = 20  # height of the legend
+MIN_SNR = 3.0  # of the true sources that are marked: no one sees fainter ones
 TRUTH_BGR, DETECTED_BGR, MATCHED_BGR = (200, 160, 60), (80, 80, 235), (110, 220, 90)
 
 
@@ -36,6 +38,11 @@ def enlarged(image: NDArray) -> tuple[NDArray[np.uint8], int, int]:
     return picture, scale, max(8, min(picture.shape[:2]) // 70)
 
 
+def visible(sources: SourceTruth) -> NDArray[np.bool_]:
+    """(N,) whether a true source has a signal-to-noise ratio above MIN_SNR, or none is known."""
+    return ~(sources.snr <= MIN_SNR)
+
+
 def annotate(
     image: NDArray,
     detected_px: Floats,
@@ -46,7 +53,7 @@ def annotate(
     """The stretched frame in BGR with blue ticks (truth), red squares (detections), green circles (matched stars).
 
     All markers leave their center open. A frame smaller than 1000 pixels is enlarged twice, so that the markers do
-    not cover its stars. `labels` are written beside the matched stars.
+    not cover its stars. `labels` are written beside the matched stars. With a truth there is a legend below.
     """
     picture, scale, size = enlarged(image)
     for x, y in pixel_positions(truth_px, scale):
@@ -57,22 +64,38 @@ def annotate(
         cv2.circle(picture, (x, y), size + 4, MATCHED_BGR, 1, cv2.LINE_AA)
         if labels:
             draw_label(picture, labels[n], x + size + 6, y + 4, MATCHED_BGR)
-    return picture
+    if truth_px is None:
+        return picture
+    meanings = {f"true, SNR > {MIN_SNR:g}": TRUTH_BGR, "detected": DETECTED_BGR, "matched": MATCHED_BGR}
+    return with_legend(picture, meanings)
 
 
 def annotate_truth(image: NDArray, sources: SourceTruth) -> NDArray[np.uint8]:
-    """The stretched frame in BGR with ticks at the flux centroid of each true source and the 40 brightest labeled.
+    """The stretched frame in BGR with ticks at the flux centroid of each visible source and the 40 brightest labeled.
 
     Blue marks unsaturated sources, red those expected to saturate. A frame smaller than 1000 pixels is enlarged twice.
     """
     picture, scale, size = enlarged(image)
     labeled = set(np.argsort(-sources.electrons)[:40].tolist())
+    seen = visible(sources)
     for n, (x, y) in enumerate(pixel_positions(sources.flux_xy_px, scale)):
+        if not seen[n]:
+            continue
         color = DETECTED_BGR if sources.saturated[n] else TRUTH_BGR
         draw_ticks(picture, x, y, size, color)
         if n in labeled:
             draw_label(picture, str(sources.id[n]), x + size + 2, y - size, color)
-    return picture
+    return with_legend(picture, {f"true, SNR > {MIN_SNR:g}": TRUTH_BGR, "saturated": DETECTED_BGR})
+
+
+def with_legend(picture: NDArray[np.uint8], meanings: dict[str, tuple[int, int, int]]) -> NDArray[np.uint8]:
+    """The picture with a strip below it that names the colors of its markers; pixels keep their places."""
+    strip = cv2.copyMakeBorder(picture, 0, LEGEND_PX, 0, 0, cv2.BORDER_CONSTANT, value=(0, 0, 0))
+    x = 6
+    for text, color in meanings.items():
+        draw_label(strip, text, x, len(strip) - 6, color)
+        x += 14 + 8 * len(text)
+    return np.asarray(strip, np.uint8)
 
 
 def draw_ticks(picture: NDArray[np.uint8], x: int, y: int, size: int, color: tuple[int, int, int]) -> None:

@@ -13,7 +13,7 @@ from estimator.trackers.pipeline import Report
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Frame, FrameRow, Mount, Truth
 from skysim.results import metrics
-from skysim.results.report import annotate
+from skysim.results.report import annotate, visible
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.run import FrameResult
@@ -105,8 +105,8 @@ def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
 
 
 def annotated(frame: Frame, truth: Truth, report: Report | None) -> NDArray[np.uint8]:
-    """The stretched frame with true sources and, if it was solved, detections and identified detections marked."""
+    """The stretched frame with visible true sources and, if it was solved, detections and matches marked."""
     detected = report.centroids.xy_px if report else np.empty((0, 2))
     match = report.attitude.match if report else None
     matched = detected[match.observed] if match else np.empty((0, 2))
-    return annotate(frame.image_dn, detected, matched, truth_px=truth.sources.xy_px)
+    return annotate(frame.image_dn, detected, matched, truth_px=truth.sources.xy_px[visible(truth.sources)])

@@ -128,7 +128,8 @@ def over_base(
     own: dict[str, Any],
     camera_of: Callable[[Any], dict[str, Any]] = lambda name: preset(str(name)),
 ) -> dict[str, Any]:
-    """The keys of a scene over those of its base. A camera preset in `own` also replaces the base's keys.
+    """The keys of a scene over those of its base. A camera preset in `own` also replaces the base's keys, and
+    `motion.start: profile` the base's rate, which the profile gives.
 
     camera_of : the camera section of a preset. An unknown preset replaces nothing; `with_preset` reports it.
     """
@@ -137,7 +138,15 @@ def over_base(
     if named is not None and isinstance(below, dict):
         with contextlib.suppress(InputError):
             base = base | {"camera": undefined_keys(below, camera_of(named))}
+    motion, moving = own.get("motion"), base.get("motion")
+    if isinstance(motion, dict) and isinstance(moving, dict):
+        start = motion.get("start")
+        if getattr(start, "value", start) == "profile":  # in `keys.provenance` a value has its origin beside it
+            base = base | {"motion": {key: value for key, value in moving.items() if key != "rate_deg_s"}}
     return merge(base, own)
+
+
+REPLACING = ("camera.preset", "motion.start")  # keys that replace others of the base: `over_base`
 
 
 def undefined_keys(section: dict[str, Any], defined: dict[str, Any]) -> dict[str, Any]:
@@ -188,11 +197,12 @@ def validate(layers: list[Layer], overrides: Mapping[str, str]) -> Scene:
 
 
 def with_overrides(tree: dict[str, Any], overrides: Mapping[str, str]) -> dict[str, Any]:
-    """The raw scene with dotted keys overridden; `tree` may be changed. A camera preset comes before the other keys."""
-    if "camera.preset" in overrides:
-        named: dict[str, Any] = {}
-        set_key(named, "camera.preset", overrides["camera.preset"])
-        tree = over_base(tree, named)
+    """The raw scene with dotted keys overridden; `tree` may be changed. Keys in REPLACING come before the others."""
+    for key in REPLACING:
+        if key in overrides:
+            named: dict[str, Any] = {}
+            set_key(named, key, overrides[key])
+            tree = over_base(tree, named)
     for key, value in overrides.items():
         set_key(tree, key, value)
     return tree

@@ -14,6 +14,7 @@ from estimator.trackers.pipeline import Clock, Report
 from skysim.core.types import Frame, Truth
 from skysim.scene.scene import Scene
 from skysim.simulation.closed_loop import CapturedFrame, ClosedLoop, OnboardCamera
+from skysim.simulation.compilation import synthetic_frame
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.telemetry import TelemetryRecorder
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
@@ -74,7 +75,10 @@ def fly(
     testbed, simulation = loop.testbed, loop.simulation
     # Raises InputError for too fast vibration before any long work.
     loop.vibration.subdivisions(simulation.times_s(0, simulation.last_step + 1))
-    camera = OnboardCamera(loop, build_tracker(testbed)) if testbed.scene.filter and loop.navigation else None
+    camera = None
+    if testbed.scene.filter and loop.navigation:
+        camera = OnboardCamera(loop, build_tracker(testbed))
+        warm_up_tracker(testbed, camera.tracker)
     recorder = TelemetryRecorder(simulation, loop.flight_computer, loop.navigation)
     # If nothing depends on the motion, one call integrates all of it.
     steps = simulation.steps_left if loop.is_free_motion else round(loop.flight_computer.period_s / simulation.step_s)
@@ -137,6 +141,15 @@ def warm_up(testbed: Testbed, estimator: factory.Estimator) -> None:
     frame, _ = render_frame(testbed, 0)
     if not isinstance(estimator, factory.UserTracker):
         factory.solve_frame(estimator, frame)
+
+
+def warm_up_tracker(testbed: Testbed, tracker: factory.Estimator | None) -> None:
+    """Solve a synthetic frame so that numba compiles before timing, where no frame can be rendered yet.
+
+    External trackers are skipped, as in `warm_up`.
+    """
+    if tracker is not None and not isinstance(tracker, factory.UserTracker):
+        factory.solve_frame(tracker, synthetic_frame(testbed))
 
 
 def run(testbed: Testbed, estimator: factory.Estimator) -> Iterator[FrameResult]:

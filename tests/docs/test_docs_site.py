@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from skysim.apps.cli import main
 from skysim.core.paths import ROOT
+from skysim.results import metrics
 from skysim.scene.scene import ExposureConfig
 from skysim.scene.sections.tracker import SurveyErrorsConfig
 
@@ -29,7 +30,7 @@ def of_the_site(name: str) -> ModuleType:
     return module
 
 
-commands, keys = of_the_site("commands"), of_the_site("keys")
+commands, keys, responses = (of_the_site(name) for name in ("commands", "keys", "responses"))
 COMMANDS_MARKDOWN = commands.commands_markdown()
 SECTIONS = dict(re.findall(r"^##+ `skysim ?([^`]*)`\n(.*?)(?=^##|\Z)", COMMANDS_MARKDOWN, re.DOTALL | re.MULTILINE))
 
@@ -69,7 +70,7 @@ def test_a_key_s_row_says_what_it_takes_and_what_stands_for_it() -> None:
     assert "| `surface_seed` | whole number, ≥ 0 or null | `null` |" in survey
 
 
-GENERATED = keys.pages() | {commands.PAGE: commands.page()}
+GENERATED = keys.pages() | {commands.PAGE: commands.page(), responses.PAGE: responses.page()}
 
 
 @pytest.mark.parametrize("path", GENERATED, ids=lambda path: path.stem)
@@ -86,6 +87,19 @@ def test_a_page_of_keys_links_to_its_sections_and_names_what_a_text_may_be(path:
     assert linked <= {heading.lower() for heading in headings}
     assert re.findall(r".*\| (?:list of any length: )?text(?: or null)? \|.*", page) == []
     assert re.findall(r"^\| `\w+` \|.* (?!\[)\w+Config\b.*", page, re.MULTILINE) == []  # every section has a link
+
+
+def test_every_response_has_a_row_with_its_meaning() -> None:
+    """Proportions, quantities and statistics that the code has, and no others; meanings of several lines are whole."""
+    page = GENERATED[responses.PAGE]
+    rows = [
+        (set(re.findall(r"`(\w+)`", names)), text) for names, text in re.findall(r"^\| (`.*`) \| (.*) \|$", page, re.M)
+    ]
+    named = set().union(*(names for names, _ in rows))
+    wanted = {*metrics.PROPORTIONS, "coverage_N", *metrics.QUANTITIES, *(f"_{name}" for name in metrics.STATISTICS)}
+    assert named == wanted
+    assert min(len(text) for _, text in rows) > 15
+    assert "ten arcminutes that the tracker's covariance allows |" in page
 
 
 def test_names_that_a_key_allows_are_on_its_row() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from skysim.core.types import SourceTruth
@@ -13,7 +15,7 @@ def seen(xy_px: list[tuple[float, float]], saturated: list[bool]) -> SourceTruth
     one, place = np.ones(count), np.array(xy_px)
     return SourceTruth(
         np.arange(count) + 1, place, place, one * 1e4, one, 0 * one, one, np.rint(place).astype(int),
-        np.array(saturated), one,
+        np.array(saturated), 9 * one,
     )  # fmt: skip
 
 
@@ -24,7 +26,7 @@ def colored(picture: np.ndarray, bgr: tuple[int, int, int]) -> np.ndarray:
 
 def test_ticks_stand_around_the_true_places_and_leave_them_open() -> None:
     image = np.random.default_rng(1).normal(100, 5, (1000, 1200))
-    picture = report.annotate_truth(image, seen([(300.2, 400.7), (900.0, 650.0)], [False, True]))
+    picture = report.annotate_truth(image, seen([(300.2, 400.7), (900.0, 650.0)], [False, True]))[:1000]
     for place, bgr in (((300, 401), report.TRUTH_BGR), ((900, 650), report.DETECTED_BGR)):
         away = np.abs(colored(picture, bgr) - place).max(axis=1)
         assert away.min() >= 8
@@ -33,9 +35,22 @@ def test_ticks_stand_around_the_true_places_and_leave_them_open() -> None:
 
 def test_a_small_frame_is_doubled_and_its_marks_with_it() -> None:
     picture = report.annotate_truth(np.random.default_rng(1).normal(100, 5, (200, 300)), seen([(100.0, 50.0)], [False]))
-    assert picture.shape == (400, 600, 3)
-    ticks = colored(picture, report.TRUTH_BGR)
+    assert picture.shape == (400 + report.LEGEND_PX, 600, 3)
+    ticks = colored(picture[:400], report.TRUTH_BGR)
     assert np.abs(ticks.min(axis=0) + ticks.max(axis=0) - [401, 201]).max() < 80  # the label leans to one side
+
+
+def test_what_nobody_can_see_is_not_marked_and_a_legend_names_the_colors() -> None:
+    """Of two sources the one with a signal-to-noise ratio of 2 has no ticks; one of unknown ratio has."""
+    image = np.random.default_rng(1).normal(100, 5, (1200, 1000))
+    sources = seen([(300.0, 400.0), (700.0, 800.0)], [False, False])
+    for snr, shown in ((np.array([9.0, 2.0]), [True, False]), (np.array([9.0, np.nan]), [True, True])):
+        picture = report.annotate_truth(image, replace(sources, snr=snr))
+        ticks = colored(picture, report.TRUTH_BGR)
+        near = [(np.hypot(*(ticks - place).T) < 60).any() for place in ((300, 400), (700, 800))]
+        assert near == shown
+        assert (ticks[:, 1] >= 1200).any()  # the legend, below the frame
+        assert len(picture) == 1200 + report.LEGEND_PX
 
 
 def test_a_contact_sheet_stretches_all_frames_alike() -> None:

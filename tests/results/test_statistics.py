@@ -14,7 +14,7 @@ from scipy.special import comb
 from skysim.results import metrics
 
 
-@pytest.mark.parametrize(("hits", "of"), [(0, 30), (15, 30), (30, 30), (999, 1000)])
+@pytest.mark.parametrize(("hits", "of"), [(1, 30), (15, 30), (29, 30), (999, 1000)])
 def test_a_share_has_wilsons_interval(hits, of):
     """The roots of (p - x)^2 = z^2 x (1 - x) / n (Wilson 1927), solved here."""
     z2 = stats.norm.ppf(0.975) ** 2
@@ -23,6 +23,20 @@ def test_a_share_has_wilsons_interval(hits, of):
     told = metrics.proportion(hits, of)
     assert (told.low, told.high) == pytest.approx(tuple(roots), abs=1e-9)
     assert (told.value, told.trials) == (p, of)
+
+
+@pytest.mark.parametrize("count", [1, 12, 1200])
+def test_none_and_all_have_the_exact_bound_of_the_words(count: int) -> None:
+    """0 of n: 1 - 0.05^(1/n), the same in tables and in words; n of n mirrored."""
+    assert metrics.proportion(0, count) == (0.0, 0.0, pytest.approx(1 - 0.05 ** (1 / count)), count, 0)
+    assert metrics.proportion(count, count) == (1.0, pytest.approx(0.05 ** (1 / count)), 1.0, count, 0)
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.001, 2995), (0.01, 299), (0.05, 59)])
+def test_a_claim_needs_as_many_trials_as_its_bound(share: float, count: int) -> None:
+    """n = ln 0.05 / ln(1 - p), rounded up; one fewer is not enough."""
+    assert metrics.trials_for_bound(share) == count
+    assert metrics.exact_bounds(0, count)[1] <= share < metrics.exact_bounds(0, count - 1)[1]
 
 
 @pytest.mark.long

@@ -77,3 +77,36 @@ def test_a_preset_file_is_named_as_the_origin_of_its_keys(folder: Path) -> None:
     assert origin["camera.shutter.kind"] == "preset mine.yaml, line 7"
     assert origin["camera.f_number"] == "this file, line 3"
     assert origin["camera.transmission"].startswith("base afit_simsat.yaml")
+
+
+# A profile gives the rate at which a motion starts.
+
+PROFILE = "{start: profile, control: prescribed, maneuver: [{kind: profile, file: sky.csv}]%s}"
+
+
+def on_profile(folder: Path, more: str = "") -> Path:
+    rows = "\n".join(f"{t},83.0,{2 + 0.01 * t:.3f},20.0" for t in range(0, 20))
+    (folder / "sky.csv").write_text(f"t_s,ra_deg,dec_deg,roll_deg\n{rows}\n")
+    path = folder / "scene.yaml"
+    path.write_text(f"schema: 1\nbase: shefex2\nmotion: {PROFILE % more}\n")
+    return path
+
+
+def test_a_rate_of_the_base_is_dropped_where_a_profile_gives_it(folder: Path) -> None:
+    """shefex2 turns at 0.5 deg/s; a rate in the scene itself is a contradiction."""
+    assert loader.load("shefex2").motion.rate_deg_s == (0.3, 0.4, 0.0)
+    scene = loader.load(on_profile(folder))
+    assert (scene.motion.start, scene.motion.rate_deg_s) == ("profile", (0.0, 0.0, 0.0))
+    shown = {".".join(entry.path): entry for entry in provenance.effective(on_profile(folder))}
+    assert shown["motion.rate_deg_s"].origin.what == "default"
+    with pytest.raises(InputError, match=r"rate_deg_s: has no effect with start: profile.*scene\.yaml"):
+        loader.load(on_profile(folder, ", rate_deg_s: [0.1, 0, 0]"))
+
+
+def test_a_start_on_the_command_line_drops_the_rate_too(folder: Path) -> None:
+    on_profile(folder)
+    maneuver = f"[{{kind: profile, file: {folder / 'sky.csv'}}}]"
+    overrides = {"motion.control": "prescribed", "motion.maneuver": maneuver, "motion.start": "profile"}
+    assert loader.load("shefex2", overrides).motion.rate_deg_s == (0.0, 0.0, 0.0)
+    with pytest.raises(InputError, match="rate_deg_s: has no effect with start: profile"):
+        loader.load("shefex2", overrides | {"motion.rate_deg_s": "[0.1, 0, 0]"})

@@ -10,10 +10,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skysim.core.types import Floats, Telemetry
+from estimator.trackers.pipeline import Report
+from skysim.core.types import Floats, Frame, Telemetry
 from skysim.scene import loader
-from skysim.simulation import run
+from skysim.simulation import compilation, run
 from skysim.simulation.testbed import Testbed, build_tracker
+from skysim.tracking import factory
 
 BUMP = 'kind: bump, rate_deg_s: [3, -2, 14], duration: "40 ms", caught_after: "0.2 s"'
 EARLY = {
@@ -37,6 +39,22 @@ def prepared(name: str = "simsat_bump", **changes: str) -> Testbed:
 @pytest.fixture(scope="module")
 def bumped() -> Testbed:
     return prepared(**EARLY | EXACT_MAP)
+
+
+def test_the_tracker_is_compiled_before_the_first_frame_of_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One synthetic frame is solved first, whose report is none of the flight's."""
+    solved: list[Frame] = []
+    solve = factory.solve_frame
+
+    def watched(tracker: factory.Estimator, frame: Frame) -> Report:
+        solved.append(frame)
+        return solve(tracker, frame)
+
+    monkeypatch.setattr(factory, "solve_frame", watched)
+    testbed = prepared(exposure='{time: 10 ms, rate_hz: 5, frames: 2, first: "0.1 s"}', motion__maneuver="[]")
+    assert [frame.index for frame in solved] == [0, 0, 1]
+    np.testing.assert_array_equal(solved[0].image_dn, compilation.synthetic_frame(testbed).image_dn)
+    assert len(testbed.reports) == 2
 
 
 def told(testbed: Testbed) -> Telemetry:

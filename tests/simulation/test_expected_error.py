@@ -33,7 +33,7 @@ def ring(arm_m: Floats, offset_m: Floats, testbed: Testbed) -> View:
     xy_px, gradient = testbed.optics.project(offset_m), image_gradient(testbed.optics, offset_m)
     row, streak = np.arange(count), np.zeros((count, 2))
     depth_m = offset_m[:, 2]
-    return View(row, xy_px, offset_m, arm_m, gradient, depth_m, *[nothing] * 4, streak, nothing)
+    return View(row, xy_px, offset_m, arm_m, gradient, depth_m, *[nothing] * 4, streak, nothing, streak)
 
 
 def around(radius: float, height: float, count: int = LEDS) -> Floats:
@@ -298,6 +298,31 @@ def test_expected_errors_are_those_of_solved_frames(name: str, count: int, rate_
     assert 0.65 < roll < 1.7
     rms, expectation = (np.sqrt(np.mean(values**2, axis=0)) for values in (errors, wanted))
     np.testing.assert_allclose(rms, expectation, rtol=0.3)
+
+
+def test_an_angular_acceleration_shifts_images_by_the_mean_of_its_parabola(stars: Testbed) -> None:
+    """158 deg/s^2 in 20 ms: a T^2 / 24 is 9.5 arcsec about its axis, in the renderer's pixels and as expected."""
+    acceleration_deg_s2, exposure_s = 158.0, 0.02
+    scene = stars.scene.model_copy(update={"exposure": stars.scene.exposure.model_copy(update={"time_s": exposure_s})})
+    lab_from_body, cam_from_body = stars.trajectory.lab_from_body[0], stars.mount.cam_from_body
+    about_body = cam_from_body.inv().apply([0.0, np.radians(acceleration_deg_s2), 0.0])
+    testbed = replace(stars, scene=scene)
+    window = exposure_window(scene, 0)
+    t_s = np.linspace(window.open_s - MARGIN_S, window.close_s(scene.camera.height_px) + MARGIN_S, 801)
+    since_s = t_s - window.middle_s(scene.camera.height_px)
+    path = lab_from_body * Rotation.from_rotvec(np.outer(since_s**2 / 2, about_body))
+    turning = Trajectory(t_s, path, np.outer(since_s, about_body))
+    _, truth = render_frame(replace(testbed, trajectory=turning), 0)
+    context = detection.context_of(testbed)
+    lights = context.beliefs.lights
+    seen = view(testbed, lights, lab_from_body, np.zeros(3), context.camera, about_body)
+    _, rendered, predicted = np.intersect1d(truth.sources.id, lights.id[seen.row], return_indices=True)
+    shift_px = (truth.sources.flux_xy_px - truth.sources.xy_px)[rendered]
+    assert len(shift_px) > 20
+    assert np.abs(shift_px - seen.bend_px[predicted]).max() < 0.02 * np.abs(shift_px).max()
+    at = Attitudes(Rotation.concatenate([lab_from_body]), np.zeros((1, 3)), np.zeros(1), about_body[None])
+    sampled = plan.sampled(at, context).error.cross_rad2["angular acceleration"]
+    assert np.sqrt(sampled[0]) / ARCSEC_RAD == pytest.approx(3600 * acceleration_deg_s2 * exposure_s**2 / 24, rel=0.01)
 
 
 def test_an_expected_error_is_no_number_with_two_lights(stars: Testbed) -> None:

@@ -17,8 +17,9 @@ from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.dynamics import multibody
 from skysim.scene import loader
 from skysim.simulation import exposure, run
-from skysim.simulation.checks import attitudes, check, detection, facts, findings, plan
+from skysim.simulation.checks import attitudes, check, detection, facts, plan
 from skysim.simulation.checks.facts import Fact, Samples
+from skysim.simulation.checks.sky import claims, depth
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking.factory import solve_frame
 
@@ -279,6 +280,9 @@ def test_a_solver_s_own_error_is_a_cause() -> None:
         ),
         ("shefex2", {"camera__vignetting": TWO_STOPS}, "camera.vignetting.cutoff_deg", "the lens is dark beyond 4 deg"),
         ("shefex2", {"light__limit_mag": "4"}, "light.limit_mag", "of the directions in reach"),
+        ("shefex2", {"light__limit_mag": "5.9"}, "light.limit_mag", "the sky ends at V 5.9"),
+        ("shefex2", {"camera__preset": "imx174"}, "tracker.limit_mag", "knows them to V 5.8 only, 9 % of them"),
+        ("shefex2", {"camera__detector__prnu": "0.1"}, "tracker.centroid_sigma_px", "1.3 times too small (NEES 5.4"),
         ("shefex2", {"tracker__limit_mag": "3"}, "tracker.limit_mag", "of the directions in reach"),
         ("afit_simsat", {"tracker__brightest": "3"}, "tracker.brightest", "the tracker uses 3 lights"),
         ("shefex2", {"tracker__threshold_sigma": "500"}, "tracker.threshold_sigma", "below the threshold of 500 sigma"),
@@ -321,7 +325,7 @@ def test_a_mistake_is_warned_of_with_its_key(scene: str, changes: dict[str, str]
     """And with what to change it to; the plan as it ships gives no such warning."""
     tilted = {"motion__maneuver": TILTED} if key.endswith("cap_deg") else {}
     lines = [line for line in check(bed(scene, **tilted, **changes)).findings if line.startswith(f"{key}: ")]
-    assert [line for line in lines if words in line and "; change it to " in line]
+    assert [line for line in lines if words in line and re.search("; (change it to|turn) ", line)]
     assert not [line for line in check(bed(scene)).findings if words in line]
 
 
@@ -385,6 +389,11 @@ def test_the_brightest_hundred_of_many_lights_are_no_fault() -> None:
     assert not [line for line in result.findings if "detects" in line]
 
 
+def test_only_an_led_s_image_has_the_part_of_an_led(afit: plan.Check) -> None:
+    assert ", LED 2" in fact(afit, "image size").lines[0]
+    assert "LED" not in fact(check(bed("shefex2")), "image size").lines[0]
+
+
 def test_the_rate_at_which_an_image_is_as_long_as_wide_is_told() -> None:
     result = check(bed("shefex2"))
     rate_deg_s, width_px = (
@@ -396,7 +405,7 @@ def test_the_rate_at_which_an_image_is_as_long_as_wide_is_told() -> None:
     assert "as long as the image is wide at" in fact(result, "smear").lines[0]
 
 
-@pytest.mark.parametrize(("focal_length", "solved"), [("25.01 mm", 3), ("25.05 mm", 0)])
+@pytest.mark.parametrize(("focal_length", "solved"), [("25.01 mm", 3), ("25.5 mm", 3), ("27 mm", 0)])
 def test_a_wrong_focal_length_is_warned_of_where_the_tracker_refuses(focal_length: str, solved: int) -> None:
     testbed = bed("shefex2", tracker__assumed_focal_length=focal_length, exposure__frames="3")
     flown, tracker = run.simulate_motion(testbed), build_tracker(testbed)
@@ -426,7 +435,7 @@ def test_fields_alike_are_those_that_the_tracker_refuses_as_ambiguous(layout: st
 def test_half_of_the_stars_at_the_limit_are_detected() -> None:
     """The limit that `light.catalog` is compared with, on rendered frames: most brighter by half a magnitude are."""
     testbed = bed("shefex2", exposure__frames="1", motion__rate_deg_s="[0, 0, 0]")
-    limit = findings.detection_limit_mag(*samples_of(testbed))
+    limit = depth.detection_limit_mag(*samples_of(testbed))
     tracker, rng, found, faint = build_tracker(testbed), np.random.default_rng(3), [], []
     for n in range(6):
         still = testbed.in_run(n).at_rest(Rotation.random(rng=rng))
@@ -438,6 +447,28 @@ def test_half_of_the_stars_at_the_limit_are_detected() -> None:
         faint += near[np.abs(v_mag - limit - 0.5) < 0.25].tolist()
     assert np.mean(found) > 0.7
     assert np.mean(faint) < 0.3
+
+
+def test_the_star_of_a_signal_to_noise_of_five_is_that_of_the_truth_table() -> None:
+    """V at which the rendered frames' stars pass 5, by their own color, against a star like the Sun: to 0.3 mag."""
+    testbed = bed("shefex2", exposure__frames="1")
+    limit = fact(check(testbed), "faintest star").values["snr_5_v_mag"]
+    magnitude = dict(zip(testbed.sources.id.tolist(), testbed.sources.magnitude.tolist(), strict=True))
+    _, truth = exposure.render_frame(run.simulate_motion(testbed), 0)
+    v_mag = np.array([magnitude[hip] for hip in truth.sources.id.tolist()])
+    near = np.abs(truth.sources.snr - 5) < 0.7
+    assert near.sum() > 10
+    assert np.median(v_mag[near]) == pytest.approx(limit, abs=0.3)
+
+
+def test_a_floor_that_the_check_proposes_makes_the_claims_true() -> None:
+    """Of a chip whose pixels differ by 10 %, NEES is 5.4 as expected and 5.7 (median of 40 frames) as measured."""
+    floor_px = 0.02
+    nees = [
+        claims.claimed(*samples_of(bed("shefex2", camera__detector__prnu="0.1", tracker__centroid_sigma_px=str(px))))
+        for px in (0.007, floor_px)
+    ]
+    assert nees == [pytest.approx(5.4, abs=0.3), pytest.approx(3, abs=0.15)]
 
 
 @pytest.mark.slow

@@ -58,6 +58,14 @@ def options(
     """Simulate a star-tracker laboratory: motion, light sources, camera, attitude determination, scoring."""
 
 
+def listing_hint(text: str, context: typer.Context | None) -> str:
+    """For an unknown command of a group that lists its items without one, such as `skysim study list`: what lists."""
+    group = getattr(context, "command", None)
+    if context is None or not text.startswith("No such command") or not getattr(group, "invoke_without_command", False):
+        return ""
+    return f" Allowed: {', '.join(getattr(group, 'commands', {}))}; `{context.command_path}` alone lists."
+
+
 def main() -> None:
     """Run the command. A user error prints one line and exits with code 2; Ctrl-C and SIGTERM exit with 130."""
     errors.running_as_command = True
@@ -77,7 +85,8 @@ def main() -> None:
         # Usage errors: recent typer bundles its parser and raises its own class, older versions raise click's.
         if not hasattr(error, "format_message"):
             raise
-        code = print_error(" ".join(error.format_message().split()) or "give a command; see skysim --help")
+        text = " ".join(error.format_message().split()) or "give a command; see skysim --help"
+        code = print_error(text + listing_hint(text, getattr(error, "ctx", None)))
     if code == 130:  # typer's own answer to Ctrl-C
         print_error("stopped")
     sys.exit(code if isinstance(code, int) else 0)

@@ -98,6 +98,9 @@ def find_file(name: str, folder: Path, what: str) -> Path:
         return path
     if not path.suffix and is_file(shipped):
         return shipped
+    near = Path(f"{name}.yaml")
+    if is_file(near):
+        raise InputError(f"{excerpt(name)}: no such {what}; did you mean {excerpt(near)}?")
     names = sorted(file.stem for file in folder.glob("*.yaml"))
     raise InputError(f"{excerpt(name)}: no such {what}; allowed: a .yaml file or one of {', '.join(names)}")
 

@@ -26,7 +26,7 @@ from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.execution.trials import Row
 
 STORE = "study.sqlite"  # file name in a study's results folder
-FORMAT = 3  # raised when the columns of `trials` change
+FORMAT = 4  # raised when the columns of `trials` change
 TEXT_FIELDS = {"status"}
 INTEGER_FIELDS = {"frames", "solved", "wrong", "ambiguous"}
 

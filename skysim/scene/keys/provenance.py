@@ -75,8 +75,9 @@ def located_tree(layers: list[Layer], overrides: Mapping[str, str]) -> dict[str,
     whats = ["this file", *(f"base {layer.path.name}" for layer in layers[1:])]
     trees = [with_origins(*layer, what) for layer, what in zip(layers, whats, strict=True)]
     tree: dict[str, Any] = functools.reduce(over_base, reversed(trees))
-    if "camera.preset" in overrides:
-        tree = over_base(tree, put({}, ["camera", "preset"], parse_yaml(overrides["camera.preset"])[1]))
+    for key in loader.REPLACING:
+        if key in overrides:
+            tree = over_base(tree, put({}, key.split("."), parse_yaml(overrides[key])[1]))
     for key, text in overrides.items():
         tree = put(tree, key.split("."), parse_yaml(text)[1])
     camera = tree.get("camera")

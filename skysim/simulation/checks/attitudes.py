@@ -32,11 +32,18 @@ class Attitudes(NamedTuple):
     lab_from_body   : N rotations
     rate_body_rad_s : (N, 3) in body axes; zeros where only the direction is of interest
     t_s             : (N,) time of the frame; NaN where it is none
+    acceleration_body_rad_s2 : (N, 3) in body axes; None for zeros
     """
 
     lab_from_body: Rotation
     rate_body_rad_s: Floats
     t_s: Floats
+    acceleration_body_rad_s2: Floats | None = None
+
+    def accelerations(self) -> Floats:
+        """(N, 3) angular accelerations in body axes, rad/s^2."""
+        given = self.acceleration_body_rad_s2
+        return np.zeros_like(self.rate_body_rad_s) if given is None else given
 
 
 def of_frames(testbed: Testbed) -> Attitudes:
@@ -53,7 +60,7 @@ def of_frames(testbed: Testbed) -> Attitudes:
     if scene.vehicle.mount == "air_bearing":
         check_stop(scene, t_s[rows], np.degrees(tilt_rad))
         rows = rows[tilt_rad <= math.radians(scene.vehicle.tilt_stop_deg)]
-    return Attitudes(every.lab_from_body[rows], every.rate_body_rad_s[rows], t_s[rows])
+    return Attitudes(every.lab_from_body[rows], every.rate_body_rad_s[rows], t_s[rows], every.accelerations()[rows])
 
 
 def check_stop(scene: Scene, t_s: Floats, tilt_deg: Floats) -> None:
@@ -79,7 +86,8 @@ def attitudes_at(testbed: Testbed, t_s: Floats) -> Attitudes:
     reference = guidance.plan(scene.motion, lab_from_start, testbed.profiles)
     states = [reference.state_at(float(t)) for t in t_s]
     lab_from_body = Rotation.from_quat(np.array([state[0] for state in states]), scalar_first=True)
-    return Attitudes(lab_from_body, np.array([state[1] for state in states]), t_s)
+    rates, accelerations = (np.array([state[k] for state in states]) for k in (1, 2))
+    return Attitudes(lab_from_body, rates, t_s, accelerations)
 
 
 def tilts_rad(attitudes: Attitudes) -> Floats:

@@ -88,8 +88,8 @@ def usable(view: View, context: Context) -> View:
     return view.take(found[np.argsort(-view.electrons[found], kind="stable")][: settings.max_blobs])
 
 
-def centroid_variance(view: View, context: Context) -> Floats:
-    """(n, 2, 2) covariance of the centroids, px^2.
+def centroid_variance(view: View, context: Context, prnu: float | None = None) -> Floats:
+    """(n, 2, 2) covariance of the centroids, px^2. prnu : relative sensitivity of the pixels, if not the detector's
 
     Photon noise sigma^2 / N and background noise of b electrons^2 a pixel: for a center of gravity in a window of side
     W, sigma^2 / N + b W^4 / (12 N^2); for a fit, the Cramer-Rao bound of a Gaussian (`fit_loss`). Then sensitivity that
@@ -107,7 +107,8 @@ def centroid_variance(view: View, context: Context) -> Floats:
         loss = fit_loss(2 * np.pi * np.sqrt(along2) * view.sigma_px * noise_e2 / n_e)
         along, across = along2 / n_e * loss, view.sigma_px**2 / n_e * loss
     disk = (view.disk_px**2 + view.defocus_px**2) / 4 / view.sigma_px**2
-    pattern = testbed.scene.camera.detector.prnu**2 / (8 * np.pi) * (1 + disk)
+    varies = testbed.scene.camera.detector.prnu if prnu is None else prnu
+    pattern = varies**2 / (8 * np.pi) * (1 + disk)
     plateau = SATURATED_SIGMA_PX**2 * (view.peak_e >= full_scale_e(testbed.scene.camera.detector))
     unit = view.streak_px / np.maximum(view.streak_length_px, 1e-12)[:, None]
     along_path = unit[:, :, None] * unit[:, None, :]

@@ -19,6 +19,8 @@ A known error is one of the second kind with p = 1. With G_i the derivative of x
     surface survey : E_i = sigma G_i R n_i, n_i the normal   focal length : E_i = relative error (x_i - center)
     survey rotation r : E_i = G_i R (r x P_i)                distortion, star places : difference of the image positions
     rolling shutter : E_i = velocity times the row's delay from the middle row
+    angular acceleration a : E_i = -J_i a T^2 / 24 against the attitude at mid-exposure: the images are rotated by
+        rate t + a t^2 / 2 at the time t from it, and the mean of t^2 / 2 over an exposure T is T^2 / 24
 
 The error of a solver's own approximation (thesis, infinity, ...) is what it errs for exact rays. `pnp` also fits the
 camera's place, so its J_i has three more columns. Variances about x and y add up to cross, that about z is roll.
@@ -38,10 +40,12 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.nearfield import SOLVERS
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
+from estimator.identification.stars.search import WRONG_FOCAL
 from skysim.camera.optics import Optics
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import RollingShutterConfig
+from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.views import View
@@ -163,6 +167,10 @@ def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Com
     return Common((view.streak_px / context.testbed.scene.exposure.time_s * delay_s[:, None])[:, :, None])
 
 
+def angular_acceleration(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    return Common(view.bend_px[:, :, None]) if view.bend_px.any() else None
+
+
 def displacement(view: View, shift_lab: Floats, lab_from_cam: Rotation) -> Common:
     """The displacement of the images by shifts (n, 3) of the lights in lab axes."""
     return Common(np.einsum("nij,nj->ni", view.gradient, lab_from_cam.inv().apply(shift_lab))[:, :, None])
@@ -179,6 +187,7 @@ CAUSES: dict[str, Callable[[View, Rotation, Context], Independent | Common | Non
     "distortion": distortion,
     "star places": star_places,
     "rolling shutter": rolling_shutter,
+    "angular acceleration": angular_acceleration,
 }
 UNKNOWN_TO_TRACKER = ("focal length", "distortion", "assumed lever", "rolling shutter")
 OUTSIDE_OF_GATE = ("survey set-up", "surface survey")  # drawn once: in the tracker's covariance, not in its radius
@@ -237,6 +246,13 @@ class Mismatch(NamedTuple):
     by_cause: dict[str, float]
 
 
+def finds_focal_length(context: Context) -> bool:
+    """Whether the tracker solves with the right focal length instead: the default identifier does under the stars."""
+    scene = context.testbed.scene
+    under_stars = isinstance(scene.light, StarsConfig) and (scene.tracker.identifier or "default") == "default"
+    return under_stars and abs(context.beliefs.focal_error) < WRONG_FOCAL
+
+
 def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch | None:
     """The mismatch by errors that the tracker's matching radius leaves out; None if there is none, or too few lights.
 
@@ -247,7 +263,7 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
         return None
     causes = {name: CAUSES[name](view, lab_from_cam, context) for name in (*UNKNOWN_TO_TRACKER, *OUTSIDE_OF_GATE)}
     shifts = {name: errors.displacement_px for name, errors in causes.items() if isinstance(errors, Common)}
-    if context.beliefs.focal_sigma:
+    if context.beliefs.focal_sigma or finds_focal_length(context):
         shifts.pop("focal length", None)  # the tracker allows for it
     if not shifts:
         return None

@@ -103,7 +103,8 @@ def spot(context: Context, samples: Samples) -> Fact:
     if not len(sigma):
         return Fact("image size", [f"lens {lens_px:.1f} px; no light in the field"], {"lens_px": lens_px})
     width, disk_px, defocus_px = (float(np.median(one)) for one in (GAUSSIAN_WIDTH * sigma, 2 * disk, 2 * defocus))
-    text = f"{width:.1f} px wide (D4σ): lens {lens_px:.1f}, LED {disk_px:.1f}, defocus {defocus_px:.1f} px"
+    led = f", LED {disk_px:.1f}" if isinstance(context.testbed.scene.light, DomeConfig) else ""
+    text = f"{width:.1f} px wide (D4σ): lens {lens_px:.1f}{led}, defocus {defocus_px:.1f} px"
     values = {"width_px": width, "lens_px": lens_px, "led_px": disk_px, "defocus_px": defocus_px}
     return Fact("image size", [text], values)
 

@@ -8,12 +8,11 @@ from collections.abc import Callable
 import numpy as np
 
 from skysim.scene.scene import Scene
-from skysim.scene.sections.camera import TwoStopsConfig
+from skysim.scene.sections.camera import RollingShutterConfig, TwoStopsConfig
 from skysim.scene.sections.layouts import FibersConfig, Layout, LcdConfig
-from skysim.scene.sections.light import DomeConfig, StarsConfig
+from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import (
-    BINOMIAL_VARIANCE_PX2,
     Context,
     detected_area_px,
     full_scale_e,
@@ -21,8 +20,6 @@ from skysim.simulation.checks.detection import (
 )
 from skysim.simulation.checks.expected_error import mismatch
 from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, Samples, cap_margin, fill, short
-from skysim.simulation.checks.views import peak_share
-from skysim.sources.photometry import SUN, star_flux_e_s_m2
 
 MAX_SATURATED = 0.25  # fraction of saturated lights that gives no warning: a bright star or LED now and then
 TARGET_FILL = 0.7  # of full well, for the light that a fraction MAX_SATURATED exceeds
@@ -37,8 +34,6 @@ MAX_BEYOND = 0.25  # fraction of the images that may lie beyond the tracker's ma
 MAX_SMEAR_PX, MAX_SMEAR_WIDTHS = 4.0, 2.0  # a path that is longer than both gives a warning; in widths of the image
 MAX_DEFOCUS = 0.5  # width of the defocus disk over that of the image in focus
 MIN_DEFOCUS_PX = 1.0
-LIMIT_MARGIN_MAG = 0.3  # by which the camera may see fainter stars than the sky holds
-DEEPEST_V = 10.0  # of a sky that `skysim catalog build` makes
 
 
 def saturation(context: Context, samples: Samples) -> str:
@@ -220,7 +215,9 @@ def not_where_expected(context: Context, samples: Samples) -> str:
         f"{100 * beyond:.0f} % of the images are up to {short(residual_px.max(), 2)} px from where the tracker expects"
         f" them, beyond its matching radius of {short(np.median(gate_px), 2)} px"
     )
+    rate_deg_s = float(np.degrees(np.linalg.norm(frames.attitudes.rate_body_rad_s, axis=1)).max())
     cause = max(found[0].by_cause, key=lambda name: max(one.by_cause[name] for one in found))
+    text += f", at up to {rate_deg_s:.3g} deg/s" if cause == "rolling shutter" else ""
     excess = float(np.quantile(residual_px / gate_px, 1 - MAX_BEYOND))
     return f"{MISMATCH_KEYS[cause]}: {text}; {CHANGES[cause](scene, excess)}"
 
@@ -228,6 +225,12 @@ def not_where_expected(context: Context, samples: Samples) -> str:
 def surface_error_m(scene: Scene) -> float:
     """The survey error of the dome's surface; 0 without a dome."""
     return float(scene.light.surface.error_m) if isinstance(scene.light, DomeConfig) else 0.0
+
+
+def row_time_us(scene: Scene) -> float:
+    """The row time of a rolling shutter; 0 for another one."""
+    shutter = scene.camera.shutter
+    return 1e6 * shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0
 
 
 MISMATCH_KEYS = {
@@ -244,8 +247,9 @@ CHANGES: dict[str, Callable[[Scene, float], str]] = {
     "distortion": lambda scene, excess: f"change it to {list(scene.camera.distortion)}, the lens's",
     "assumed lever": lambda scene, excess: "leave it out, or fit the place with tracker.solver: pnp",
     "rolling shutter": lambda scene, excess: (
-        f"change it to {{kind: global}}, or turn {short(excess, 2)} times slower: rows are read one after another, and"
-        " the tracker takes them as simultaneous"
+        f"turn {short(excess, 2)} times slower, or change row_time to {short(row_time_us(scene) / excess, 2)} us if the"
+        " chip can: rows are read one after another, and the tracker does not correct for it (a gyro changes nothing);"
+        " a camera with shutter {kind: global} has no such error"
     ),
     "survey set-up": lambda scene, excess: (
         f"change it to one of smaller errors of the set-up, by a factor of {short(excess, 2)}"
@@ -302,36 +306,6 @@ def long_smear(context: Context, samples: Samples) -> str:
     )
 
 
-def sky_too_shallow(context: Context, samples: Samples) -> str:
-    """Warn where the camera detects fainter stars than the simulated sky holds."""
-    light, sky = context.testbed.scene.light, context.testbed.sources.magnitude
-    if not isinstance(light, StarsConfig) or light.limit_mag is not None or not len(sky):
-        return ""
-    limit_mag, faintest_mag = detection_limit_mag(context, samples), float(np.nanmax(sky))
-    if limit_mag <= min(faintest_mag + LIMIT_MARGIN_MAG, DEEPEST_V):
-        return ""
-    wanted = min(math.ceil(2 * limit_mag) / 2, DEEPEST_V)
-    return (
-        f"light.catalog: the camera detects stars to V {limit_mag:.1f}, but the sky ends at V {faintest_mag:.1f};"
-        f" change it to a file of `skysim catalog build --source gaia --limit {wanted:g}`"
-    )
-
-
-def detection_limit_mag(context: Context, samples: Samples) -> float:
-    """V of the faintest star like the Sun that is detected at the slowest frame, about half of such stars being so.
-
-    A Gaussian of variance s^2 has the least area A above the threshold T if its peak is T exp(A / (2 pi s^2)), see
-    `detection.detected_area_px`.
-    """
-    camera, lengths = context.camera, [np.median(view.streak_length_px) for view in samples.frames.seen if len(view)]
-    blur2_px2 = camera.lens_px**2 + BINOMIAL_VARIANCE_PX2
-    peak_e = threshold_e(context) * math.exp(context.settings.min_area_px / (2 * math.pi * blur2_px2))
-    none = np.zeros(1)
-    share = peak_share(np.array([blur2_px2]), none, none, np.array([min(lengths, default=0.0)]))[0]
-    reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.testbed.band))
-    return 2.5 * math.log10(reference_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s * share / peak_e)
-
-
 FINDINGS: tuple[Callable[[Context, Samples], str], ...] = (
     bright_background,
     saturation,
@@ -342,5 +316,4 @@ FINDINGS: tuple[Callable[[Context, Samples], str], ...] = (
     out_of_focus,
     long_smear,
     not_where_expected,
-    sky_too_shallow,
 )

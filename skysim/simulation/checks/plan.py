@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from skysim.camera import wcs
+from skysim.core.types import Floats
 from skysim.dynamics import guidance
 from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, dome, lookalike
@@ -13,9 +16,12 @@ from skysim.simulation.checks.detection import Context, context_of, usable
 from skysim.simulation.checks.expected_error import expected
 from skysim.simulation.checks.facts import FACTS, Fact, Sampled, Samples
 from skysim.simulation.checks.findings import FINDINGS
+from skysim.simulation.checks.sky import claims, depth
 from skysim.simulation.checks.views import views
 from skysim.simulation.reference_limits import check_reference
 from skysim.simulation.testbed import Testbed
+
+SKY_FINDINGS = (depth.sky_too_shallow, depth.tracker_too_shallow, claims.floor_too_small)
 
 
 class Check(NamedTuple):
@@ -30,10 +36,12 @@ class Check(NamedTuple):
         return {"facts": numbers, "findings": self.findings}
 
 
-def check(testbed: Testbed, tilt_deg: float | None = None) -> Check:
+def check(testbed: Testbed, tilt_deg: float | None = None, rate_body_rad_s: Floats | None = None) -> Check:
     """Check the plan of a test bed whose motion need not be simulated.
 
     tilt_deg : greatest tilt under a dome, if it is not that of the scene's motion (random attitudes of a study)
+    rate_body_rad_s : (3,) rate of all frames in body axes, in place of the motion's, for trials of single frames
+
     Raises InputError for unreadable files, and for a maneuver that a run would refuse.
     """
     scene = testbed.scene
@@ -42,11 +50,16 @@ def check(testbed: Testbed, tilt_deg: float | None = None) -> Check:
         return Check([], first)  # all else assumes that the camera is inside
     context = context_of(testbed)
     frames = attitudes.of_frames(testbed)
+    if rate_body_rad_s is not None:
+        rates = np.tile(rate_body_rad_s, (len(frames.t_s), 1))
+        frames = frames._replace(rate_body_rad_s=rates, acceleration_body_rad_s2=None)
     check_reference(guidance.plan(scene.motion, testbed.trajectory.lab_from_body[0], testbed.profiles), testbed)
     reach = attitudes.within_reach(scene, testbed.mount, frames, tilt_deg)
     samples = Samples(sampled(frames, context), sampled(reach, context))
-    facts = [fact for build in FACTS if (fact := build(context, samples)) is not None]
-    findings = [line for find in FINDINGS if (line := find(context, samples))]
+    facts = [
+        fact for build in (*FACTS, depth.faintest_star, claims.fact) if (fact := build(context, samples)) is not None
+    ]
+    findings = [line for find in (*FINDINGS, *SKY_FINDINGS) if (line := find(context, samples))]
     alike = lookalike.of(context, samples)
     if alike is not None and isinstance(scene.light, DomeConfig):
         facts.insert(2, lookalike.fact(alike))

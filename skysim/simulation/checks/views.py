@@ -36,6 +36,7 @@ from skysim.simulation.testbed import Testbed
 from skysim.sources.dome.led import irradiance_e_s_m2
 
 STEP = 1e-6  # relative displacement of a light, for the numerical derivative of its image
+NO_ACCELERATION = np.zeros(3)
 FIELD_MARGIN = 1.02  # of the cone in which lights are projected
 
 
@@ -52,6 +53,7 @@ class View(NamedTuple):
     disk_px, defocus_px, sigma_px : radii of the LED's and of the defocus disk, rms radius per axis without motion
     streak_px   : (n, 2) path during the exposure
     peak_e      : mean electrons in the brightest pixel, background included
+    bend_px     : (n, 2) mean of the path minus its middle, by the angular acceleration
     """
 
     row: NDArray[np.int64]
@@ -66,6 +68,7 @@ class View(NamedTuple):
     sigma_px: Floats
     streak_px: Floats
     peak_e: Floats
+    bend_px: Floats
 
     def __len__(self) -> int:
         return len(self.row)
@@ -129,14 +132,23 @@ class CameraModel(NamedTuple):
 
 def views(testbed: Testbed, lights: Sources, attitudes: Attitudes, camera: CameraModel) -> list[View]:
     """The view at each attitude, of the lights that no obstacle hides."""
-    rows = zip(attitudes.lab_from_body, attitudes.rate_body_rad_s, strict=True)
-    return [view(testbed, lights, lab_from_body, rate, camera) for lab_from_body, rate in rows]
+    rows = zip(attitudes.lab_from_body, attitudes.rate_body_rad_s, attitudes.accelerations(), strict=True)
+    return [view(testbed, lights, at, rate, camera, acceleration) for at, rate, acceleration in rows]
 
 
 def view(
-    testbed: Testbed, lights: Sources, lab_from_body: Rotation, rate_body_rad_s: Floats, camera: CameraModel
+    testbed: Testbed,
+    lights: Sources,
+    lab_from_body: Rotation,
+    rate_body_rad_s: Floats,
+    camera: CameraModel,
+    acceleration_body_rad_s2: Floats = NO_ACCELERATION,
 ) -> View:
-    """The view at one attitude while the vehicle rotates at a rate, (3,) in body axes."""
+    """The view at one attitude while the vehicle rotates at a rate and an acceleration, (3,) each in body axes.
+
+    At the time t from mid-exposure the lights are rotated by -(rate t + acceleration t^2 / 2); the mean over the
+    exposure T is -acceleration T^2 / 24.
+    """
     mount, optics, exposure_s = testbed.mount, camera.optics, testbed.scene.exposure.time_s
     cam_from_lab = mount.cam_from_body * lab_from_body.inv()
     camera_m = lab_from_body.apply(mount.camera_body_m)
@@ -161,8 +173,11 @@ def view(
     arm_m = cam_from_lab.apply(chosen.place[:, :3])
     offset_m = arm_m - chosen.place[:, 3:] * mount.cam_from_body.apply(mount.camera_body_m)
     gradient = image_gradient(optics, offset_m)
-    rate_cam = mount.cam_from_body.apply(rate_body_rad_s)
-    streak_px = -exposure_s * np.einsum("nij,j->ni", np.cross(arm_m[:, None, :], gradient), rate_cam)
+    jacobian = np.cross(arm_m[:, None, :], gradient)
+    streak_px, bend_px = (
+        -factor * np.einsum("nij,j->ni", jacobian, mount.cam_from_body.apply(body))
+        for factor, body in ((exposure_s, rate_body_rad_s), (exposure_s**2 / 24, acceleration_body_rad_s2))
+    )
     depth_m = np.where(is_led, offset_m[:, 2], np.inf)
     disk_px = np.where(is_led, optics.camera.focal_px * chosen.radius_m / distance_m, 0.0)
     defocus_px = blur_radius_px(optics.camera, depth_m)
@@ -182,6 +197,7 @@ def view(
         sigma_px,
         streak_px,
         electrons * share + camera.background_e,
+        bend_px,
     )
 
 

@@ -30,7 +30,10 @@ STUDY: dict[str, Any] = {
     "factors": {"leds": {"key": "light.layout.count", "values": [500, 900]}},
     "responses": ["identified", "roll_arcsec_p95", "misidentified"],
 }
-NEVER = {"misidentified": 0, "roll_noise": 0, "wrong": 0, "ambiguous": 0, "refused": 0, "identified": 0}
+NEVER = {
+    **{"misidentified": 0, "roll_noise": 0, "misled": 0, "wrong": 0, "ambiguous": 0, "refused": 0},
+    **{"identified": 0},
+}
 
 
 def study(**keys: Any) -> Study:
@@ -53,20 +56,19 @@ def test_nowhere_ambiguous_has_a_confidence() -> None:
     """1 - 0.05^(1 / 10,000) is 0.02995 %."""
     texts = answer.headline(study(), [line(0, 500, 10_000)], True)
     assert said(texts, "Is it ambiguous anywhere?") == (
-        "Is it ambiguous anywhere? No. Ambiguous or misidentified:"
-        " none in 10,000 (less than 0.03 % at 95 % confidence)."
+        "Is it ambiguous anywhere? No. Ambiguous or misled: none in 10,000 (less than 0.03 % at 95 % confidence)."
     )
     assert pytest.approx(0.0002995, abs=1e-7) == 1 - 0.05 ** (1 / 10_000)
     assert [one for one in answer.headline(study(), [line(0, 500, 10_000)], False) if "ambiguous" in one] == []
 
 
 def test_ambiguous_somewhere_says_where_and_how_sure_it_is_of_the_rest() -> None:
-    """Misidentified attitudes count as ambiguous ones that the tracker did not notice."""
-    lines = [line(0, 500, 200, ambiguous=20, misidentified=10), line(1, 900, 400)]
+    """Misled attitudes count as ambiguous ones that the tracker did not notice."""
+    lines = [line(0, 500, 200, ambiguous=20, misled=10), line(1, 900, 400)]
     interval = metrics.proportion(30, 200)
     text = said(answer.headline(study(), lines, True), "Is it ambiguous anywhere?")
     assert text == (
-        "Is it ambiguous anywhere? Yes. Ambiguous or misidentified: at 1 of 2 points, most at leds = 500: 15 % of the"
+        "Is it ambiguous anywhere? Yes. Ambiguous or misled: at 1 of 2 points, most at leds = 500: 15 % of the"
         f" frames ({100 * interval.low:.3g} to {100 * interval.high:.3g} %); none in 400 (less than 0.75 % at 95 %"
         " confidence) at the other points."
     )
@@ -99,6 +101,19 @@ def test_the_fewest_trials_of_a_point_bound_what_was_never_seen() -> None:
     assert said(texts, "Misidentified").endswith("none in 100 a point (less than 3 % at 95 % confidence).")
 
 
+def test_wrong_matches_are_counted_and_their_effect_on_the_attitude() -> None:
+    """One of 90 matches is wrong in 25 of 200 frames: not an alarm if the errors are as claimed."""
+    one, other = line(0, 500, 200, misidentified=25), line(1, 900, 200)
+    for point, share in ((one, 25 / 18_000), (other, 0.0)):
+        point.responses["mismatched"] = Summary(share, math.nan, math.nan, 18_000)
+    texts = answer.headline(study(), [one, other], True)
+    assert "There 25 of 18,000 matches are wrong; the attitude is unaffected: all errors are as claimed." in texts
+    assert said(texts, "Is it ambiguous anywhere?").startswith("Is it ambiguous anywhere? No.")
+    one.responses["misled"] = metrics.proportion(10, 200)
+    (text,) = [text for text in answer.headline(study(), [one, other], True) if text.startswith("There 25")]
+    assert "the attitude errs more than claimed at 1 of 2 points, most at leds = 500: 5 % of the frames (2.74" in text
+
+
 def test_a_tracker_that_does_not_name_its_lights_is_not_called_right() -> None:
     unknown = line(0, 500, 100)
     unknown.responses["misidentified"] = metrics.NO_VALUE
@@ -111,10 +126,54 @@ def test_ranges_name_the_points_of_the_extremes_and_pass_over_those_of_few_value
     few.responses["roll_arcsec_p95"] = Summary(1.0, math.nan, math.nan, 3, 56)
     told = answer.ranges(study(), [*lines, few])
     assert told == [
-        "identified: 0.015 (0.00511..0.0432) at leds = 200, to 1 (0.981..1) at leds = 900.",
+        "identified: 0.015 (0.00511..0.0432) at leds = 200, to 1 (0.985..1) at leds = 900.",
         "roll_arcsec_p95: 100 (90..350) at leds = 500, to 200 (90..350) at leds = 900.",
     ]
-    assert answer.ranges(study(), [few])[1] == "roll_arcsec_p95: 1 (needs 56 more)."
+    assert answer.ranges(study(), [few])[1] == "roll_arcsec_p95: 1 (needs 56 more values)."
+
+
+def test_the_next_claim_says_how_many_trials_it_needs() -> None:
+    """ln 0.05 / ln(1 - 0.001) is 2,994.2; what was seen at every point makes no claim."""
+    texts = answer.headline(study(), [line(0, 500, 1200), line(1, 900, 5000)], False)
+    assert said(texts, "None in") == (
+        "None in 1,200 is less than 0.25 % at 95 % confidence; a claim of less than 0.1 % needs 2,995 in all at each"
+        " point without any."
+    )
+    seen = line(0, 500, 1200, misidentified=1, misled=1, roll_noise=1, wrong=1, ambiguous=1)
+    assert not [one for one in answer.headline(study(), [seen], False) if one.startswith("None in")]
+
+
+@pytest.mark.parametrize(
+    ("nees", "expected"),
+    [
+        ([(3.0, 2.8, 3.2), (3.1, 2.9, 3.3)], "Yes: NEES is 2.5 to 3.5 at all 2 points."),
+        (
+            [(3.0, 2.8, 3.2), (5.07, 4.6, 5.6)],
+            "No: too small by a factor of 1.3 at leds = 900 (NEES 5.07, 4.6 to 5.6; 3 if true), at 1 of 2 points.",
+        ),
+        (
+            [(0.75, 0.7, 0.8), (3.0, 2.8, 3.2)],
+            "No: too large by a factor of 2 at leds = 500 (NEES 0.75, 0.7 to 0.8; 3 if true), at 1 of 2 points.",
+        ),
+        (
+            [(3.0, 2.8, 3.2), (1e4, math.nan, math.nan)],
+            "No: too small by a factor of 58 at leds = 900 (NEES 1e+04, 1e+04 to 1e+04; 3 if true), at 1 of 2 points.",
+        ),
+        ([(3.0, 2.8, 3.2), (9.0, math.nan, math.nan)], "Yes: NEES is 2.5 to 3.5."),
+        (
+            [(3.0, 2.8, 3.2), (4.0, 2.0, 6.0)],
+            "Nothing says otherwise, but NEES is known to 2 to 6 only at leds = 900; more trials decide it.",
+        ),
+    ],
+)
+def test_claimed_errors_that_are_false_are_called_so(nees: list[tuple[float, float, float]], expected: str) -> None:
+    """The factor is sqrt(NEES / 3): 1.3 at 5.07, and 2 too large at 0.75."""
+    lines = [line(n, leds, 500) for n, leds in enumerate((500, 900))]
+    for one, values in zip(lines, nees, strict=True):
+        one.responses["nees"] = Summary(*values, 500)
+    texts = answer.headline(study(), lines, False)
+    assert said(texts, "Are the claimed errors true?") == f"Are the claimed errors true? {expected}"
+    assert len(answer.ranges(study(responses=["nees"]), lines)) == 1
 
 
 def test_before_the_first_trial_there_is_no_answer() -> None:
@@ -236,6 +295,20 @@ def test_findings_of_many_levels_are_few(tmp_path: Path) -> None:
     found = overview.overview(loaded(tmp_path, trial={"kind": "frames"}, factors={"size": sizes})).findings
     (wide,) = [one for one in found if "px wide; local treats" in one]
     assert wide.endswith("[first levels; with other numbers at all others]")
+
+
+def test_a_rolling_shutter_is_checked_at_the_rates_of_the_trials(tmp_path: Path) -> None:
+    """The scene turns by 0.5 deg/s and its trials by up to 20: the warning is of 20, and none is given at rest."""
+    shutter = {"camera.shutter": {"kind": "rolling", "row_time": "80 us"}}
+    rates = {"key": "trial.rate_deg_s", "values": [0, 20, 5]}
+    keys: dict[str, Any] = {"scene": "shefex2", "set": shutter, "trial": {"kind": "frames"}}
+    found = overview.overview(loaded(tmp_path, factors={"rate": rates}, **keys)).findings
+    (text,) = [one for one in found if one.startswith("camera.shutter: ")]
+    assert "at up to 20 deg/s; turn " in text
+    assert "the tracker does not correct for it (a gyro changes nothing)" in text
+    assert text.endswith("[rate = 20]")
+    still = overview.overview(loaded(tmp_path, factors={"rate": rates | {"values": [0]}}, **keys)).findings
+    assert [one for one in still if one.startswith("camera.shutter: ")] == []
 
 
 def test_a_report_begins_with_scene_findings_and_answers(tmp_path: Path) -> None:

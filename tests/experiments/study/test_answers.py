@@ -51,12 +51,16 @@ def test_responses_are_of_what_their_names_say():
         stars=[7, 5, 4, 2, np.nan],
         ambiguous=[0, 0, 0, 1, 0],
         misidentified=[0, 0, 1, 0, np.nan],
+        misled=[0, 0, 1, 0, np.nan],
+        wrong_matches=[0, 0, 3, 0, np.nan],
+        matched=[9, 0, 20, 1, 5],
         roll_noise=[1, 0, 0, 0, np.nan],
         streak_px=[1, 2, 6, 3, np.nan],
         centroid_px=[1, 1, 7, np.nan, np.nan],
     )
     said = {
-        **{"ambiguous": 1 / 4, "misidentified": 1 / 4, "roll_noise": 1 / 4},
+        **{"ambiguous": 1 / 4, "misidentified": 1 / 4, "misled": 1 / 4, "roll_noise": 1 / 4},
+        "mismatched": 3 / 30,
         **{"streak_px": 2.5, "centroid_px": math.sqrt(17), "nees": 33335.333333333336, "streak_px_worst": 6},
         **{"identified": 2 / 4, "wrong": 1 / 4, "refused": 1 / 4, "failed": 1 / 5, "overconfident": 1 / 3},
         **{"coverage": 2 / 4, "coverage_3": 3 / 4, "stars_least": 2, "stars_mean": 4.5},
@@ -189,6 +193,20 @@ def test_exports_say_what_the_store_says(tmp_path):
     assert dict(cube.sizes) == {"strays": 2, "focal": 2}
     assert float(cube.identified.sel(strays=5, focal="20 mm")) == lines[2].responses["identified"].value
     assert not list(tmp_path.glob(".*"))
+
+
+def test_a_csv_leaves_out_what_no_trial_has(tmp_path):
+    """A study of centroids has no pointing error and no streak; the columns that are left are the store's, in order."""
+    told, kept = done(tmp_path, STUDY)
+    with kept as rows:
+        export.export(rows, told.study.responses, tmp_path / "trials.csv")
+        columns = table.trial_columns(rows)
+    written = (tmp_path / "trials.csv").read_text().splitlines()[0].split(",")
+    empty = {"pointing_arcsec", "filter_arcsec", "streak_px", "body_tilt_deg"}
+    assert empty <= set(columns)
+    assert empty & set(written) == set()
+    assert {"trial", "status", "x_arcsec", "boresight_ra_deg", "strays"} <= set(written)
+    assert written == [name for name in columns if name in written]
 
 
 @pytest.mark.slow

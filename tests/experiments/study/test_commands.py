@@ -182,6 +182,11 @@ def test_a_table_at_80_columns_is_not_cut_and_names_what_it_drops(monkeypatch, c
         (("run", "question.yaml", "--set", "replicates"), "--set replicates: allowed: path.to.key=value"),
         (("run", "question.yaml", "--set", "replicates=0"), "replicates: 0 is not allowed"),
         (("run", "nothing"), "nothing: no such study; allowed: a .yaml file or one of dome_"),
+        (("run", "question"), "question: no such study; did you mean question.yaml?"),
+        (
+            ("list",),
+            "Allowed: run, resume, status, report, export, replay, worst, optimize; `skysim study` alone lists.",
+        ),
         (
             ("status", "question.yaml"),
             "out/question/study.sqlite: no such store; allowed: a store written by skysim study run",

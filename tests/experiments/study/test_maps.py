@@ -40,7 +40,7 @@ STUDY: dict[str, Any] = {
 def columns(count: int, sky: bool = False, low: float = 0.0, high: float = 30.0, **given: Any) -> Columns:
     """Solved trials in random directions, uniform in solid angle; `given` replaces columns."""
     table: dict[str, Any] = {name: np.full(count, np.nan) for name in FIELDS}
-    table |= {name: np.zeros(count) for name in ("wrong", "ambiguous", "misidentified", "roll_noise")}
+    table |= {name: np.zeros(count) for name in ("wrong", "ambiguous", "misidentified", "roll_noise", "misled")}
     table |= {"trial": np.arange(count), "point": np.zeros(count, int), "seed": np.arange(count)}
     table |= {"frames": np.ones(count), "solved": np.ones(count), "stars": np.full(count, 9.0)}
     table |= {name: np.ones(count) for name in ("x_arcsec", "y_arcsec", "roll_arcsec", "nees")}

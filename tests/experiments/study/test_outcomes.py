@@ -56,6 +56,7 @@ def test_a_light_matched_with_another_star_is_a_misidentification(spec: TrialSpe
         star[k] = star[k - 1]
         planted = scored(setup, with_match(report, star), lights)
         assert (planted.misidentified, planted.roll_noise, planted.wrong) == (1, 0, 0)
+        assert (planted.wrong_matches, planted.misled) == (1, 0)  # the attitude is the right one still
 
 
 @pytest.mark.parametrize("spec", [SKY, DOME])
@@ -68,6 +69,21 @@ def test_a_light_is_the_stars_own_within_three_pixels(spec: TrialSpec, distance_
     moved_px[match.observed[0]] += [distance_px, 0]
     moved = Report(report.attitude, replace(report.centroids, xy_px=moved_px))
     assert scored(setup, moved, lights).misidentified == wrong
+
+
+@pytest.mark.parametrize(("sigmas", "misled"), [(5.0, 0), (7.0, 1)])
+def test_wrong_lights_mislead_where_the_error_is_more_than_claimed(sigmas: float, misled: int) -> None:
+    """NEES 25 is allowed, 49 is not (40.8 has the probability 1e-8); with the right lights neither is misled."""
+    setup, report, lights = solved(SKY)
+    truth = setup.testbed.mount.cam_from_body * lights.lab_from_body.inv()
+    error = Rotation.from_rotvec([sigmas * 1e-6, 0, 0])
+    attitude = replace(report.attitude, cam_from_ref=error * truth, covariance_rad2=1e-12 * np.eye(3))
+    assert scored(setup, Report(attitude, report.centroids), lights).misled == 0
+    match = report.attitude.match
+    assert match is not None
+    star = match.star[[1, 0, *range(2, len(match.star))]]
+    planted = scored(setup, with_match(Report(attitude, report.centroids), star), lights)
+    assert (planted.misidentified, planted.wrong_matches, planted.misled) == (1, 2, misled)
 
 
 def test_a_light_displaced_in_the_exposure_is_still_its_stars() -> None:

@@ -361,6 +361,19 @@ def test_shares_are_drawn_from_zero_to_one() -> None:
     assert (other["cmap"] != "cividis", other["norm"].vmin, other["norm"].vmax) == (True, 3, 9)
 
 
+def test_a_curve_of_nees_has_a_line_at_three() -> None:
+    from matplotlib.figure import Figure as Canvas
+
+    lines = [PointRow(n, {"tilt": tilt}, {"nees": Summary(9.0, 8.0, 10.0, 99)}, 99) for n, tilt in enumerate((0, 10))]
+    curve, fig = Curve(kind="curve", x="tilt", y="nees"), Canvas()
+    figures.draw_curve(fig, lines, curve, study())
+    (axes,) = fig.axes
+    assert [one.get_ydata() for one in axes.lines if one.get_linestyle() == ":"] == [[3, 3]]
+    assert axes.get_ylim()[0] < 3
+    assert "Dotted: 3, where the claimed errors are true." in layout.caption(curve, study(), lines)
+    assert layout.expected_value("nees_p95") is layout.expected_value("cross_arcsec_mean") is None
+
+
 def test_a_heat_map_has_its_cells_in_order_and_nan_where_nothing_is(tmp_path: Path) -> None:
     asked = study(factors={"dome": DOME, "tilt": TILT})
     lines = lines_of(filled(tmp_path / "s.sqlite", asked, done=8 * 20), asked)

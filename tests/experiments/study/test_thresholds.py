@@ -63,10 +63,10 @@ def test_beyond_the_levels_there_is_no_number() -> None:
 
 
 def test_levels_that_are_not_certain_leave_the_end_open_and_say_what_they_need() -> None:
-    """All of 60: the exact lower bound is 0.025^(1/60) = 0.940; 72 trials would be enough, of which 12 are missing."""
+    """All of 60: the exact lower bound is 0.025^(1/60) = 0.940; 72 trials would be enough."""
     found = counted([60, 60, 60, 60, 39, 12, 5, 2], trials=60)
     assert metrics.exact_bounds(60, 60, 0.975)[0] == pytest.approx(0.025 ** (1 / 60))
-    assert (found.low, found.high, found.needs) == (-math.inf, 4, 12)
+    assert (found.low, found.high, found.needs) == (-math.inf, 4, ((0, 72),))
     assert counted([72, 72, 72, 72, 40, 12, 5, 2], trials=72).low == 3
 
 
@@ -137,7 +137,7 @@ def test_a_study_says_the_rate_at_which_95_percent_are_identified() -> None:
         "chain = fast: identified is at least 95 % at all levels of rate, 0 to 10 deg/s (95 %: above 10).",
     ]
     few = thresholds.sentences(study.thresholds[0], study, lines_of(study, curves, 60))
-    assert few[0].endswith("(95 %: below 4; 12 more trials at each level are needed).")
+    assert few[0].endswith("(95 %: below 4; needs about 72 trials at rate = 0 deg/s).")
 
 
 def test_a_level_of_the_sentence_has_its_unit() -> None:
@@ -177,12 +177,38 @@ def test_a_threshold_that_cannot_be_is_refused(tmp_path: Path, change: dict[str,
         loader.load(path)
 
 
-def test_a_limit_needs_as_many_trials_as_its_exact_bound() -> None:
-    """ceil(ln 0.025 / ln limit): 36 at 90 %, 72 at 95 %, 368 at 99 %; one fewer is not enough."""
-    for limit, needed in ((0.9, 36), (0.95, 72), (0.99, 368)):
-        found = crossing(np.array([0.0, 1.0]), np.array([1.0, 0.0]), np.array([1.0, 1.0]), limit)
-        assert found.needs == needed - 1
-        assert stats.binom.pmf(needed, needed, limit) <= 0.025 < stats.binom.pmf(needed - 1, needed - 1, limit)
+@pytest.mark.parametrize(
+    ("share", "limit", "needed"), [(1.0, 0.9, 36), (1.0, 0.95, 72), (1.0, 0.99, 368), (0.0, 0.95, 2), (0.98, 0.95, 0)]
+)
+def test_a_limit_needs_as_many_trials_as_its_exact_bound(share: float, limit: float, needed: int) -> None:
+    """ceil(ln 0.025 / ln limit): 36 at 90 %, 72 at 95 %, 368 at 99 %; of 98 % the fewest n by the binomial tail."""
+    found = thresholds.trials_needed(share, limit, above=share > limit)
+    if needed:
+        assert found == needed
+    else:  # integer hits n share bracket it: 50 more than enough, 50 fewer not
+        for count, enough in ((found + 50 - found % 50, True), (found - found % 50, False)):
+            hits = round(share * count)
+            assert (stats.binom.sf(hits - 1, count, limit) <= 0.025) == enough
+    assert thresholds.trials_needed(0.95, 0.95, above=True) == 0
+    assert thresholds.trials_needed(share, limit, above=share <= limit) == 0
+
+
+def test_a_level_on_the_wrong_side_is_closed_by_no_number_of_trials() -> None:
+    """All levels are above: nothing is said to be needed at the last one, however many trials there are."""
+    assert counted([60] * 8, trials=60).needs == ((0, 72),)
+    assert counted([400] * 8).needs == ()
+    both = counted([78, 77, 77, 77, 77, 76, 75, 75], trials=80)
+    assert [level for level, _ in both.needs] == [0, 10]
+
+
+def test_two_trials_give_two_levels_and_no_number() -> None:
+    """A step of one trial in two is no proportion near 95 %; 20 trials are the fewest that have one."""
+    study = Study.model_validate(STUDY)
+    curves = {"slow": [1, 1, 1, 0.5, 0.5, 0, 0, 0], "fast": [1.0] * 8}
+    (said, _) = thresholds.sentences(study.thresholds[0], study, lines_of(study, curves, 2))
+    assert "identified falls below 95 % between rate = 2 and 3 deg/s (95 %: below 6" in said
+    assert thresholds.too_few(np.array([19.0, 40]), 0.95)
+    assert not thresholds.too_few(np.array([20.0, 40]), 0.95)
 
 
 def test_a_threshold_is_one_of_a_proportion() -> None:

@@ -6,24 +6,25 @@ an error that the covariance allows). An event that was never seen has an upper 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from skysim.experiments.study.analysis import thresholds
+from skysim.experiments.study.analysis import claims, thresholds
 from skysim.experiments.study.analysis.axes import axis, distinct, unit_of
-from skysim.experiments.study.analysis.table import PointRow, format_level, format_summary, has_few_values
+from skysim.experiments.study.analysis.table import Place, PointRow, format_level, format_summary, has_few_values
 from skysim.experiments.study.factors import Value
 from skysim.experiments.study.plan import Study
 from skysim.results import metrics
 from skysim.results.metrics import Summary
 
 EVENTS = {
-    "misidentified": "Misidentified (a light matched with a wrong star or LED)",
+    "misidentified": "Misidentified (at least one light matched with a wrong star or LED)",
     "roll_noise": "Roll noise (the right lights, but a roll error beyond 10′ that the covariance allows)",
     "wrong": "Wrong attitudes (an error beyond 10′ that the covariance does not allow, or beyond 1°)",
 }
-RESPONSES = (*EVENTS, "ambiguous", "refused")  # responses that the answers need besides those of the study
+SHARES = (*EVENTS, "ambiguous", "misled", "refused")
+RESPONSES = (*SHARES, "mismatched", "nees")  # responses that the answers need besides those of the study
 
 
 def headline(
@@ -46,17 +47,15 @@ def headline(
         found.append(ambiguity(study, done, place))
     for name, text in EVENTS.items():
         found.append(event(text, [line.responses[name] for line in done], done, place))
-    return found
+        found += claims.effect_of_wrong_matches(done, place) if name == "misidentified" else []
+    return [*found, *claims.runs_needed(done, list(EVENTS)), *claims.claimed_errors(done, place)]
 
 
 def ranges(study: Study, lines: Sequence[PointRow]) -> list[str]:
     """Smallest and largest value of each response over the points, but of those that the headline is about."""
     done = [line for line in lines if line.trials]
     place = placer(study, done)
-    return [response_range(name, done, place) for name in study.responses if name not in RESPONSES] if done else []
-
-
-Place = Callable[[PointRow], str]
+    return [response_range(name, done, place) for name in study.responses if name not in SHARES] if done else []
 
 
 def placer(study: Study, lines: Sequence[PointRow]) -> Place:
@@ -98,15 +97,15 @@ def event(text: str, shares: Sequence[Summary], lines: Sequence[PointRow], place
 
 
 def ambiguity(study: Study, lines: Sequence[PointRow], place: Place) -> str:
-    """Whether the lights of some attitude fit another one as well: refused as ambiguous, or misidentified."""
+    """Whether the lights of some attitude fit another one as well: refused as ambiguous, or misled."""
     shares = []
     for line in lines:
-        refused, wrong = line.responses["ambiguous"], line.responses["misidentified"]
+        refused, wrong = line.responses["ambiguous"], line.responses["misled"]
         either = refused.value + np.nan_to_num(wrong.value)
         share = metrics.proportion(round(either * refused.trials), refused.trials)
         shares.append(share._replace(value=either))
     unit = ", each with hardware of its own" if study.hardware else ""
-    text = event("Ambiguous or misidentified", shares, lines, place)
+    text = event("Ambiguous or misled", shares, lines, place)
     never = all(share.value == 0 for share in shares)
     return f"Is it ambiguous anywhere{unit}? {'No' if never else 'Yes'}. {text}"
 

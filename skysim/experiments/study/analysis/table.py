@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +27,9 @@ class PointRow(NamedTuple):
     levels: dict[str, Any]
     responses: dict[str, Summary]
     trials: int = 0
+
+
+Place = Callable[[PointRow], str]  # names a point in words
 
 
 def table(store: Store, responses: Sequence[str]) -> list[PointRow]:
@@ -83,7 +86,7 @@ def format_summary(summary: Summary) -> str:
         return "-"
     value, low, high = (0.0 if abs(one) < ROUNDING else one for one in summary[:3])
     if summary.needs:
-        return f"{value:.3g} (needs {summary.needs} more)"
+        return f"{value:.3g} (needs {summary.needs} more values)"
     if np.isnan(low) or low == high:
         return f"{value:.3g}"
     return f"{value:.3g} ({low:.3g}..{high:.3g})"

@@ -8,6 +8,7 @@ other, so more levels between the two make it shorter.
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -24,6 +25,7 @@ from skysim.experiments.study.plan import Curve, Study, Threshold
 from skysim.results import metrics
 
 TAIL = (1 - metrics.CONFIDENCE) / 2
+MOST_TRIALS = 1_000_000  # more trials than that are no advice
 MISFIT_PROBABILITY = 1e-3  # of a monotonic curve that differs from its isotonic fit by more than the accepted deviance
 
 
@@ -33,14 +35,17 @@ class Crossing(NamedTuple):
     value    : the estimate; -inf or inf if it is beyond the levels, NaN if the proportion neither rises nor falls
     low, high: interval at CONFIDENCE; -inf or inf where no level is certain
     rising   : whether the proportion rises along the factor
-    needs    : how many more trials at each level a certain level requires, if none of its trials fails
+    between  : the two levels between which it crosses, where trials are so few that the estimate is no more than that
+               (`too_few`); None otherwise
+    needs    : of each open end that more trials would close, a level, and about how many trials it takes in all
     """
 
     value: float
     low: float
     high: float
     rising: bool
-    needs: int
+    between: tuple[float, float] | None = None
+    needs: tuple[tuple[float, int], ...] = ()
 
 
 # Estimation.
@@ -59,25 +64,48 @@ def crossing(x: Floats, hits: Floats, trials: Floats, limit: float, log: bool = 
     """
     fits = {rising: isotonic(hits / trials, trials, rising) for rising in (False, True)}
     rising = log_likelihood(hits, trials, fits[True]) > log_likelihood(hits, trials, fits[False])
-    needed = math.ceil(math.log(TAIL) / math.log(limit))
-    needs = max(needed - int(trials.min()), 0)
     deviance = 2 * (log_likelihood(hits, trials, hits / trials) - log_likelihood(hits, trials, fits[rising]))
     if deviance > scipy.stats.chi2.isf(MISFIT_PROBABILITY, max(len(x) - 1, 1)):
-        return Crossing(math.nan, -math.inf, math.inf, rising, needs)
+        return Crossing(math.nan, -math.inf, math.inf, rising)
     # In the order in which the proportion falls, `above` and `below` are certain levels.
     order = slice(None, None, -1) if rising else slice(None)
     sign = -1.0 if rising else 1.0
     places, fit = (np.log(x) if log else x)[order], fits[rising][order]
-    value = sign * math.inf
+    value, between = sign * math.inf, None
     below = np.flatnonzero(fit < limit)
     if len(below):
         n = int(below[0])
         share = (fit[n - 1] - limit) / (fit[n - 1] - fit[n]) if n else 0.0
         value = float(places[n - 1] + share * (places[n] - places[n - 1])) if n else -sign * math.inf
         value = math.exp(value) if log and n else value
+        if n and too_few(trials, limit):
+            first, second = sorted(x[order][n - 1 : n + 1].tolist())
+            between = first, second
     above, beneath = certain_levels(x[order], hits[order], trials[order], limit)
     ends = (-sign * math.inf if above is None else above, sign * math.inf if beneath is None else beneath)
-    return Crossing(value, min(ends), max(ends), rising, needs)
+    open_ends = [end for end, level in ((0, above), (-1, beneath)) if level is None]
+    needs = [(float(x[order][end]), trials_needed(float(fit[end]), limit, above=end == 0)) for end in open_ends]
+    return Crossing(value, min(ends), max(ends), rising, between, tuple((at, n) for at, n in needs if n))
+
+
+def too_few(trials: Floats, limit: float) -> bool:
+    """Whether one trial is more than what separates the limit from 0 or 1: a proportion then has no value near it."""
+    return bool(trials.min() < 1 / min(limit, 1 - limit))
+
+
+def trials_needed(share: float, limit: float, above: bool) -> int:
+    """About how many trials make a level of this proportion certainly above (or below) the limit; 0 if none would.
+
+    The fewest n whose exact bound for n share hits is beyond the limit, a guess as good as the share is known.
+    """
+    side, sign = (0, 1.0) if above else (1, -1.0)
+
+    def certain(count: int) -> bool:
+        return sign * (metrics.exact_bounds(share * count, count, 1 - TAIL)[side] - limit) >= 0
+
+    if not certain(MOST_TRIALS):
+        return 0
+    return bisect.bisect_left(range(MOST_TRIALS), True, lo=1, key=certain)
 
 
 def isotonic(proportion: Floats, weight: Floats, rising: bool) -> Floats:
@@ -171,18 +199,22 @@ def describe(found: Crossing | None, threshold: Threshold, axis: Axis) -> str:
     if math.isnan(found.value):
         return f"{response} neither rises nor falls along {name}, so no level of it is a threshold."
     first, last = (axis.coordinate(one) for one in (axis.levels[0], axis.levels[-1]))
+    crosses = f"{response} {'reaches' if found.rising else 'falls below'} {limit}"
     if math.isinf(found.value):
         everywhere = (found.value > 0) != found.rising
         text = f"{response} is {'at least' if everywhere else 'below'} {limit} at all levels of {name}, "
         text += f"{first:.4g} to {last:.4g}{unit}"
+    elif found.between:
+        text = f"{crosses} between {name} = {found.between[0]:.4g} and {found.between[1]:.4g}{unit}"
     else:
-        text = f"{response} {'reaches' if found.rising else 'falls below'} {limit} at {name} = {found.value:.4g}{unit}"
-    return f"{text} ({interval_text(found)})."
+        text = f"{crosses} at {name} = {found.value:.4g}{unit}"
+    return f"{text} ({interval_text(found, name, unit)})."
 
 
-def interval_text(found: Crossing) -> str:
-    """The interval of a crossing in words, and how many trials more it takes where an end is open."""
-    needs = f"; {found.needs} more trials at each level are needed" if found.needs else ""
+def interval_text(found: Crossing, name: str, unit: str) -> str:
+    """The interval of a crossing in words, and how many trials it takes in all where an end is open."""
+    counts = " and ".join(f"about {trials:,} trials at {name} = {level:.4g}{unit}" for level, trials in found.needs)
+    needs = f"; needs {counts}" if counts else ""
     low, high = (f"{end:.4g}" for end in (found.low, found.high))
     if math.isinf(found.low) and math.isinf(found.high):
         return f"{100 * metrics.CONFIDENCE:g} %: no level is certain{needs}"

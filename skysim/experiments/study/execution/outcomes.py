@@ -37,7 +37,8 @@ class Outcome:
     frames, solved, wrong : number of frames, of solved frames, and of wrong solutions (`metrics.is_wrong`)
     x_arcsec, y_arcsec, roll_arcsec : error in camera axes, signed (RMS for a flight); NaN without a solution
     nees     : e^T P^-1 e with three degrees of freedom and the tracker's covariance P; mean for a flight
-    stars    : true sources on the detector, minimum for a flight.  detected, matched : numbers, means for a flight
+    stars    : true sources on the detector, minimum for a flight
+    detected, matched : numbers of detections and of lights matched with a star or LED, means for a flight
     availability : fraction of a flight's ticks with a filter error below ten arcminutes; without a filter, fraction
                of its frames solved correctly
     filter_arcsec, filter_worst_arcsec : angular error of a flight's filter, RMS and worst
@@ -49,6 +50,9 @@ class Outcome:
                SAME_LIGHT_PX from the true image of that star or LED; NaN if the tracker does not name its lights
     roll_noise : number of frames solved with the right lights and a roll error beyond ten arcminutes that the
                covariance allows; NaN likewise
+    misled   : number of misidentified frames whose error the covariance does not allow: the wrong lights moved the
+               attitude beyond what the tracker claims; NaN likewise
+    wrong_matches : number of lights that are matched with a wrong star or LED; NaN likewise
     centroid_px : RMS error of the centroids about each axis, of those within SAME_LIGHT_PX of a true image
     streak_px : length of the images of the lights, median of a frame and mean for a flight; NaN for centroid trials
     lab_from_body_w, _x, _y, _z : true attitude at mid-exposure; of the worst frame for a flight (`worst_frame`)
@@ -76,6 +80,8 @@ class Outcome:
     ambiguous: int = 0
     misidentified: float = math.nan
     roll_noise: float = math.nan
+    misled: float = math.nan
+    wrong_matches: float = math.nan
     centroid_px: float = math.nan
     streak_px: float = math.nan
     lab_from_body_w: float = math.nan
@@ -89,6 +95,7 @@ class Outcome:
 
 
 FIELDS = tuple(field.name for field in fields(Outcome))
+IDENTITY = ("misidentified", "roll_noise", "misled", "wrong_matches")  # unknown of an external tracker
 FAILED = Outcome("failed")
 DIRECTION = FIELDS[-8:]  # attitude and direction
 
@@ -132,8 +139,7 @@ def score(testbed: Testbed, estimator: factory.Estimator, report: Report, lights
         "detected": len(centroids_px),
         "matched": len(solution.match.observed) if solution.match else 0,
         "ambiguous": int(solution.status.startswith(AMBIGUOUS)),
-        "misidentified": 0.0 if own_tracker else math.nan,
-        "roll_noise": 0.0 if own_tracker else math.nan,
+        **dict.fromkeys(IDENTITY, 0.0 if own_tracker else math.nan),
         "centroid_px": centroid_error_px(centroids_px, lights.flux_xy_px, reach_px),
         "streak_px": streak_px,
         **directions(testbed, lab_from_body, cam_from_lab),
@@ -145,10 +151,11 @@ def score(testbed: Testbed, estimator: factory.Estimator, report: Report, lights
     if solution.match is not None and own_tracker:
         claimed_px = claimed_image_px(testbed, estimator, solution.match, lab_from_body, cam_from_lab)
         observed_px = centroids_px[solution.match.observed]
-        misidentified = is_misidentified(observed_px, claimed_px, lights, reach_px)
+        wrong_matches = count_wrong_matches(observed_px, claimed_px, lights, reach_px)
         allowed = nees <= metrics.OVERCONFIDENT_NEES
-        noise = not misidentified and abs(error[2]) > metrics.WRONG_RAD and allowed
-        common |= {"misidentified": float(misidentified), "roll_noise": float(noise)}
+        noise = not wrong_matches and abs(error[2]) > metrics.WRONG_RAD and allowed
+        found = (wrong_matches > 0, noise, wrong_matches > 0 and not allowed, wrong_matches)
+        common |= dict(zip(IDENTITY, map(float, found), strict=True))
     x, y, roll = (error / ARCSEC_RAD).tolist()
     return Outcome("solved", 1, 1, int(wrong), x, y, roll, nees, **common)
 
@@ -183,18 +190,18 @@ def claimed_image_px(
     return testbed.optics.project(quaternion.to_rotation(cam_from_lab).apply(offset_lab))
 
 
-def is_misidentified(observed_px: Floats, claimed_px: Floats, lights: TrueLights, reach_px: float) -> bool:
-    """Whether any of K lights is matched with a star or LED whose true image is farther than reach_px from it.
+def count_wrong_matches(observed_px: Floats, claimed_px: Floats, lights: TrueLights, reach_px: float) -> int:
+    """How many of K lights are matched with a star or LED whose true image is farther than reach_px from them.
 
     observed_px : (K, 2) centroids;  claimed_px : (K, 2) true images at mid-exposure of the matched stars or LEDs
     The image of a pulsed LED, or under a rolling shutter, is displaced over the exposure: that of the light nearest to
     the claimed image is added.
     """
     if not len(lights.xy_px):
-        return len(observed_px) > 0
+        return len(observed_px)
     nearest, _ = nearest_light(claimed_px, lights.xy_px)
     expected_px = claimed_px + lights.flux_xy_px[nearest] - lights.xy_px[nearest]
-    return not bool(np.all(np.linalg.norm(observed_px - expected_px, axis=1) <= reach_px))
+    return int(np.sum(~(np.linalg.norm(observed_px - expected_px, axis=1) <= reach_px)))  # NaN is wrong
 
 
 def centroid_error_px(centroids_px: Floats, true_px: Floats, reach_px: float) -> float:
@@ -271,10 +278,9 @@ def summarize_flight(testbed: Testbed, outcomes: list[Outcome], settle_s: float)
         rms(pointing),
         float(pointing.max()) if len(pointing) else math.nan,
         sum(one.ambiguous for one in outcomes),
-        sum(one.misidentified for one in outcomes) if outcomes else math.nan,
-        sum(one.roll_noise for one in outcomes) if outcomes else math.nan,
-        rms(finite([one.centroid_px for one in outcomes])),
-        mean(finite([one.streak_px for one in outcomes])),
+        **{name: sum(getattr(one, name) for one in outcomes) if outcomes else math.nan for name in IDENTITY},
+        centroid_px=rms(finite([one.centroid_px for one in outcomes])),
+        streak_px=mean(finite([one.streak_px for one in outcomes])),
         **{name: getattr(worst, name) for name in DIRECTION},
     )
 

@@ -20,7 +20,7 @@ from skysim.experiments.study.execution.trials import Row, Segment
 from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Plan
 from skysim.experiments.study.store import Store, to_sql
 from skysim.results.files import frames
-from skysim.results.report import annotate
+from skysim.results.report import annotate, visible
 from skysim.simulation import run
 from skysim.tracking import factory
 
@@ -68,7 +68,8 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
                 pictures.append(folder / f"frame_{frame.index:04d}.annotated.png")
                 match, xy_px = report.attitude.match, report.centroids.xy_px
                 matched_px = xy_px[match.observed] if match else np.empty((0, 2))
-                picture = annotate(frame.image_dn, xy_px, matched_px, truth_px=truth.sources.xy_px)
+                truth_px = truth.sources.xy_px[visible(truth.sources)]
+                picture = annotate(frame.image_dn, xy_px, matched_px, truth_px=truth_px)
                 file_io.write_image(pictures[-1], picture)
         except Exception:
             if row.error is None:

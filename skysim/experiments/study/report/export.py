@@ -17,13 +17,22 @@ from skysim.results.files.export import EXTRA
 
 
 def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
-    """Write one line per trial, missing values empty; numbers in Python's shortest form, which reads back exactly."""
-    columns = trial_columns(store)
+    """Write one line per trial, missing values empty; numbers in Python's shortest form, which reads back exactly.
+
+    Columns without any value are left out: of a study of frames, for example, those of flights.
+    """
+    every = trial_columns(store)
+    columns = {name: column for name, column in every.items() if any(map(has_value, column.tolist()))} or every
     with files.atomic_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
         for row in zip(*(column.tolist() for column in columns.values()), strict=True):
-            writer.writerow(["" if value is None or value != value else value for value in row])
+            writer.writerow([value if has_value(value) else "" for value in row])
+
+
+def has_value(value: Any) -> bool:
+    """Whether a value is neither None nor NaN."""
+    return value is not None and value == value
 
 
 def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:

@@ -52,6 +52,8 @@ def draw_curve(fig: Any, lines: Sequence[PointRow], figure: Curve, study: Study)
     dots = layout.draws_medians(study, x_axis, sum(len(one.x) for one in shown))
     set_up_y_axis(axes, figure.y, shown, figure.log, not dots)
     set_up_x_axis(axes, x_axis)
+    if (expected := layout.expected_value(figure.y)) is not None:
+        axes.axhline(expected, color="#777777", linestyle=":", linewidth=1.2)
     group_axis = axis(study, lines, figure.by) if figure.by is not None else None
     for n, one in enumerate(shown):
         ink = color(n, len(shown), group_axis is not None and group_axis.numeric)
@@ -88,7 +90,9 @@ def draw_thresholds(axes: Any, figure: Curve, study: Study, lines: Sequence[Poin
 def set_up_y_axis(axes: Any, name: str, shown: Sequence[Series | Panel], log: bool, bars: bool = True) -> None:
     """Set up the y axis: limits that include all values and, if drawn, their error bars; label and scale."""
     bounds = [end for one in shown for end in (one.low, one.high)] if bars else []
-    low, high = layout.limits([one.value for one in shown], bounds, log, is_share(name))
+    expected = layout.expected_value(name)
+    marked = [np.array([expected])] if expected is not None else []
+    low, high = layout.limits([*(one.value for one in shown), *marked], bounds, log, is_share(name))
     if log:
         logarithmic(axes, "y", low, high)
     axes.set_ylim(low, high)

@@ -180,6 +180,11 @@ def limits(values: Sequence[Floats], bounds: Sequence[Floats], log: bool, share:
     return low - (pad if low else pad / 2), high + pad
 
 
+def expected_value(name: str) -> float | None:
+    """The value of a response if the tracker's claims are true, to be drawn as a line: 3 for the mean NEES."""
+    return 3.0 if metrics.split_name(name) == ("nees", "mean") else None
+
+
 # Candidates of an optimization.
 
 
@@ -221,6 +226,8 @@ def caption(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
     text += "."
     if isinstance(figure, Curve) and thresholds_of(figure, study, lines):
         text += " Dashed: a limit; ticks and bars: where it is crossed, with intervals of 95 %."
+    if isinstance(figure, Curve) and expected_value(value) is not None:
+        text += f" Dotted: {expected_value(value):g}, where the claimed errors are true."
     if any(has_few_values(line, value) for line in shown):
         mark = "Hollow, without a line" if isinstance(figure, Curve) else "Dotted"
         text += f" {mark}: few of the point's trials have a value (n of them), and these are the easy ones."

@@ -11,11 +11,13 @@ import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.types import Floats
 from skysim.experiments.study.analysis.table import format_level
 from skysim.experiments.study.designs import Point, make_point
+from skysim.experiments.study.execution.trials import rate_axis
 from skysim.experiments.study.factors import Distribution, Factor, Range
 from skysim.experiments.study.loader import fixed_seeds, may_report_ambiguity
-from skysim.experiments.study.plan import FlightTrial, Plan, Trial, resolve_point
+from skysim.experiments.study.plan import FlightTrial, FrameTrial, Plan, Trial, resolve_point
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import DomeConfig, StarsConfig
@@ -24,6 +26,7 @@ from skysim.simulation.checks.facts import TRACKER_KNOWS, Fact
 from skysim.simulation.testbed import Testbed, build_testbed
 
 NUMBER = re.compile(r"\d[\d.]*")
+RATE = "trial.rate_deg_s"
 MAX_CHECKED = 8  # scenes that are checked: building one takes up to a second
 
 
@@ -31,7 +34,7 @@ class Overview(NamedTuple):
     """What a report begins with.
 
     rows     : names and texts of the scene table, for the first level of every factor
-    findings : of the checks, each with the levels at which it was found
+    findings : of the checks, each with the levels at which it was found; at the rates of the study's trials
     may_be_ambiguous : whether the tracker can refuse a frame as ambiguous
     fixed    : seeds of hardware that all trials share, see `loader.fixed_seeds`
     """
@@ -53,7 +56,7 @@ def overview(plan: Plan) -> Overview:
         try:
             scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(point.settings, 0))
             testbed = build_testbed(scene, plan.spec.programs)
-            found_here = checks.check(testbed, greatest_tilt_deg(scene, trial))
+            found_here = checks.check(testbed, greatest_tilt_deg(scene, trial), trial_rate_rad_s(trial, testbed))
         except InputError:
             continue
         checked += 1
@@ -82,11 +85,29 @@ def finding_text(at: list[tuple[str, str]], checked: int) -> str:
     return f"{line} [{'; '.join([first, *others])}]"
 
 
+def trial_rate_rad_s(trial: Trial, testbed: Testbed) -> Floats | None:
+    """(3,) rate of a trial of a single attitude in body axes; None for a flight, whose scene has its rates."""
+    if isinstance(trial, FlightTrial):
+        return None
+    if not isinstance(trial, FrameTrial):
+        return np.zeros(3)
+    # A random axis is taken between the camera's x and y: rows of a rolling shutter are both sheared and stretched.
+    axis_cam = rate_axis(trial.rate_axis, math.pi / 4, testbed.mount)
+    return np.asarray(testbed.mount.cam_from_body.inv().apply(math.radians(trial.rate_deg_s) * axis_cam))
+
+
 def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:
-    """The point of all first levels, then each other level of one factor that changes the scene, with its name."""
+    """The point of all first levels, then the greatest rate of trials, then each other level of one factor that changes
+    the scene, with its name.
+    """
     factors = plan.study.factors
     first = {name: options(factor)[0] for name, factor in factors.items()}
     yield "first levels", make_point(first)
+    for name, factor in factors.items():
+        rates = [option for option in options(factor) if isinstance(option[1].get(RATE), int | float)]
+        fastest = max(rates, key=lambda option: float(str(option[1][RATE])), default=None)
+        if fastest is not None and fastest != first[name]:
+            yield f"{name} = {format_level(fastest[0])}", make_point(first | {name: fastest})
     for name, factor in factors.items():
         for value, settings in options(factor)[1:]:
             if any(not key.startswith("trial.") for key in settings):
