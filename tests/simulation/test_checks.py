@@ -14,8 +14,8 @@ from skysim.camera.optics import disk_image_axes
 from skysim.camera.psf.kernel import Kernel
 from skysim.core.types import Floats
 from skysim.scene import loader
-from skysim.simulation.checks import dome as checks
 from skysim.simulation.checks import plan
+from skysim.simulation.checks.dome import assumptions as checks
 from skysim.simulation.testbed import Testbed, build_testbed
 
 RIM_RAD = np.linspace(0, 2 * np.pi, 3600, endpoint=False)

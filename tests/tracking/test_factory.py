@@ -18,7 +18,8 @@ from skysim.core.types import Floats, Frame, Telemetry
 from skysim.dynamics import imu, multibody
 from skysim.scene import loader
 from skysim.simulation import run
-from skysim.simulation.checks import check, dome
+from skysim.simulation.checks import check
+from skysim.simulation.checks.dome import assumptions
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking import exposure_control
 from skysim.tracking.exposure_control import ExposureController
@@ -317,7 +318,7 @@ def test_under_the_stars_there_is_no_surface_to_doubt() -> None:
 def test_what_no_tracker_copes_with_is_doubted(changes: dict[str, str], told: str) -> None:
     """By hand: 8 mm at 33 in, 36.5 mm before pixels of 4 um, is 87 px; focused at 20 in 4.4 mm of pupil blur by 32."""
     testbed = build_testbed(loader.load("afit_simsat", changes))
-    lines = dome.warnings(testbed.scene, testbed.sources, testbed.mount)
+    lines = assumptions.warnings(testbed.scene, testbed.sources, testbed.mount)
     assert len(lines) == 1
     assert lines[0].startswith(told)
     assert lines[0] in check(testbed).findings

@@ -13,9 +13,10 @@ from skysim.camera.psf.otf import blur_radius_px
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.light import DomeConfig, StarsConfig
-from skysim.simulation.checks import attitudes, beliefs, dome
+from skysim.simulation.checks import attitudes, beliefs
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, full_scale_e
+from skysim.simulation.checks.dome import assumptions
 from skysim.simulation.checks.expected_error import Expected, mean_root
 from skysim.simulation.checks.views import View
 from skysim.sources.dome.shell.room import fit
@@ -114,7 +115,7 @@ def image_shape(context: Context, samples: Samples) -> Fact | None:
     testbed = context.testbed
     if not isinstance(testbed.scene.light, DomeConfig):
         return None
-    note = dome.round_disk_note(testbed.scene, testbed.sources, testbed.mount)
+    note = assumptions.round_disk_note(testbed.scene, testbed.sources, testbed.mount)
     return Fact("image shape", [note], {}) if note else None
 
 

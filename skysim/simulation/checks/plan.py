@@ -10,9 +10,10 @@ from skysim.camera import wcs
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
 from skysim.scene.sections.light import DomeConfig, StarsConfig
-from skysim.simulation.checks import attitudes, dome, lookalike
+from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, context_of, usable
+from skysim.simulation.checks.dome import assumptions, lookalike
 from skysim.simulation.checks.expected_error import expected
 from skysim.simulation.checks.facts import FACTS, Fact, Sampled, Samples
 from skysim.simulation.checks.findings import FINDINGS
@@ -45,7 +46,7 @@ def check(testbed: Testbed, tilt_deg: float | None = None, rate_body_rad_s: Floa
     Raises InputError for unreadable files, and for a maneuver that a run would refuse.
     """
     scene = testbed.scene
-    first = [line for line in [dome.camera_outside_warning(scene, testbed.mount)] if line]
+    first = [line for line in [assumptions.camera_outside_warning(scene, testbed.mount)] if line]
     if first:
         return Check([], first)  # all else assumes that the camera is inside
     context = context_of(testbed)
@@ -81,4 +82,4 @@ def broken_assumptions(testbed: Testbed) -> list[str]:
         return [line for line in [wcs.accuracy_warning(scene.camera)] if line]
     if not isinstance(scene.light, DomeConfig):
         return []
-    return dome.warnings(scene, testbed.sources, testbed.mount)
+    return assumptions.warnings(scene, testbed.sources, testbed.mount)

@@ -106,12 +106,12 @@ def render(
     """Simulate a scene and write its frames with their truth, without solving them."""
     from skysim.results.run import Recorder
     from skysim.simulation import run as simulation
-    from skysim.simulation.checks import dome
+    from skysim.simulation.checks.dome import assumptions
     from skysim.simulation.testbed import build_testbed
 
     loaded = load(scene, frames, seed, set_)
     testbed = build_testbed(loaded)
-    if warning := dome.camera_outside_warning(loaded, testbed.mount):
+    if warning := assumptions.camera_outside_warning(loaded, testbed.mount):
         terminal.print_error(warning)
     with terminal.progress_callback("simulating the motion") as update:
         testbed = simulation.simulate_motion(testbed, update)
