@@ -35,7 +35,7 @@ from estimator.identification.chance import (
     MIN_MATCHES,
     log10_tail,
 )
-from estimator.identification.stars import quads, search
+from estimator.identification.stars import evidence, quads, search
 from estimator.identification.stars.evidence import Detections, Solution
 from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, process_frame
 
@@ -75,6 +75,7 @@ UNCALIBRATED_SEARCHES = (
     SearchModel(1.0, 0.005, 200_000),
     SearchModel(2.0, 0.01, 100_000),
 )
+MISFIT_SHARE = 0.8  # near misses per match; centroid errors that are claimed three times too small give up to 0.75
 MAX_DISTORTION_SIGMA = 1.5  # of an undistorted lens
 # A detection brighter than its star by this much is a mismatch: more than colors, variables and doubles explain.
 TOO_BRIGHT_MAG = 2.0
@@ -267,6 +268,8 @@ class StarTracker:
             clock.lap("identify")
             if not len(solution.star):
                 continue
+            if not self.focal_uncertainty and self._misfits(solution, centroids):
+                continue
             attitude = self.attitude_of(centroids, solution, sigma_px)
             if self.focal_uncertainty and not (
                 model.min_error_px == MIN_ERROR_PX and self._fits(solution, centroids, sigma_px)
@@ -310,11 +313,28 @@ class StarTracker:
         score = np.sum(q * np.sum(offset * residual_px, axis=1)) / np.sqrt(np.sum(q**2 * r2 * sigma_px[observed] ** 2))
         if abs(score) > MAX_DISTORTION_SIGMA:
             return False
-        radius_px = self._lens_radii_px[0]
-        near, _ = self._nearest(centroids, camera, cam_from_ref, radius_px)
-        rows, _ = self.in_field(camera, cam_from_ref)
-        covered = len(rows) * np.pi * radius_px**2 / (camera.width_px * camera.height_px)
-        return len(near) <= count + 1 + 2 * covered * (len(centroids) - count)
+        near, by_chance = self._near_misses(solution, centroids)
+        return near <= 1 + 2 * by_chance
+
+    def _misfits(self, solution: Solution, centroids: Centroids) -> bool:
+        """Whether about as many stars are beside detections, beyond their errors, as on them.
+
+        The camera model is then wrong (a rolling shutter that turns, a strong distortion). The stars that match are
+        those of a part of the field, and their attitude is that of this part.
+        """
+        matched = len(solution.star)
+        if len(centroids) - matched < MISFIT_SHARE * matched:
+            return False
+        near, by_chance = self._near_misses(solution, centroids)
+        return near - by_chance > max(MISFIT_SHARE * matched, 3 * np.sqrt(by_chance))
+
+    def _near_misses(self, solution: Solution, centroids: Centroids) -> tuple[int, float]:
+        """Number of unmatched detections beside a star, and how many are expected by chance."""
+        gate_rad = min(self._lens_radii_px[0] / self.camera.focal_px, 0.05)
+        tangent = self.camera.tangents(np.delete(centroids.xy_px, solution.observed, axis=0))
+        R = Rotation.from_quat(solution.cam_from_ref_xyzw).as_matrix()
+        near = evidence.count_near(tangent, self.sky, R, solution.focal_ratio, gate_rad)
+        return near, len(tangent) * min(len(self.stars) * gate_rad**2 / 4, 1.0)
 
     def attitude_of(self, centroids: Centroids, solution: Solution, sigma_px: Floats) -> Attitude:
         """The attitude of a solution; solved again from its matches if the settings name another solver."""

@@ -197,6 +197,16 @@ def _match(
 
 
 @jit
+def count_near(tangent: Floats, sky: SkyIndex, R_cam_from_ref: Floats, focal_ratio: float, gate_rad: float) -> int:
+    """Number of detections with a star within a gate."""
+    R_ref_from_cam, count = R_cam_from_ref.T.copy(), 0
+    for n in range(len(tangent)):
+        x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
+        count += nearest(sky.vectors, sky.cell_first, sky.cell_star, sky.side, x, y, z, gate_rad)[0] >= 0
+    return count
+
+
+@jit
 def project(vectors_ref: Floats, R: Floats, star: int) -> vectors.Vector:
     """Project a star into camera axes: x / z, y / z, and z."""
     x, y, z = vectors.rotate(R, vectors.row(vectors_ref, star))
