@@ -342,6 +342,7 @@ def test_a_measured_lens_is_read_from_fits_and_png_too(tmp_path: Path) -> None:
         ("words.csv", "1,2,3\n4,five,6\n7,8,9\n", "five"),
         ("oblong.csv", "1,2,3\n4,5,6\n", "shape (2, 3); allowed: a square"),
         ("dark.csv", "0,0,0\n0,0,0\n0,0,0\n", "add up to 0; allowed"),
+        ("negative.csv", "0,0,0\n0,-1,0\n0,0,0\n", "add up to -1; allowed"),
         ("hole.csv", "1,2,3\n4,nan,6\n7,8,9\n", "add up to nan; allowed"),
         ("cut.fits", "SIMPLE  =", "not a complete FITS file"),
         ("cut.png", "no picture", "cannot be decoded"),
