@@ -302,8 +302,12 @@ def test_gimbals_at_their_limit_keep_the_direction(steering):
 
 def test_a_gyro_may_lie_at_any_angle():
     """Gimbal and rotor at 45 deg between x and y: at right angles, though no product of their components is zero."""
-    one = CmgSet(np.sqrt([[0.5], [0.5], [0.0]]), np.sqrt([[0.5], [0.5], [0.0]]) * [[1], [-1], [1]], np.array([0.01]), 1.0)
-    np.testing.assert_allclose(one.momentum(np.zeros(1), np.array([100.0])), np.sqrt([0.5, 0.5, 0.0]) * [1, -1, 1], rtol=1e-12)
+    one = CmgSet(
+        np.sqrt([[0.5], [0.5], [0.0]]), np.sqrt([[0.5], [0.5], [0.0]]) * [[1], [-1], [1]], np.array([0.01]), 1.0
+    )
+    np.testing.assert_allclose(
+        one.momentum(np.zeros(1), np.array([100.0])), np.sqrt([0.5, 0.5, 0.0]) * [1, -1, 1], rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("steering", STEERING)

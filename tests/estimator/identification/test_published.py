@@ -447,6 +447,18 @@ def test_two_stars_of_one_partner_leave_it_to_the_cheaper() -> None:
         assert cost[kept] == 1
 
 
+def test_saa_s_best_counts_as_the_binomial_tail_of_the_stars_beside_its_pair() -> None:
+    """All but one of them are matched; each catalog star of the field that is not seen costs half a power of ten."""
+    rays, _, rows, index, _ = field(0)
+    unknown = np.full(len(rays), np.nan)
+    stars = SearchInput(rays, unknown, index.vectors, np.full(60, np.nan), index.cells, Gates(1e-4, 1e-4, np.inf, 0.0))
+    pool, best = SAA.AssumptionPool(stars, (-1.0, 1.0, -1.0, 1.0), 0.5), rows.astype(np.int32)
+    best[-1] = -1
+    pool.add(SAA.build_primary(stars, 0, 1), (best[None], np.array([3.0]), np.array([len(rows) - 3])))
+    tail = stats.binom.logsf(len(rows) - 4, len(rows) - 2, pool.p) / np.log(10)
+    assert pool.log10_chance == pytest.approx(tail + 0.5 * pool.missing, abs=1e-9)
+
+
 @pytest.mark.parametrize(("ratio", "accepted"), [(0.9e5, False), (1.1e5, True)])
 def test_saa_s_best_must_be_1e5_times_as_likely_as_what_contradicts_it(ratio: float, accepted: bool) -> None:
     """A cost is a squared number of standard deviations: the likelihood is exp(-cost / 2)."""
