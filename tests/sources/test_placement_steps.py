@@ -51,7 +51,7 @@ def test_sites_are_spread_as_widely_as_there_are_that_many() -> None:
 def test_attitudes_with_less_than_two_leds_in_the_inner_field_are_counted() -> None:
     """The inner field is 0.8 of the tangents of half of 20 x 15 deg; some attitudes see none, one, two and more."""
     rng = np.random.default_rng(4)
-    place_m = rng.normal(0, [0.4, 0.4, 0], (60, 3)) + [0, 0, 1.2]
+    place_m = rng.normal([0, 0, 1.2], [0.4, 0.4, 0], (60, 3))
     R = Rotation.from_rotvec(rng.normal(0, 0.2, (100, 3))).as_matrix()
     x, y, z = np.moveaxis(np.einsum("aij,kj->aki", R, place_m) - [0.02, 0.01, 0.3], 2, 0)
     half_x, half_y = 0.8 * np.tan(np.radians([10, 7.5]))
@@ -82,3 +82,26 @@ def test_most_of_a_field_that_another_shows_is_that_of_all_rotations() -> None:
     np.testing.assert_allclose(fraction, wanted.max(axis=1), rtol=1e-12)
     np.testing.assert_allclose(wanted[np.arange(8), other], fraction, rtol=1e-12)
     assert len(set(fraction)) > 3
+
+
+def test_leds_are_moved_to_reduce_an_ambiguity_where_their_spacing_allows_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in for the overlap that falls with an LED's height, so that every move up is wanted."""
+    sites_m = np.random.default_rng(6).uniform(0, 1, (400, 3))
+    place_m = sites_m[OPTIMIZE.thin(sites_m, 0.2, 20)]
+    config, options = SimpleNamespace(count=20, spacing_m=0.2), OPTIMIZE.PlacementOptions(ambiguity_trials=300)
+    scorer = SimpleNamespace(config=config, options=options, tail_variance=lambda _: 0.5, under_two=lambda _: 0)
+    layouts = []
+
+    def overlap(_: object, at_m: np.ndarray) -> object:
+        layouts.append(at_m)
+        return AMBIGUITY.Ambiguity(np.arange(20), np.arange(20), options.max_overlap + (0.9 - at_m[:, 2]).clip(0))
+
+    monkeypatch.setattr(OPTIMIZE, "layout_ambiguity", overlap)
+    moved_m = OPTIMIZE.reduce_ambiguity(scorer, place_m, sites_m, np.random.default_rng(7))
+    assert moved_m[:, 2].mean() > place_m[:, 2].mean() + 0.1
+    assert pdist(moved_m).min() >= 0.2
+    # An overlap of the limit is none too many.
+    layouts.clear()
+    place_m[:, 2] = 0.95
+    np.testing.assert_array_equal(OPTIMIZE.reduce_ambiguity(scorer, place_m, sites_m, None), place_m)
+    assert len(layouts) == 1

@@ -217,6 +217,23 @@ def test_the_windowed_centroid_s_error_is_an_eighth_above_the_minimum(sigma: flo
     assert row[2] == pytest.approx(9 / 8 * np.sqrt(8 * np.pi) * sigma**2 * 3.0 / 1e4, rel=0.01)
 
 
+def test_a_star_at_an_edge_is_placed_as_its_mirror_image_at_the_other() -> None:
+    image, grid, last = gaussian((17, 21), 1.2, 2.3, 1e4, 0.9), np.ones((1, 1)), np.array([20, 16])
+
+    def mirrored(*flip: bool) -> np.ndarray:
+        axes = [axis for axis in (0, 1) if flip[1 - axis]]
+        corners = np.where(flip, last - [[0, 0], [4, 5]], [[0, 0], [4, 5]])
+        box, start = np.hstack([corners.min(axis=0), corners.max(axis=0)])[None], np.where(flip, last - [1, 2], [1, 2])
+        flipped = np.ascontiguousarray(np.flip(image, axes))
+        row = moments.gaussian_windowed(flipped, start[None].astype(float), box, 0 * grid, grid, 1.0)[0]
+        return np.append(np.where(flip, last - row[:2], row[:2]), row[2:])
+
+    wanted = mirrored(False, False)
+    assert np.isfinite(wanted).all()
+    for flip in ((True, False), (False, True), (True, True)):
+        np.testing.assert_allclose(mirrored(*flip), wanted, rtol=1e-9)
+
+
 def test_a_large_saturated_star_is_placed_by_its_wings() -> None:
     """In the largest window, of 21 px; by the interpreter, which refuses an index beyond an array."""
     plain, image = interpreted("estimator.centroiding.gaussian_fit"), gaussian((41, 41), 20.3, 19.8, 1e5, 1.2)

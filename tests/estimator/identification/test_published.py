@@ -392,6 +392,8 @@ def test_saa_s_chance_is_that_of_the_stars_within_its_reach() -> None:
     p, missing = SAA._chance_statistics(stars, primary, np.array([0, 1, 2, -1]), (-0.3, 0.08, -0.1, 0.07))
     assert p == pytest.approx(np.mean(-np.expm1(-similar * share)), rel=1e-9)
     assert missing == np.count_nonzero(in_field) - 3
+    alone = stars._replace(vectors=seen, magnitude_cam=seen_mag, magnitude=magnitude[:4])
+    assert SAA._chance_statistics(alone, primary, np.arange(4), (-0.3, 0.08, -0.1, 0.07))[1] == 0
 
 
 @pytest.mark.parametrize("base", [5, 9])
