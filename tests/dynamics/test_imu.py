@@ -619,6 +619,7 @@ def test_a_navigator_follows_an_even_turn_exactly() -> None:
     wanted = TILTED * Rotation.from_rotvec(10 * rate)
     assert (Rotation.from_quat(navigator.lab_from_body_wxyz, scalar_first=True).inv() * wanted).magnitude() < 1e-12
     np.testing.assert_allclose(euler_deg(navigator), wanted.as_euler("ZYX", degrees=True)[::-1], rtol=0, atol=1e-10)
+    assert np.linalg.norm(navigator.lab_from_body_wxyz) == pytest.approx(1, abs=1e-14)
 
 
 def test_in_pieces_or_at_once_a_navigator_is_the_same() -> None:
