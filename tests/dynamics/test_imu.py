@@ -25,6 +25,7 @@ from skysim.dynamics.imu import (
     Navigator,
     earth_rate_lab_rad_s,
     ideal_increments,
+    response_matrix,
     tilt_rad,
 )
 from skysim.scene.sections.vehicle import ImuConfig, SiteConfig
@@ -409,6 +410,14 @@ def test_units_off_the_line_scatter_as_declared() -> None:
         assert (np.abs(drawn.mean(axis=0)) < 4 / np.sqrt(n)).all()
         between = np.corrcoef(drawn.T) - np.eye(drawn.shape[1])
         assert np.abs(between).max() < 5 / np.sqrt(n)  # tens of pairs
+
+
+def test_scale_errors_are_on_the_diagonal_and_misalignments_off_it() -> None:
+    normal = np.random.default_rng(4).normal(size=(3, 3))
+    errors = response_matrix(500.0, 30.0, normal) - np.eye(3)
+    np.testing.assert_allclose(np.diag(errors), 500e-6 * np.diag(normal), rtol=1e-9)
+    off = ~np.eye(3, dtype=bool)
+    np.testing.assert_allclose(errors[off], 30 * ARCSEC * normal[off], rtol=1e-12)
 
 
 def test_scale_and_misalignment_on_a_known_turn() -> None:
