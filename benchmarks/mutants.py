@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import importlib
 import json
 import marshal
 import os
@@ -308,6 +309,7 @@ def use_copy() -> None:
     for name in [name for name in sys.modules if name.split(".")[0] in ("benchmarks", "skysim", "estimator")]:
         del sys.modules[name]
     sys.path.insert(0, str(TREE))
+    importlib.invalidate_caches()  # Python remembers that the copy's folder did not exist when it started
 
 
 def copy_tree() -> None:

@@ -153,9 +153,10 @@ def _lower_bounds(threshold: Floats, height: int, y: int, cell: int, scale: floa
             value = floor(min(max(scale * least, -2e9), 2e9))
         else:  # an integer exceeds a number exactly if it exceeds its floor
             value = floor(min(max(scale * least, 0.0), 65535.0))
-        # A cell extends from one tile center to the next; the outermost ones extend to the frame's edge.
-        first = 0 if column == 0 else int((column + 0.5) * width / columns)
-        last = width if column >= columns - 2 else int((column + 1.5) * width / columns)
+        # A cell extends from one tile center to the next, x + 1/2 = (column + 1/2) width / columns; the outermost ones
+        # extend to the frame's edge.
+        first = 0 if column == 0 else round((column + 0.5) * width / columns)
+        last = width if column >= columns - 2 else round((column + 1.5) * width / columns)
         bound[first:last] = value
     return cell_row
 

@@ -382,6 +382,18 @@ def test_signal_to_noise_is_what_repeated_photometry_scatters() -> None:
     assert not told.saturated[0]
 
 
+def test_signal_to_noise_has_each_noise_of_a_pixel() -> None:
+    """N / sqrt(N + n (sky + read^2 + reset^2 + gain^2 / 12)), the CCD equation; each of the last three alone."""
+    light_e = np.full((64, 32), 70.0)
+    noise_e = {"read_noise_e": 7.0, "reset_noise_e": 11.0, "gain_e_dn": 30.0}
+    for name in noise_e:
+        one = {"read_noise_e": 0.1, "reset_noise_e": 0.0, "gain_e_dn": 1.0} | {name: noise_e[name]}
+        made = detector_with((64, 32), offset_dn=20.0, **one)
+        told = detector.add_snr_and_saturation(seen(1000.0, 25.0, 40.0), light_e.astype(np.float32), 0.05, made)
+        pixel_e2 = one["read_noise_e"] ** 2 + one["reset_noise_e"] ** 2 + one["gain_e_dn"] ** 2 / 12
+        assert told.snr[0] == pytest.approx(1000 / np.sqrt(1000 + 25 * (30 + pixel_e2)), rel=1e-6)
+
+
 @pytest.mark.parametrize(("peak_e", "full"), [(39000.0, False), (41000.0, True)])
 def test_a_source_is_saturated_where_its_brightest_pixel_is(peak_e: float, full: bool) -> None:
     made = detector_with((64, 32), full_well_e=40000.0, gain_e_dn=10.0, offset_dn=64.0)

@@ -65,6 +65,15 @@ def test_sharpness_is_a_gaussian_s_own_sigma_and_an_edge_s() -> None:
     assert edge == pytest.approx(1.25 * np.sqrt(0.49 + 1 / 12), rel=0.03)
 
 
+def test_sharpness_of_a_grid_is_as_a_table_s(tmp_path: Any) -> None:
+    """Half the peak of a Gaussian over its steepest slope is sigma sqrt(e) / 2, the pixel included."""
+    at = np.arange(-24, 25) / 4
+    np.savetxt(tmp_path / "psf.csv", np.exp(-(at**2 + at[:, None] ** 2) / 2), delimiter=",")
+    lens = camera(focus="infinity", psf={"kind": "measured", "file": str(tmp_path / "psf.csv"), "oversampling": 4})
+    wanted = np.sqrt(np.e) / 2 * np.sqrt(1 + 1 / 12)
+    assert sharpness_px(build_kernel(lens.psf, lens)) == pytest.approx(wanted, rel=0.02)
+
+
 def test_a_measured_image_is_a_grid(tmp_path: Any) -> None:
     y, x = np.mgrid[-6:7, -6:7]
     np.savetxt(tmp_path / "psf.csv", np.exp(-(x**2) / 2 - y**2 / 8), delimiter=",")

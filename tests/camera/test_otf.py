@@ -12,8 +12,9 @@ from scipy import special
 from scipy.signal import fftconvolve
 from splatting import add_kernel
 
-from skysim.camera.psf.kernel import Kernel, build_kernel, round_kernel
+from skysim.camera.psf.kernel import HARMONIC_FLOOR, Kernel, bandwidth, build_kernel, pack_table, round_kernel
 from skysim.camera.psf.otf import EXTENT, PSFS, airy_unit_px, blur_radius_px, cell_response, field_sigma_px
+from skysim.camera.psf.splat import PER_PX
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import (
@@ -163,6 +164,21 @@ def test_airy_s_first_dark_ring_and_what_is_in_it() -> None:
     assert inside * (1 - beyond) == pytest.approx(0.838, abs=0.004)
 
 
+@pytest.mark.parametrize("pixel_um", [0.2, 0.4, 0.55, 1.0, 4.2, 30.0])
+def test_airy_s_light_beyond_its_reach_is_a_fortieth_at_most(pixel_um: float) -> None:
+    """On average over its rings 2 / (pi z) of the light is farther than z = pi r / (lambda N) (Born & Wolf 8.5)."""
+    psf, lens = AiryPsfConfig(kind="airy"), camera(pixel=f"{pixel_um} um")
+    reach_px, _ = EXTENT["airy"](psf, lens)
+    assert 2 / np.pi**2 * airy_unit_px(psf, lens) / reach_px < 0.0254
+
+
+def test_a_table_has_the_harmonics_above_the_floor() -> None:
+    profile_0 = np.exp(-((np.arange(300) / PER_PX) ** 2))
+    for fraction, columns in ((0.9, 3), (1.1, 5)):
+        weak = [fraction * HARMONIC_FLOOR, 0.1 * HARMONIC_FLOOR]
+        assert pack_table(np.outer([1, *weak], profile_0)).shape == (301, columns)
+
+
 def test_moffat_s_full_width_at_half_maximum() -> None:
     image = build_kernel(MoffatPsfConfig(kind="moffat", fwhm_px=24.0, beta=3.0), camera())
     center, half, out = profile(image, np.array([0.0, 12.0, 36.0]))
@@ -262,6 +278,8 @@ def test_a_measured_gaussian_is_that_gaussian(tmp_path: Path, sigma_px: float, o
     for x, y in PLACES + 10:
         peak = draw(wanted, x, y, 21)
         np.testing.assert_allclose(draw(image, x, y, 21), peak, rtol=0, atol=5e-4 * peak.max())
+    # As few sub-pixel positions, in powers of two, as are more than seven times the highest frequency.
+    assert 7 * bandwidth(psf, camera(), 0.0, 1e-3) < len(image.grid) - 3 <= 14 * bandwidth(psf, camera(), 0.0, 1e-3)
 
 
 def test_a_star_measured_in_whole_pixels_gives_its_image_back(tmp_path: Path) -> None:
@@ -342,6 +360,7 @@ def test_a_measured_lens_is_read_from_fits_and_png_too(tmp_path: Path) -> None:
         ("words.csv", "1,2,3\n4,five,6\n7,8,9\n", "five"),
         ("oblong.csv", "1,2,3\n4,5,6\n", "shape (2, 3); allowed: a square"),
         ("dark.csv", "0,0,0\n0,0,0\n0,0,0\n", "add up to 0; allowed"),
+        ("negative.csv", "0,0,0\n0,-1,0\n0,0,0\n", "add up to -1; allowed"),
         ("hole.csv", "1,2,3\n4,nan,6\n7,8,9\n", "add up to nan; allowed"),
         ("cut.fits", "SIMPLE  =", "not a complete FITS file"),
         ("cut.png", "no picture", "cannot be decoded"),

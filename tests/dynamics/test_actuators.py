@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from interpreted import interpreted
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -274,6 +275,18 @@ def test_away_from_singularities_both_ways_of_steering_agree():
     assert 0 < np.abs(plain - robust).max() < 3 * lambda_ * np.abs(plain).max()
 
 
+def test_the_robust_inverse_is_wie_s_at_any_time():
+    """A^T (A A^T + lambda E)^-1: E is 1 on the diagonal, e_i = 0.01 sin(pi t / 2 + phase_i) off it."""
+    plain, rng = interpreted("skysim.dynamics.actuators"), np.random.default_rng(4)
+    for t_s in (0.0, 0.3, 1.1, 2.6):
+        jacobian, asked = 0.3 * rng.normal(size=(3, 4)), rng.normal(size=3)
+        e_1, e_2, e_3 = 0.01 * np.sin(np.pi * t_s / 2 + np.array([0, np.pi / 2, np.pi]))
+        gram = jacobian @ jacobian.T
+        damping = 0.01 * np.exp(-10 * np.linalg.det(gram)) * np.array([[1, e_3, e_2], [e_3, 1, e_1], [e_2, e_1, 1]])
+        wanted = jacobian.T @ np.linalg.solve(gram + damping, asked)
+        np.testing.assert_allclose(plain.singularity_robust(jacobian, asked, t_s), wanted, rtol=1e-9)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("steering", STEERING)
 def test_gimbals_at_their_limit_keep_the_direction(steering):
@@ -285,6 +298,16 @@ def test_gimbals_at_their_limit_keep_the_direction(steering):
     # The robust inverse is off by lambda, 5e-8 there, over the smallest eigenvalue 2/3.
     np.testing.assert_allclose(given / np.linalg.norm(given), torque / np.linalg.norm(torque), rtol=0, atol=1e-6)
     assert np.linalg.norm(given) < 0.5 * np.linalg.norm(torque)
+
+
+def test_a_gyro_may_lie_at_any_angle():
+    """Gimbal and rotor at 45 deg between x and y: at right angles, though no product of their components is zero."""
+    one = CmgSet(
+        np.sqrt([[0.5], [0.5], [0.0]]), np.sqrt([[0.5], [0.5], [0.0]]) * [[1], [-1], [1]], np.array([0.01]), 1.0
+    )
+    np.testing.assert_allclose(
+        one.momentum(np.zeros(1), np.array([100.0])), np.sqrt([0.5, 0.5, 0.0]) * [1, -1, 1], rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("steering", STEERING)

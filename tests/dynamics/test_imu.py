@@ -25,6 +25,7 @@ from skysim.dynamics.imu import (
     Navigator,
     earth_rate_lab_rad_s,
     ideal_increments,
+    response_matrix,
     tilt_rad,
 )
 from skysim.scene.sections.vehicle import ImuConfig, SiteConfig
@@ -411,6 +412,14 @@ def test_units_off_the_line_scatter_as_declared() -> None:
         assert np.abs(between).max() < 5 / np.sqrt(n)  # tens of pairs
 
 
+def test_scale_errors_are_on_the_diagonal_and_misalignments_off_it() -> None:
+    normal = np.random.default_rng(4).normal(size=(3, 3))
+    errors = response_matrix(500.0, 30.0, normal) - np.eye(3)
+    np.testing.assert_allclose(np.diag(errors), 500e-6 * np.diag(normal), rtol=1e-9)
+    off = ~np.eye(3, dtype=bool)
+    np.testing.assert_allclose(errors[off], 30 * ARCSEC * normal[off], rtol=1e-12)
+
+
 def test_scale_and_misalignment_on_a_known_turn() -> None:
     """A whole turn about body y: sensor y counts 360 deg (1 + scale), x and z their tilt towards y times 360 deg."""
     one = unit({"scale_ppm": 500, "misalignment_arcsec": 100})
@@ -619,6 +628,7 @@ def test_a_navigator_follows_an_even_turn_exactly() -> None:
     wanted = TILTED * Rotation.from_rotvec(10 * rate)
     assert (Rotation.from_quat(navigator.lab_from_body_wxyz, scalar_first=True).inv() * wanted).magnitude() < 1e-12
     np.testing.assert_allclose(euler_deg(navigator), wanted.as_euler("ZYX", degrees=True)[::-1], rtol=0, atol=1e-10)
+    assert np.linalg.norm(navigator.lab_from_body_wxyz) == pytest.approx(1, abs=1e-14)
 
 
 def test_in_pieces_or_at_once_a_navigator_is_the_same() -> None:

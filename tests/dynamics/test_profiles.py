@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from skysim.core.errors import InputError
 from skysim.core.quantities.units import ARCSEC_RAD
-from skysim.dynamics.guidance import plan
+from skysim.dynamics.guidance import plan, profile_start
 from skysim.dynamics.profiles import text
 from skysim.dynamics.profiles.load import read_profile
 from skysim.dynamics.profiles.samples import MAX_SAMPLES, Samples, check_samples
@@ -489,6 +489,10 @@ def test_an_stk_file_without_an_epoch_counts_from_the_maneuver(tmp_path: Path) -
         (stk(MOTION, TimeFormat="UTCG"), "line 9: TimeFormat 'UTCG'; allowed: EpSec"),
         (stk(MOTION, RepeatPattern="yes"), "line 9: unknown keyword 'RepeatPattern'; allowed: Numb"),
         (stk(MOTION, ScenarioEpoch="yesterday"), "line 5: ScenarioEpoch 'yesterday'; allowed: 1 Jul 2005"),
+        *(
+            (stk(MOTION, ScenarioEpoch=f"1 Jul 2005 {clock}"), f"line 5: ScenarioEpoch '1 Jul 2005 {clock}'; allowed")
+            for clock in ("12:-1:00", "12:60:00", "-1:00:00", "24:00:00", "12:00:-1", "12:00:60")
+        ),
         (
             stk(MOTION, NumberOfAttitudePoints="62"),
             "line 4: NumberOfAttitudePoints 62, but there are 61: the file is cut",
@@ -568,6 +572,13 @@ def test_a_profile_that_does_not_join_on_is_refused() -> None:
     assert plan(first, None, (late,)).duration_s == pytest.approx(6.0, abs=1e-12)
     with pytest.raises(InputError, match="attitudes from -9 s to -3 s after"):
         plan(following(), tumble(np.array([3.0]))[0], (fit_spline(sampled(TIMES - 9.0)),))
+
+
+def test_the_vehicle_starts_where_the_first_of_two_profiles_does() -> None:
+    first, second = fit_spline(sampled(TIMES + 3.0)), fit_spline(sampled(TIMES + 20.0))
+    motion = following(begin="first_sample").model_copy(update={"start": "profile"})
+    start_wxyz, _, _ = profile_start(motion, (first, second))
+    assert angle(Rotation.from_quat(start_wxyz, scalar_first=True), tumble(np.array([3.0]))[0]) < 1e-12
 
 
 def test_the_spline_is_scipys(tmp_path: Path) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from interpreted import interpreted
 from scipy.spatial.distance import cdist, pdist
+from scipy.spatial.transform import Rotation
 
-OPTIMIZE = interpreted("skysim.sources.dome.placement.optimize")
+OPTIMIZE, AMBIGUITY = (interpreted(f"skysim.sources.dome.placement.{name}") for name in ("optimize", "ambiguity"))
 
 
 def test_a_site_has_room_beside_all_leds_but_the_one_that_moves() -> None:
@@ -43,3 +46,62 @@ def test_sites_are_spread_as_widely_as_there_are_that_many() -> None:
     assert widest_m > 0.2
     assert len(OPTIMIZE.thin(sites_m, widest_m * (1 + 1e-9), 20)) < 20
     assert len(OPTIMIZE.spread(sites_m, 0.3, 190, 40)) == len(OPTIMIZE.thin(sites_m, 0.3))
+
+
+def test_attitudes_with_less_than_two_leds_in_the_inner_field_are_counted() -> None:
+    """The inner field is 0.8 of the tangents of half of 20 x 15 deg; some attitudes see none, one, two and more."""
+    rng = np.random.default_rng(4)
+    place_m = rng.normal([0, 0, 1.2], [0.4, 0.4, 0], (60, 3))
+    R = Rotation.from_rotvec(rng.normal(0, 0.2, (100, 3))).as_matrix()
+    x, y, z = np.moveaxis(np.einsum("aij,kj->aki", R, place_m) - [0.02, 0.01, 0.3], 2, 0)
+    half_x, half_y = 0.8 * np.tan(np.radians([10, 7.5]))
+    seen = np.sum((np.abs(x) <= half_x * z) & (np.abs(y) <= half_y * z), axis=1)
+    assert {0, 1, 2, 3} <= set(seen)
+    config = SimpleNamespace(camera_m=(0.02, 0.01, 0.3), field_deg=(20.0, 15.0))
+    score = OPTIMIZE.PlacementScore(config, SimpleNamespace(inner_field=0.8), R)
+    assert score.under_two(place_m) == np.sum(seen < 2)
+
+
+def test_most_of_a_field_that_another_shows_is_that_of_all_rotations() -> None:
+    """Fields of two rings, at any angles: every neighbor of each field is laid on every one of the other."""
+    rng = np.random.default_rng(5)
+    counts = rng.integers(3, 6, (8, 2))
+    fields = [np.repeat([0.2, 0.3], count) * np.exp(2j * np.pi * rng.random(count.sum())) for count in counts]
+    every, first = np.concatenate(fields), np.cumsum([0, *map(len, fields)])
+    given = AMBIGUITY.Fields(np.arange(8), first, np.abs(every).round(9), np.angle(every), np.full(8, 0.02))
+
+    def shown(i: int, j: int) -> float:
+        """The most that two fields share at any turn, but for a field laid on itself without one."""
+        turn = fields[j] / fields[i][:, None]
+        unit = np.isclose(np.abs(turn), 1) & ~(np.eye(*turn.shape, dtype=bool) & (i == j))
+        far = np.abs(fields[i][:, None] * turn[unit][:, None, None] - fields[j])  # (turns, of i, of j)
+        return float((1 + (far.min(axis=2) < 0.02).sum(axis=1).max()) / (1 + max(len(fields[i]), len(fields[j]))))
+
+    fraction, other = AMBIGUITY.most_similar(given, 0.0)
+    wanted = np.array([[shown(*sorted((i, j))) for j in range(8)] for i in range(8)])
+    np.testing.assert_allclose(fraction, wanted.max(axis=1), rtol=1e-12)
+    np.testing.assert_allclose(wanted[np.arange(8), other], fraction, rtol=1e-12)
+    assert len(set(fraction)) > 3
+
+
+def test_leds_are_moved_to_reduce_an_ambiguity_where_their_spacing_allows_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in for the overlap that falls with an LED's height, so that every move up is wanted."""
+    sites_m = np.random.default_rng(6).uniform(0, 1, (400, 3))
+    place_m = sites_m[OPTIMIZE.thin(sites_m, 0.2, 20)]
+    config, options = SimpleNamespace(count=20, spacing_m=0.2), OPTIMIZE.PlacementOptions(ambiguity_trials=300)
+    scorer = SimpleNamespace(config=config, options=options, tail_variance=lambda _: 0.5, under_two=lambda _: 0)
+    layouts = []
+
+    def overlap(_: object, at_m: np.ndarray) -> object:
+        layouts.append(at_m)
+        return AMBIGUITY.Ambiguity(np.arange(20), np.arange(20), options.max_overlap + (0.9 - at_m[:, 2]).clip(0))
+
+    monkeypatch.setattr(OPTIMIZE, "layout_ambiguity", overlap)
+    moved_m = OPTIMIZE.reduce_ambiguity(scorer, place_m, sites_m, np.random.default_rng(7))
+    assert moved_m[:, 2].mean() > place_m[:, 2].mean() + 0.1
+    assert pdist(moved_m).min() >= 0.2
+    # An overlap of the limit is none too many.
+    layouts.clear()
+    place_m[:, 2] = 0.95
+    np.testing.assert_array_equal(OPTIMIZE.reduce_ambiguity(scorer, place_m, sites_m, None), place_m)
+    assert len(layouts) == 1

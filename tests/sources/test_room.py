@@ -50,6 +50,14 @@ def test_a_cap_is_as_high_and_wide_as_a_spherical_cap() -> None:
     np.testing.assert_allclose(part_m(1), [RADIUS_M - RIM_M, 2 * HALF_WIDTH_M, 2 * HALF_WIDTH_M], rtol=1e-9)
 
 
+def test_a_panel_beside_the_zenith_is_sampled_from_its_near_edge_to_its_far_one() -> None:
+    """From 1 mm to 1.001 m off the bearing's axis: the near edge is 0.06 deg from the zenith."""
+    panel = {"kind": "flat", "apex": "1 m", "width": "1 m", "height": "1 m", "offset": ["0.501 m", "0 m", "0 m"]}
+    made = surface.build_surface(light.SurfaceConfig.model_validate(panel))
+    x_m = rooms.shell_m(RoomConfig.model_validate({"segments": 1}), made, 40.0, np.zeros(1))[:, 0]
+    np.testing.assert_allclose([x_m.min(), x_m.max()], [0.001, 1.001], rtol=0, atol=1e-12)
+
+
 def test_a_thick_shell_is_larger_by_its_thickness() -> None:
     """The outer face is a sphere of R + d about the same center, down to the rim's normals."""
     rim_side = HALF_WIDTH_M * (1 + 0.05 / RADIUS_M)

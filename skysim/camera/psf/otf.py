@@ -182,7 +182,7 @@ def moffat_reach_px(psf: MoffatPsfConfig, camera: CameraConfig) -> float:
 def airy_reach_px(psf: AiryPsfConfig, camera: CameraConfig) -> float:
     """Radius where the mean of Airy's rings, 4 / (pi z^3) of its peak at z = pi r / (lambda N), falls below WING_LEVEL.
 
-    At most 64 px or eight lambda N. The light beyond, 2 / (pi z), is within 2 %.
+    At most 64 px or eight lambda N. The light beyond, 2 / (pi z), is 2.5 % at most.
     """
     unit = airy_unit_px(psf, camera)
     z = (4 / np.pi / WING_LEVEL * max(1.0, np.pi / 4 / unit**2)) ** (1 / 3)

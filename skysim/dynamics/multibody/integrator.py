@@ -193,7 +193,6 @@ class PrescribedMotion(Simulation):
             state = self.states[self.row + 1]
             state[:] = self.states[self.row]
             self.step += 1
-            state[0] = self.now_s
             state[1:5], state[rate_column : rate_column + 3] = self.state_at(self.now_s)
 
 

@@ -194,6 +194,19 @@ def test_a_known_length_sets_the_size_of_lights_and_lever_and_nothing_else() -> 
     assert by_length.camera.focal_px == pytest.approx(by_map.camera.focal_px, rel=1e-8)
 
 
+def test_the_misfit_is_over_the_coordinates_beyond_the_unknowns() -> None:
+    """Three for each light and frame, three of the lever, seven of the lens; less four that change no pixel."""
+    noise_px = 0.01
+    found, place, turned, lever = small_survey(noise_px, 6)
+    frames = filmed(np.random.default_rng(6), turned, place, lever, SMALL, noise_px)
+    assert found.tied.all()
+    assert len(found.outliers) == 0
+    coordinates = 2 * sum(int(found.surveyed[frame.led].sum()) for frame in frames)
+    unknowns = 3 * int(found.surveyed.sum()) + 3 * len(frames) + 3 + 7 - 4
+    wanted = found.rms_px / frames[0].sigma_px[0] * np.sqrt(coordinates / (coordinates - unknowns))
+    assert found.misfit == pytest.approx(wanted, rel=1e-9)
+
+
 def test_a_reference_frame_keeps_its_attitude() -> None:
     found, place, turned, lever = small_survey(0.02, 9, reference_frame=4)
     frames = filmed(np.random.default_rng(9), turned, place, lever, SMALL, 0.02)

@@ -13,6 +13,7 @@ from estimator.calibration.home_position import (
     DEVIATIONS,
     HomeCatalog,
     Sighting,
+    _covariance,
     calibrate,
     instrument_brightness,
     led_map,
@@ -238,6 +239,14 @@ def test_the_covariance_is_the_noise_s(home: HomeCatalog) -> None:
     assert stats.chi2.ppf(RARE, 24 * 49) < variances < stats.chi2.isf(RARE, 24 * 49)
     # z = sqrt(c^2 - x^2 - y^2) moves by x / c of x: 1.4 % at the board's edge.
     assert home.covariance_m2[:, 2, 2].max() < (0.02 * SIGMA_M) ** 2
+
+
+def test_the_sample_covariance_is_numpy_s_and_none_of_one_sample() -> None:
+    lab_m, led = np.random.default_rng(14).normal(size=(9, 3)), np.array([0, 2, 0, 1, 2, 0, 2, 0, 2])
+    covariance = _covariance(lab_m, led)
+    for row in (0, 2):
+        np.testing.assert_allclose(covariance[row], np.cov(lab_m[led == row], rowvar=False), rtol=1e-12)
+    assert np.isnan(covariance[1]).all()
 
 
 def test_the_mean_over_all_stops_keeps_their_imu_error_and_home_does_not() -> None:

@@ -180,6 +180,12 @@ def test_a_gauge_moves_no_pixel(
     assert by_led.shape == (3 * LIGHTS, 4)
     led_free, rest_free = ba.gauge_freedoms(once)
     assert np.linalg.matrix_rank(led_free.T @ by_led + rest_free.T @ by_rest) == 4  # it leaves nothing free
+    if gauge.length is not None:  # its constraint is the known length's slope
+        ends, moved = list(gauge.length[:2]), rng.normal(0, 1e-6, once.position_m.shape)
+        change_m = np.diff(
+            [np.linalg.norm(at[ends[0]] - at[ends[1]]) for at in (once.position_m, once.position_m + moved)]
+        )
+        np.testing.assert_allclose(moved.ravel() @ by_led[:, 3], change_m[0], rtol=0, atol=1e-10)
 
 
 @law(align_attitudes)

@@ -6,10 +6,12 @@ from interpreted import interpreted
 from scipy import ndimage
 from scipy.special import erf, j1
 
+from estimator.centroiding import moments
 from estimator.centroiding.centroid import CENTROIDERS, cog, gaussian_fit
 from estimator.core.least_squares import CONVERGED_PX
 from estimator.core.types import Centroids, FramePriors
 from estimator.detection import detect
+from estimator.detection.background import FILTERED_NOISE
 
 SIGMA_PX = 0.7
 CELL_PX, CELLS = 64, 12  # stars so far apart that the sky between them is not lifted by their light
@@ -201,6 +203,45 @@ def test_the_reported_sigma_is_true(
     # Chi-square a degree of freedom; 1,440 numbers give it to 3.7 %, three deviations are 0.11.
     chi2 = np.mean((off / sigma[:, None]) ** 2)
     assert band[0] < chi2 < band[1]
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.5])
+def test_the_windowed_centroid_s_error_is_an_eighth_above_the_minimum(sigma: float) -> None:
+    """In noise of the sky a Gaussian sampled at points is placed to sqrt(8 pi) sigma^2 n / F at best in x and y."""
+    y, x = np.mgrid[:61, :61]
+    image = 1e4 * np.exp(-((x - 30.3) ** 2 + (y - 29.8) ** 2) / (2 * sigma**2)) / (2 * np.pi * sigma**2)
+    noise = np.full((1, 1), 3.0 * FILTERED_NOISE)
+    box = np.array([[25, 25, 35, 35]])
+    row = moments.gaussian_windowed(image, np.array([[30.0, 30.0]]), box, np.zeros((1, 1)), noise, 1e12)[0]
+    np.testing.assert_allclose(row[:2], [30.3, 29.8], rtol=0, atol=1e-3)
+    assert row[2] == pytest.approx(9 / 8 * np.sqrt(8 * np.pi) * sigma**2 * 3.0 / 1e4, rel=0.01)
+
+
+def test_a_star_at_an_edge_is_placed_as_its_mirror_image_at_the_other() -> None:
+    image, grid, last = gaussian((17, 21), 1.2, 2.3, 1e4, 0.9), np.ones((1, 1)), np.array([20, 16])
+
+    def mirrored(*flip: bool) -> np.ndarray:
+        axes = [axis for axis in (0, 1) if flip[1 - axis]]
+        corners = np.where(flip, last - [[0, 0], [4, 5]], [[0, 0], [4, 5]])
+        box, start = np.hstack([corners.min(axis=0), corners.max(axis=0)])[None], np.where(flip, last - [1, 2], [1, 2])
+        flipped = np.ascontiguousarray(np.flip(image, axes))
+        row = moments.gaussian_windowed(flipped, start[None].astype(float), box, 0 * grid, grid, 1.0)[0]
+        return np.append(np.where(flip, last - row[:2], row[:2]), row[2:])
+
+    wanted = mirrored(False, False)
+    assert np.isfinite(wanted).all()
+    for flip in ((True, False), (False, True), (True, True)):
+        np.testing.assert_allclose(mirrored(*flip), wanted, rtol=1e-9)
+
+
+def test_a_large_saturated_star_is_placed_by_its_wings() -> None:
+    """In the largest window, of 21 px; by the interpreter, which refuses an index beyond an array."""
+    plain, image = interpreted("estimator.centroiding.gaussian_fit"), gaussian((41, 41), 20.3, 19.8, 1e5, 1.2)
+    level, noise, box = np.zeros((1, 1)), np.ones((1, 1)), np.array([[10, 10, 30, 30]])
+    clipped, start = np.minimum(image, 5000.0), np.array([[20.0, 20.0]])
+    row = plain.fit_all(clipped, start, np.array([4e4]), box, np.array([5000.0]), level, noise, 1.0, 5000.0)[0]
+    np.testing.assert_allclose(row[:2], [20.3, 19.8], rtol=0, atol=1e-3)
+    assert row[3] == pytest.approx(1e5, rel=1e-3)
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from interpreted import interpreted
-from scipy import ndimage, stats
+from scipy import ndimage, optimize, stats
 from scipy.special import erf
 
 from estimator.centroiding.centroid import cog, gaussian_fit, streak, streak_ends
@@ -217,6 +217,8 @@ def test_the_line_fit_beats_the_center_of_gravity() -> None:
     fitted, by_gravity = streak(image, blobs, 1.0, priors), cog(image, blobs, 1.0)
     errors = [found.xy_px[nearest(found.xy_px, xy)] - xy for found in (fitted, by_gravity)]
     assert errors[0].std() < errors[1].std() / 2
+    # A streak of 11 px has 130 pixels of noise of 12 e-: some 2 % of its light for one, 0.4 % for all.
+    assert fitted.flux.mean() == pytest.approx(4000, rel=0.02)
 
 
 def test_round_stars_get_the_round_fit() -> None:
@@ -309,3 +311,53 @@ def test_a_fit_that_begins_some_pixels_off_comes_to_the_truth(start: tuple[float
     assert plain._fit(np.vstack([x, y, -rows[7]]), 1.0, 1e9, rows, weight, p, out)
     wanted = [20.3, 14.8, 50000, 9 * np.cos(0.4), 9 * np.sin(0.4)]
     np.testing.assert_allclose(out[:5], wanted, rtol=1e-4)
+
+
+def test_a_fit_uses_every_pixel_near_its_line_and_no_other() -> None:
+    plain, streak_px = interpreted("estimator.centroiding.streak_fit"), (8.0, -6.0)
+    image = smeared((41, 41), 20.3, 19.8, *streak_px, 5000.0)
+    box, grid = np.array([[14, 14, 26, 26]]), np.ones((1, 1))
+
+    def fit(at: tuple[int, int] | None = None) -> np.ndarray:
+        changed = image.copy()
+        if at is not None:
+            changed[at] += 100.0
+        return plain.fit_all(changed, np.array([[20.0, 20.0]]), box, 0 * grid, grid, streak_px, 1.0, 1e9)
+
+    y, x = np.mgrid[:41, :41]
+    u, v = ((x - 20) * 8 - (y - 20) * 6) / 10, ((x - 20) * 6 + (y - 20) * 8) / 10
+    far_px = np.hypot(np.maximum(np.abs(u) - 5, 0), v)
+    # The window ends 4 px beyond the line's ends in x and y.
+    near = (far_px <= 4.5) & (np.abs(x - 20) <= 8) & (np.abs(y - 20) <= 7)
+    plain_fit, used = fit(), np.argwhere(near)
+    assert plain_fit.shape == (1, 8)
+    np.testing.assert_allclose(plain_fit[0, :2], [20.3, 19.8], rtol=0, atol=0.01)
+    for at in (used[0], used[-1]):
+        assert np.abs(fit(tuple(at)) - plain_fit).max() > 1e-3
+    for at in ((20 + 6, 20), (20, 20 + 9)):
+        assert not near[at]
+        np.testing.assert_array_equal(fit(at), plain_fit)
+
+
+def test_a_streak_s_length_direction_and_width_are_weighed_with_the_frame_s() -> None:
+    """The least chi-square of pixels and priors by SciPy: sigmas of 0.15 of the length and 0.5 px, 0.15 rad, 0.15."""
+    plain = interpreted("estimator.centroiding.streak_fit")
+    y, x = (grid.ravel().astype(float) for grid in np.mgrid[:17, :27])
+    start, noise = np.array([13.0, 8.0, 900.0, 9.0, 0.0, 0.8, 7.0]), 20.0
+
+    def model(p: np.ndarray) -> np.ndarray:
+        u, v = np.array([[np.cos(p[4]), np.sin(p[4])], [-np.sin(p[4]), np.cos(p[4])]]) @ [x - p[0], y - p[1]]
+        along = np.diff(erf(np.array([u - p[3] / 2, u + p[3] / 2]) / (p[5] * 2**0.5)), axis=0)[0] / (2 * p[3])
+        return p[6] + p[2] * along * np.exp(-((v / p[5]) ** 2) / 2) / (p[5] * np.sqrt(2 * np.pi))
+
+    light = model(np.array([13.3, 8.2, 1000.0, 12.0, 0.1, 0.9, 7.0]))
+
+    def residuals(p: np.ndarray) -> np.ndarray:
+        return np.append((light - model(p)) / noise, (start - p)[3:6] / [0.15 * 9 + 0.5, 0.15, 0.15 * 0.8])
+
+    p, rows, weight, out = start.copy(), np.ones((8, x.size)), np.empty(x.size), np.empty(8)
+    assert plain._fit(np.vstack([x, y, light]), noise, 1e9, rows, weight, p, out)
+    wanted = optimize.least_squares(residuals, start, x_scale=[1, 1, 100, 1, 0.1, 0.1, 1], xtol=1e-12).x
+    assert 10 < wanted[3] < 11.5  # between the frame's and its own
+    off = np.abs(p - wanted) / [0.01, 0.01, 5, 0.02, 0.002, 0.002, 0.02]
+    assert off.max() < 1, off

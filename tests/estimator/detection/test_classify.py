@@ -247,6 +247,21 @@ def test_a_bad_pixel_far_from_any_star_is_no_light() -> None:
     assert len(detect.default(mended)) == 10
 
 
+def test_a_bad_pixel_gets_the_median_of_its_good_neighbors() -> None:
+    """Within one pixel; of nine bad ones the middle gets that of those within two; at corners and edges too."""
+    image = np.random.default_rng(48).uniform(100, 200, (12, 15))
+    block = [(x, y) for x in (6, 7, 8) for y in (4, 5, 6)]
+    bad = np.array([(0, 0), (14, 0), (14, 11), (0, 7), (3, 11), (11, 9), (12, 9), *block])
+    good = np.full((16, 19), np.nan)
+    good[2:-2, 2:-2] = image
+    good[bad[:, 1] + 2, bad[:, 0] + 2] = np.nan
+    wanted = image.copy()
+    for x, y in bad:
+        near, far = good[y + 1 : y + 4, x + 1 : x + 4], good[y : y + 5, x : x + 5]
+        wanted[y, x] = np.nanmedian(far if np.isnan(near).all() else near)
+    np.testing.assert_array_equal(detect.replace_bad_pixels(image, bad), wanted)
+
+
 def test_a_bad_pixel_off_the_sensor_is_refused() -> None:
     with pytest.raises(ImageError, match="the bad-pixel map reaches beyond the frame of 659x493 pixels"):
         detect.replace_bad_pixels(np.eye(493, 659), np.array([(659, 3)]))

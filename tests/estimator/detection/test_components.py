@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from interpreted import interpreted
 from scipy import ndimage
 from scipy.special import erf
 
 from estimator.core.errors import ImageError
 from estimator.core.types import FramePriors
 from estimator.detection import detect
+from estimator.detection.background import interpolate
 from estimator.detection.components import FIRST_RUNS, label_runs, runs_above
 from estimator.detection.shefex import maximum_scan, sequential_scan
 
@@ -140,3 +142,22 @@ def test_labels_are_scipy_s(seed: int) -> None:
     # The same partition: every pair of labels meets one to one.
     pairs = np.unique(np.column_stack([labels.ravel(), wanted.ravel()]), axis=0)
     assert len(pairs) == count + 1
+
+
+@pytest.mark.parametrize(
+    ("shape", "rows", "columns"), [((48, 61), 3, 4), ((40, 64), 2, 4), ((30, 47), 2, 3), ((9, 9), 1, 1)]
+)
+def test_a_row_s_lower_bounds_are_the_least_corners_of_its_cells(
+    shape: tuple[int, int], rows: int, columns: int
+) -> None:
+    """Nowhere above the interpolated threshold, nor below the least of the four tile centers about a pixel."""
+    grid = np.random.default_rng(8).uniform(10, 90, (rows, columns))
+    bounds, (height, width) = interpreted("estimator.detection.components")._lower_bounds, shape
+    u = np.clip((np.arange(width) + 0.5) * columns / width - 0.5, 0, columns - 1)
+    for y in range(height):
+        bound, v = np.full(width, np.nan), np.clip((y + 0.5) * rows / height - 0.5, 0, rows - 1)
+        bounds(grid, height, y, -1, 1.0, bound)
+        assert (bound <= [interpolate(grid, height, width, y, x) + 1e-12 for x in range(width)]).all()
+        corners = grid[np.array([[np.floor(v)], [np.ceil(v)]], int), np.array([np.floor(u), np.ceil(u)], int)[:, None]]
+        inner = (u % 1 > 0) & (v % 1 > 0)
+        np.testing.assert_allclose(bound[inner], corners.min(axis=(0, 1))[inner], rtol=1e-12)

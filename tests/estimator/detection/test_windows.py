@@ -36,6 +36,18 @@ def test_a_blob_is_all_that_is_connected_with_its_peak() -> None:
     assert touched.all()
 
 
+def test_a_window_spans_the_pixels_from_its_lower_end_to_its_upper_one() -> None:
+    """Both rounded down; none outside of the frame. An upper end of 0 to 1 px is within the first pixel."""
+    for low in np.arange(-6.0, 20.0, 0.25):
+        high = low + 4.0
+        first, last = WINDOWS._span(low + 2.0, 2.0, 17)
+        if high >= 0:
+            assert list(range(first, last + 1)) == [k for k in range(17) if np.floor(low) <= k <= high]
+        if high <= -1:
+            assert first > last
+    assert WINDOWS._span(np.nan, 2.0, 17) == (0, -1)
+
+
 def test_each_window_gives_the_blob_of_its_brightest_pixel_once() -> None:
     """Windows over the edges and outside of the frame too; where none is above the threshold there is no blob."""
     rng, found, empty = np.random.default_rng(9), 0, 0

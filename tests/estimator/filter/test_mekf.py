@@ -631,6 +631,7 @@ def test_solutions_confirm_each_other_within_what_the_bias_turns(sigmas: float, 
         (np.diag([1e-8, -1e-8, 1e-8]), "positive definite"),
         (np.diag([1e-8, np.nan, 1e-8]), "positive definite"),
         (np.eye(3) + np.diag([0.1, 0.1], 1), "symmetric"),
+        (1e-10 * np.eye(3) + np.diag([1e-13, 1e-13], 1), "symmetric"),
         (np.eye(2), r"allowed: \(3, 3\)"),
     ],
 )

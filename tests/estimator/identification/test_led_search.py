@@ -105,6 +105,7 @@ def test_equal_leds_are_told_apart_and_never_wrongly(surface, dead, false, least
         if not isinstance(match, str):
             found += 1
             assert names_right(match, names)
+            assert match.log10_chance <= -search.ACCEPT_DEX
     assert found >= least * 80
 
 

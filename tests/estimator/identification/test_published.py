@@ -392,6 +392,8 @@ def test_saa_s_chance_is_that_of_the_stars_within_its_reach() -> None:
     p, missing = SAA._chance_statistics(stars, primary, np.array([0, 1, 2, -1]), (-0.3, 0.08, -0.1, 0.07))
     assert p == pytest.approx(np.mean(-np.expm1(-similar * share)), rel=1e-9)
     assert missing == np.count_nonzero(in_field) - 3
+    alone = stars._replace(vectors=seen, magnitude_cam=seen_mag, magnitude=magnitude[:4])
+    assert SAA._chance_statistics(alone, primary, np.arange(4), (-0.3, 0.08, -0.1, 0.07))[1] == 0
 
 
 @pytest.mark.parametrize("base", [5, 9])
@@ -445,6 +447,18 @@ def test_two_stars_of_one_partner_leave_it_to_the_cheaper() -> None:
         assert partner.tolist() == [7 if kept == 0 else -1, 3, 7 if kept == 2 else -1, -1]
         assert cost[2 - kept] == UNMATCHED_COST
         assert cost[kept] == 1
+
+
+def test_saa_s_best_counts_as_the_binomial_tail_of_the_stars_beside_its_pair() -> None:
+    """All but one of them are matched; each catalog star of the field that is not seen costs half a power of ten."""
+    rays, _, rows, index, _ = field(0)
+    unknown = np.full(len(rays), np.nan)
+    stars = SearchInput(rays, unknown, index.vectors, np.full(60, np.nan), index.cells, Gates(1e-4, 1e-4, np.inf, 0.0))
+    pool, best = SAA.AssumptionPool(stars, (-1.0, 1.0, -1.0, 1.0), 0.5), rows.astype(np.int32)
+    best[-1] = -1
+    pool.add(SAA.build_primary(stars, 0, 1), (best[None], np.array([3.0]), np.array([len(rows) - 3])))
+    tail = stats.binom.logsf(len(rows) - 4, len(rows) - 2, pool.p) / np.log(10)
+    assert pool.log10_chance == pytest.approx(tail + 0.5 * pool.missing, abs=1e-9)
 
 
 @pytest.mark.parametrize(("ratio", "accepted"), [(0.9e5, False), (1.1e5, True)])
