@@ -239,6 +239,17 @@ def test_a_radial_distortion_is_found_with_the_focal_length(uncertain: StarTrack
     assert np.median(found) == pytest.approx(-0.15, abs=0.01)
 
 
+def test_the_residual_is_the_rms_of_its_coordinates(tracker: StarTracker, uncertain: StarTracker) -> None:
+    rng = np.random.default_rng(98)
+    for eye, noise_px in ((tracker, 0.1), (uncertain, 0.3)):  # 0.3 px: the lens is fitted to the stars
+        _, pixels, _ = starfield(eye, rng, CAMERA)
+        lights = centroids(pixels + noise_px * rng.standard_normal(pixels.shape))
+        answer = eye.solve_centroids(lights)
+        seen = answer.camera.pixels(answer.cam_from_ref.apply(eye.stars.vectors[answer.match.star]))
+        residual = seen - lights.xy_px[answer.match.observed]
+        assert answer.rms_px == pytest.approx(np.sqrt(np.mean(residual**2)), rel=1e-3)
+
+
 def test_a_sheared_image_is_refused(tracker: StarTracker) -> None:
     """A rolling shutter shears the image of a turning camera: the stars of a part of the field fit an attitude."""
     rng, solved = np.random.default_rng(97), 0
