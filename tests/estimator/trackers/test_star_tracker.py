@@ -254,7 +254,7 @@ def test_a_sheared_image_is_refused(tracker: StarTracker) -> None:
     """A rolling shutter shears the image of a turning camera: the stars of a part of the field fit an attitude."""
     rng, solved = np.random.default_rng(97), 0
     for _ in range(20):
-        truth, pixels, _ = starfield(tracker, rng, CAMERA, limit_mag=7.0)
+        _truth, pixels, _ = starfield(tracker, rng, CAMERA, limit_mag=7.0)
         assert tracker.solve_centroids(centroids(pixels)).solved
         sheared = pixels + 0.01 * (pixels[:, [1]] - CAMERA.center_px[1]) * [1, 0]  # 2.5 px at the edge
         solved += tracker.solve_centroids(centroids(sheared)).solved
