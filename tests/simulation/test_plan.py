@@ -293,7 +293,7 @@ def test_a_solver_s_own_error_is_a_cause() -> None:
             "light.led.intensity",
             "the others are below the threshold",
         ),
-        ("shefex2", {"tracker__assumed_focal_length": "25.1 mm"}, "tracker.assumed_focal_length", "matching radius"),
+        ("shefex2", {"tracker__assumed_focal_length": "27 mm"}, "tracker.assumed_focal_length", "matching radius"),
         (
             "shefex2",
             {"tracker__assumed_distortion": "[1, 0, 0, 0, 0]"},
