@@ -85,7 +85,10 @@ def opening(plan: Plan, lines: list[PointRow]) -> Iterator[str]:
     yield f"\nThe checks of this scene find{':' if about.findings else ' nothing to warn of.'}\n"
     yield from (f"- {line}" for line in about.findings)
     yield "\n## Answer\n"
-    yield from (f"- {line}" for line in answer.headline(plan.study, lines, about.may_be_ambiguous))
+    yield from (
+        f"- {line}"
+        for line in answer.headline(plan.study, lines, about.may_be_ambiguous, f"skysim study worst {plan.name}")
+    )
     yield from (f"- {line}" for line in answer.one_unit(about.fixed))
     yield from (f"- {line}" for line in answer.ranges(plan.study, lines))
     yield "\n## Figures\n" if plan.study.figures else ""
