@@ -219,9 +219,9 @@ def angles(testbed: Testbed, runs: NoiseRuns, images: int, rng: np.random.Genera
 
 def relative_decrease(reference: float, angles: Floats) -> Summary:
     """Decrease of a mean angle relative to `reference` in percent; the error of `reference` is neglected."""
-    *mean, trials = confidence_interval(angles)
-    value, high, low = (100 * (1 - one / reference) for one in mean)
-    return Summary(value, low, high, trials)
+    mean = confidence_interval(angles)
+    value, high, low = (100 * (1 - one / reference) for one in (mean.value, mean.low, mean.high))
+    return Summary(value, low, high, mean.trials)
 
 
 def glare_bias_arcsec(testbed: Testbed, images: int, rng: np.random.Generator) -> float:
