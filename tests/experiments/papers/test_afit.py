@@ -17,6 +17,7 @@ from skysim.experiments.papers.afit.test_stand import (
     render_at_attitude,
     separations_arcsec,
 )
+from skysim.experiments.papers.intervals import confidence_interval
 from skysim.scene.loader import load
 from skysim.simulation.testbed import Testbed
 
@@ -114,3 +115,10 @@ def test_one_led_of_nine_is_lit_at_any_time() -> None:
         assert lit_ms.sum() == pytest.approx(100, abs=1e-3)
         assert lit_ms.min() > 11 - 1e-3
         assert lit_ms.max() < 12 + 1e-3
+
+
+def test_a_relative_decrease_has_the_interval_of_the_mean_the_other_way_round() -> None:
+    angles = np.array([96.0, 92.0, 94.0, 95.0, 93.0])
+    fall, mean = test2.relative_decrease(100.0, angles), confidence_interval(angles)
+    assert (fall.value, fall.low, fall.high) == pytest.approx((6.0, 100 - mean.high, 100 - mean.low))
+    assert (mean.value, fall.trials) == (pytest.approx(94.0), 5)
