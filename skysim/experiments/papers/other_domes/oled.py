@@ -117,7 +117,7 @@ def draw(fig: Any, errors_by_lights: dict[int, AttitudeErrors]) -> None:
     across, roll = [one.cross_boresight for one in errors], [one.roll for one in errors]
     curves = (("across", "across, one axis", across), ("roll", "roll", roll))
     for n, (key, name, summaries) in enumerate(curves):
-        value, low, high, _ = np.array(summaries).T
+        value, low, high, *_ = np.array(summaries).T
         axes.errorbar(
             lights, value, [value - low, high - value], fmt=MARKS[n], color=INK[n], capsize=3, label=f"ours, {name}"
         )

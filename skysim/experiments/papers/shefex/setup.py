@@ -152,6 +152,6 @@ def random_fields(count: int, seed: int) -> list[Field]:
 
 def plot_curve(axes: Any, x: Any, summaries: list[Summary], curve: int, label: str) -> None:
     """Plot a curve of ours with its intervals; INK[1] is reserved for published data."""
-    value, low, high, _ = np.array(summaries).T
+    value, low, high, *_ = np.array(summaries).T
     color = [one for one in INK if one != PUBLISHED][curve]
     axes.errorbar(x, value, [value - low, high - value], marker=MARKS[curve], color=color, capsize=2, label=label)
