@@ -127,6 +127,7 @@ def test_short_trails_are_those_that_the_detector_measures() -> None:
     assert diagnosis.trailed(diagnosis.replace(short, image=photograph())) == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "focal", "says"),
     [
@@ -139,6 +140,7 @@ def test_each_cause_is_named_with_the_field_unknown(change: Change, focal: str, 
     assert re.search(says, hint(change(photograph(focal)), None))
 
 
+@pytest.mark.slow
 def test_what_is_left_for_an_unknown_field_is_a_narrow_one() -> None:
     assert hint(dots(photograph()), None).endswith("; if the field is below 5°, give --fov and --catalog gaia_v8.0")
 

@@ -35,9 +35,9 @@ def code_of(stars):
 
 
 def test_the_index_holds_every_quad_of_locally_bright_stars_by_its_code() -> None:
-    height = np.radians(40.0)
-    vectors, mag = random_sky(120, 3)
-    sky = sky_index.build(vectors, mag, np.radians(60.0))
+    height = np.radians(60.0)
+    vectors, mag = random_sky(45, 3)
+    sky = sky_index.build(vectors, mag, np.radians(90.0))
     index = quad_index.build(sky, height)
     apart = 2 * np.arcsin(squareform(pdist(vectors)) / 2)
     brighter = [np.count_nonzero(apart[n, :n] < height / 2) for n in range(len(vectors))]
@@ -49,7 +49,7 @@ def test_the_index_holds_every_quad_of_locally_bright_stars_by_its_code() -> Non
         if quad_index.SHORTEST * height < longest < quad_index.LONGEST * height - bin_rad:
             expected.add(four)
     found = {tuple(sorted(star)): code for star, code in zip(index.star.tolist(), index.code, strict=True)}
-    assert len(found) == len(index.star) > 500
+    assert len(found) == len(index.star) > 100
     missing = expected - found.keys()
     assert len(missing) < 0.01 * len(expected)  # of stars with more than NEIGHBORS neighbors, or at a bin's edge
     for star, code in zip(index.star, index.code, strict=True):
