@@ -43,7 +43,7 @@ class Workload:
     brightest     : maximum number of centroids; false_share : fraction of the centroids that are false, after this cut
     false, missing: number of false lights, and fraction of the stars not detected
     false_brighter: whether every false light is brighter than any star
-    focal_error   : relative error of the focal length that the tracker is told; focal_uncertainty : as it is told
+    focal_error   : relative error of the tracker's focal length; focal_uncertainty : that the tracker assumes
     """
 
     name: str
@@ -83,9 +83,9 @@ WORKLOADS = (
     Workload("6 x 6 deg, 70 % false", (6, 6), 1024, 7.5, 0.2, false_share=0.7),
     Workload("35 x 20 deg, 70 % false", (35, 20), 1280, 5.5, 0.2, false_share=0.7),
     Workload("23 x 23 deg, 70 % false", (23, 23), 1024, 5.5, 0.2, false_share=0.7),
-    Workload("SHEFEX, focal told to 5 %, off 5 %", SHEFEX, 659, 5.75, 0.1, focal_error=0.05, focal_uncertainty=0.05),
+    Workload("SHEFEX, focal known to 5 %, off 5 %", SHEFEX, 659, 5.75, 0.1, focal_error=0.05, focal_uncertainty=0.05),
     Workload("17 x 13 deg, half false, the same", *DENSE, false_share=0.5, focal_error=0.05, focal_uncertainty=0.05),
-    Workload("SHEFEX, focal off 1 %, told as known", SHEFEX, 659, 5.75, 0.1, focal_error=0.01),
+    Workload("SHEFEX, focal off 1 %, assumed exact", SHEFEX, 659, 5.75, 0.1, focal_error=0.01),
     Workload("17 x 13 deg, half false, the same", *DENSE, false_share=0.5, focal_error=0.01),
 )
 

@@ -61,9 +61,10 @@ class SearchModel(NamedTuple):
     focal_uncertainty: float = 0.0
 
 
+WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 200_000, True, search.WRONG_FOCAL)
 CALIBRATED_SEARCHES = (
     SearchModel(MIN_ERROR_PX, 0.0, 25_000),
-    SearchModel(MIN_ERROR_PX, 0.0, 200_000, True, search.WRONG_FOCAL),
+    WRONG_FOCAL_SEARCH,
     SearchModel(MIN_ERROR_PX, 0.0, 400_000),
 )
 UNCALIBRATED_SEARCHES = (
@@ -254,16 +255,18 @@ class StarTracker:
         searches: tuple[SearchModel, ...],
         clock: Clock,
     ) -> Attitude:
-        """Solve by the default identifier; if the focal length is uncertain, then fit the lens to all stars.
+        """Solve by the default identifier.
 
-        If that fit fails, a search without relative_error returns the solution; otherwise the next search follows.
+        With a calibrated camera a solution that only a part of the field fits is dropped. With an uncertain focal
+        length the lens is fitted to all stars, unless an undistorted one explains the solution; if that fit fails, a
+        search without relative_error returns the solution, otherwise the next search follows.
         """
         for model in searches:
             sigma_px = self.sigma_px(centroids, model.min_error_px, model.relative_error)
             solution = self._search(centroids, sigma_px, patterns, model)
-            if not self.focal_uncertainty and _residuals_too_great(solution):
+            if not (self.focal_uncertainty or model.by_quads) and _residuals_too_great(solution):
                 # Of a camera with a wrong focal length a part of the stars may match, at a wrong attitude.
-                other = self._search(centroids, sigma_px, patterns, CALIBRATED_SEARCHES[1])
+                other = self._search(centroids, sigma_px, patterns, WRONG_FOCAL_SEARCH)
                 solution = other if other.dex > solution.dex + search.WRONG_FOCAL_DEX else solution
             clock.lap("identify")
             if not len(solution.star):

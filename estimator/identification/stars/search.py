@@ -100,17 +100,17 @@ def fit_to_all(detections: Detections, stars: SkyIndex, candidate: Hypothesis, a
         return build_solution(detections, stars, no_hypothesis())
     gates = 1.5 * GATE_SIGMA * detections.sigma
     full = evaluate(detections, stars, candidate.R_cam_from_ref.copy(), candidate.focal_ratio, gates, -np.inf)
-    if 2 * len(full.observed) <= len(candidate.observed):
-        return build_solution(detections, stars, no_hypothesis())
-    return build_solution(detections, stars, with_evidence(full, max(full.dex, candidate.dex)))
+    return _solution_of(detections, stars, candidate, full)
 
 
 @jit
-def with_evidence(hypothesis: Hypothesis, dex: float) -> Hypothesis:
-    """The same hypothesis with other evidence."""
-    return Hypothesis(
-        hypothesis.observed, hypothesis.star, hypothesis.R_cam_from_ref, hypothesis.focal_ratio, hypothesis.info, dex
-    )
+def _solution_of(detections: Detections, stars: SkyIndex, candidate: Hypothesis, full: Hypothesis) -> Solution:
+    """The solution of a candidate's fit to all detections; empty if it keeps no more than half of the matches."""
+    if 2 * len(full.observed) <= len(candidate.observed):
+        return build_solution(detections, stars, no_hypothesis())
+    dex = max(full.dex, candidate.dex)
+    best = Hypothesis(full.observed, full.star, full.R_cam_from_ref, full.focal_ratio, full.info, dex)
+    return build_solution(detections, stars, best)
 
 
 @jit
@@ -125,10 +125,8 @@ def fit_with_calibration(detections: Detections, stars: SkyIndex, candidate: Hyp
     R, ratio = candidate.R_cam_from_ref, candidate.focal_ratio
     kept = evaluate(exact, stars, R.copy(), 1.0, gates, -np.inf)
     free = evaluate(detections, stars, R.copy(), ratio, gates, -np.inf)
-    chosen, best = (detections, free) if free.dex > kept.dex + WRONG_FOCAL_DEX else (exact, kept)
-    if 2 * len(best.observed) <= len(candidate.observed):
-        return build_solution(exact, stars, no_hypothesis())
-    return build_solution(chosen, stars, with_evidence(best, max(best.dex, candidate.dex)))
+    chosen, full = (detections, free) if free.dex > kept.dex + WRONG_FOCAL_DEX else (exact, kept)
+    return _solution_of(chosen, stars, candidate, full)
 
 
 @jit
@@ -395,7 +393,7 @@ def quick_check(
     """Quick check of an attitude: number of detections looked up, and whether `required` of them have a star nearby.
 
     The two detections of the pair count as matched. Stops as soon as the count is reached or out of reach, or after
-    `max_misses` of them without any match.
+    `max_misses` detections without any match.
     """
     count, remaining = 2, len(order)
     for step in range(remaining):

@@ -379,9 +379,8 @@ def load_stored_plan(
     with open_store(study, out) as stored:
         overrides = stored.overrides() | parse_overrides(set_)
         plan = loader.load(study, overrides, None if program is None else process.program_commands(program))
-        known = plan.digest == stored.meta("digest") or (grows and runner.stored_replicates(plan, stored))
-        path = stored.path
-    if not known:
+        kept, path = runner.stored_replicates(plan, stored), stored.path
+    if not kept or (kept < plan.study.replicates and not grows):
         raise InputError(f"{path}: contains another study or an earlier version of this one; allowed: another --out")
     return plan, overrides
 

@@ -109,8 +109,8 @@ def prepare_store(plan: Plan, store: Store, resume: bool, overrides: Mapping[str
     Raises InputError if the store holds another study or rows of another code version, or if `resume` does not fit.
     """
     stored, done, fault = store.meta("digest"), store.counts()["done"], ""
-    fewer = stored_replicates(plan, store) if stored and stored != plan.digest else plan.study.replicates
-    if not fewer:
+    kept = stored_replicates(plan, store) if stored else plan.study.replicates
+    if not kept:
         fault = "contains another study, or an earlier version of this one; allowed: another --out"
     elif resume and not stored:
         fault = "contains no trials to resume; allowed: skysim study run"
@@ -127,7 +127,7 @@ def prepare_store(plan: Plan, store: Store, resume: bool, overrides: Mapping[str
         text, file = plan.path.read_text(encoding="utf-8"), str(plan.path.resolve())
         store.begin(
             plan.points,
-            grown=(fewer, plan.study.replicates) if done else None,
+            grown=(kept, plan.study.replicates) if done else None,
             study=text,
             file=file,
             title=plan.study.title,
@@ -139,7 +139,9 @@ def prepare_store(plan: Plan, store: Store, resume: bool, overrides: Mapping[str
 
 
 def stored_replicates(plan: Plan, store: Store) -> int:
-    """Replicates of the store's trials if its study is the plan's with fewer of them, else 0."""
+    """Replicates of the store's trials if its study is the plan's, with as many of them or fewer; else 0."""
+    if plan.digest == store.meta("digest"):
+        return plan.study.replicates
     if plan.study.optimize is not None:  # a search has chosen its candidates by all replicates
         return 0
     with store.corruption_as_input_error():
