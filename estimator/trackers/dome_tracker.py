@@ -26,7 +26,8 @@ from estimator.identification.leds.index import build_dome_index, corner_rays, i
 from estimator.identification.leds.search import NO_MATCH
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, process_frame
-from estimator.trackers.star_tracker import NO_STARS, mutual_nearest
+from estimator.trackers.refinement import mutual_nearest
+from estimator.trackers.star_tracker import NO_STARS
 
 MIN_ERROR_PX = 0.3  # least centroid error of an LED, for effects outside of survey and calibration
 SETTINGS = Settings(identifier="led_pairs", solver="rotation_only")

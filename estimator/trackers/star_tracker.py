@@ -18,29 +18,24 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.solvers import SOLVERS, covariance
-from estimator.attitude.systematic import focal_error_px, with_focal_error
+from estimator.attitude.systematic import with_focal_error
 from estimator.catalog import catalog, pair_index, quad_index, sky_index
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
-from estimator.core.least_squares import fit_soft_l1
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.chance import (
-    ACCEPT_LOG10_CHANCE,
     MIN_EVIDENCE_MATCHES,
-    MIN_MATCHES,
-    log10_tail,
 )
-from estimator.identification.stars import evidence, quads, search
+from estimator.identification.stars import quads, search
 from estimator.identification.stars.evidence import Detections, Solution
-from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, process_frame
+from estimator.trackers.pipeline import Clock, Report, Settings, brightest, process_frame
+from estimator.trackers.refinement import NO_MATCH, FieldMatcher
 
 NO_STARS = "too few stars detected"
-NO_MATCH = "no identification beyond chance"
 MIN_ERROR_PX = 0.005  # least centroid error of a star: a calibrated lens, a catalog's places
 
 
@@ -76,10 +71,6 @@ UNCALIBRATED_SEARCHES = (
     SearchModel(1.0, 0.005, 200_000),
     SearchModel(2.0, 0.01, 100_000),
 )
-MISFIT_SHARE = 0.8  # near misses per match; centroid errors that are claimed three times too small give up to 0.75
-MAX_DISTORTION_SIGMA = 1.5  # of an undistorted lens
-# A detection brighter than its star by this much is a mismatch: more than colors, variables and doubles explain.
-TOO_BRIGHT_MAG = 2.0
 CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 SETTINGS = Settings()
 
@@ -107,7 +98,6 @@ class StarTracker:
         self.searches: tuple[SearchModel, ...] = UNCALIBRATED_SEARCHES if focal_uncertainty else CALIBRATED_SEARCHES
         apparent_stars = replace(stars, vectors=vectors)
         self.stars = catalog.merge_doubles(apparent_stars, settings.merge_px / camera.focal_px)
-        self.tree = cKDTree(self.stars.vectors)
         field_sr = camera.width_px * camera.height_px / camera.focal_px**2
         index_stars = self.stars.take(
             self.stars.v_mag <= catalog.limit_for_density(self.stars, field_sr, settings.field_stars)
@@ -122,6 +112,7 @@ class StarTracker:
         else:
             self.index = pair_index.build(index_stars.vectors, widest_rad * 1.02)
             self.pairs = len(self.index.pair)
+        self.field_matcher = FieldMatcher(camera, self.stars, self.sky, settings, focal_uncertainty, self.pairs)
         corners = camera.tangents(CORNERS * [camera.width_px, camera.height_px] - 0.5)
         self.field = np.array([corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max()])
 
@@ -185,7 +176,7 @@ class StarTracker:
             return self._identify_by_evidence(centroids, self.patterns, searches, clock)
         for camera, cam_from_ref in self._candidates(centroids):
             clock.lap("identify")
-            attitude = self._refine(centroids, camera, cam_from_ref)
+            attitude = self.field_matcher.refine(centroids, camera, cam_from_ref)
             clock.lap("solve")
             if attitude.solved:
                 return attitude
@@ -271,13 +262,13 @@ class StarTracker:
             clock.lap("identify")
             if not len(solution.star):
                 continue
-            if not self.focal_uncertainty and self._misfits(solution, centroids):
+            if not self.focal_uncertainty and self.field_matcher.misfits(solution, centroids):
                 continue
             attitude = self.attitude_of(centroids, solution, sigma_px)
             if self.focal_uncertainty and not (
-                model.min_error_px == MIN_ERROR_PX and self._fits(solution, centroids, sigma_px)
+                model.min_error_px == MIN_ERROR_PX and self.field_matcher.fits(solution, centroids, sigma_px)
             ):
-                fitted = self._refine(
+                fitted = self.field_matcher.refine(
                     centroids,
                     self.camera.zoomed(solution.focal_ratio),
                     Rotation.from_quat(solution.cam_from_ref_xyzw),
@@ -297,47 +288,6 @@ class StarTracker:
             return search.lost_in_space(detections, patterns, self.sky, most, model.max_checks)
         known = not self.focal_uncertainty
         return quads.identify(detections, self.quads, patterns, self.sky, most, model.max_checks, known)
-
-    def _fits(self, solution: Solution, centroids: Centroids, sigma_px: Floats) -> bool:
-        """Whether an undistorted lens explains a solution.
-
-        The residuals have their expected size, they have no part q = r^3 - c r by a radial distortion (c makes q
-        orthogonal to r, which a focal length explains), and no more stars than by chance are near other detections.
-        """
-        count, observed = len(solution.star), solution.observed
-        if solution.chi2 > 1 + 1 / np.sqrt(count):
-            return False
-        camera, cam_from_ref = self.camera.zoomed(solution.focal_ratio), Rotation.from_quat(solution.cam_from_ref_xyzw)
-        xy_px = centroids.xy_px[observed]
-        residual_px = xy_px - camera.pixels(cam_from_ref.apply(self.stars.vectors[solution.star]))
-        offset = (xy_px - camera.center_px) / camera.focal_px
-        r2 = np.sum(offset**2, axis=1)
-        q = r2 - np.sum(r2**2) / np.sum(r2)  # over r
-        score = np.sum(q * np.sum(offset * residual_px, axis=1)) / np.sqrt(np.sum(q**2 * r2 * sigma_px[observed] ** 2))
-        if abs(score) > MAX_DISTORTION_SIGMA:
-            return False
-        near, by_chance = self._near_misses(solution, centroids)
-        return near <= 1 + 2 * by_chance
-
-    def _misfits(self, solution: Solution, centroids: Centroids) -> bool:
-        """Whether about as many stars are beside detections, beyond their errors, as on them.
-
-        The camera model is then wrong (a rolling shutter that turns, a strong distortion). The stars that match are
-        those of a part of the field, and their attitude is that of this part.
-        """
-        matched = len(solution.star)
-        if len(centroids) - matched < MISFIT_SHARE * matched:
-            return False
-        near, by_chance = self._near_misses(solution, centroids)
-        return near - by_chance > max(MISFIT_SHARE * matched, 3 * np.sqrt(by_chance))
-
-    def _near_misses(self, solution: Solution, centroids: Centroids) -> tuple[int, float]:
-        """Number of unmatched detections beside a star, and how many are expected by chance."""
-        gate_rad = min(self._lens_radii_px[0] / self.camera.focal_px, 0.05)
-        tangent = self.camera.tangents(np.delete(centroids.xy_px, solution.observed, axis=0))
-        R = Rotation.from_quat(solution.cam_from_ref_xyzw).as_matrix()
-        near = evidence.count_near(tangent, self.sky, R, solution.focal_ratio, gate_rad)
-        return near, len(tangent) * min(len(self.stars) * gate_rad**2 / 4, 1.0)
 
     def attitude_of(self, centroids: Centroids, solution: Solution, sigma_px: Floats) -> Attitude:
         """The attitude of a solution; solved again from its matches if the settings name another solver."""
@@ -388,130 +338,7 @@ class StarTracker:
                 if match:
                     yield camera, match.cam_from_ref
 
-    @property
-    def _lens_radii_px(self) -> list[float]:
-        """Matching radii with an uncertain lens: the first allow for its error at the corner; each fit permits less."""
-        reach_px = np.hypot(self.camera.width_px, self.camera.height_px) / 2
-        return [0.008 * reach_px + 2, 0.004 * reach_px + 2, 4, 3, 2.5, 2.5]
-
-    def _refine(self, centroids: Centroids, camera: Camera, cam_from_ref: Rotation) -> Attitude:
-        """Refine an attitude: match the field to the full catalog and fit, with decreasing radii; test against chance.
-
-        If the focal length is uncertain, each round also fits the camera (`fit_camera`), and the result must be within
-        1.2 times the uncertainty.
-        """
-        fit_lens = self.focal_uncertainty > 0
-        for radius_px in self._lens_radii_px if fit_lens else [3, 2.5, 2.5]:
-            observed, star = self._nearest(centroids, camera, cam_from_ref, radius_px)
-            if len(observed) < MIN_MATCHES:
-                return Attitude(NO_MATCH)
-            xy, vectors = centroids.xy_px[observed], self.stars.vectors[star]
-            if fit_lens:
-                camera, cam_from_ref = fit_camera(camera, cam_from_ref, xy, vectors)
-            rays = camera.rays(xy)
-            focal_rad = focal_error_px(camera, xy) / camera.focal_px
-            sigma_rad = np.hypot(direction_sigma_rad(centroids.take(observed), camera, self.settings), focal_rad)
-            try:
-                cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
-            except ValueError as error:
-                return Attitude(f"no attitude: {error}")
-        rows, _ = self.in_field(camera, cam_from_ref)
-        chance = log10_chance(
-            observed,
-            len(centroids),
-            len(rows),
-            radius_px,
-            camera,
-            self.pairs,
-        )
-        if chance > ACCEPT_LOG10_CHANCE:
-            return Attitude(NO_MATCH)
-        # The field, not the focal length: a distortion changes what a focal length means.
-        if abs(self.camera.fov_rad / camera.fov_rad - 1) > 1.2 * self.focal_uncertainty + 1e-9:
-            return Attitude(NO_MATCH)
-        seen_cam = cam_from_ref.apply(vectors)
-        rms_px = float(np.sqrt(np.mean((camera.pixels(seen_cam) - xy) ** 2)))
-        covariance_rad2 = covariance(rays, sigma_rad, self.settings.solver)
-        covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, camera, xy, seen_cam, sigma_rad)
-        match = StarMatch(observed, star, cam_from_ref, chance)
-        return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2)
-
-    def in_field(self, camera: Camera, cam_from_ref: Rotation) -> tuple[NDArray, Floats]:
-        """Rows and pixels of the catalog stars on the sensor, brightest first."""
-        boresight = cam_from_ref.inv().apply([0.0, 0.0, 1.0])
-        rows = np.array(self.tree.query_ball_point(boresight, 2 * np.sin(camera.diagonal_rad / 4) * 1.05), int)
-        rows.sort()
-        xy = camera.pixels(cam_from_ref.apply(self.stars.vectors[rows])) if len(rows) else np.empty((0, 2))
-        inside = camera.contains(xy, -2.0)
-        return rows[inside], xy[inside]
-
-    def _nearest(
-        self, centroids: Centroids, camera: Camera, cam_from_ref: Rotation, radius_px: float
-    ) -> tuple[NDArray, NDArray]:
-        """Mutual nearest neighbors of centroids and catalog stars within a radius, without much too bright ones."""
-        rows, xy = self.in_field(camera, cam_from_ref)
-        observed, star = mutual_nearest(centroids.xy_px, xy, radius_px, rows)
-        if len(star) < MIN_MATCHES:
-            return observed, star
-        # The zero point from each match is about the same for all stars; saturation loses flux and makes it smaller.
-        # One far above the median is a planet, a lamp or a reflection near a faint star.
-        zero_mag = self.stars.v_mag[star] + 2.5 * np.log10(centroids.flux[observed])
-        excess_mag = zero_mag - np.median(zero_mag)
-        plausible = excess_mag < max(TOO_BRIGHT_MAG, 4 * float(np.median(np.abs(excess_mag))))
-        return observed[plausible], star[plausible]
-
 
 def _residuals_too_great(solution: Solution) -> bool:
     """Whether the residuals of a solution exceed their errors by more than three standard deviations of chi-square."""
     return bool(solution.chi2 > 1 + 3 / np.sqrt(max(len(solution.star), 1)))
-
-
-def log10_chance(
-    observed: NDArray, blobs: int, predicted: int, radius_px: float, camera: Camera, patterns: int
-) -> float:
-    """log10 of the expected number of matches this good by chance, over all patterns tried.
-
-    A false blob falls within the radius of a predicted star with probability p, the fraction of the sensor that the
-    circles cover; two matches define the attitude and do not count. Faint blobs are mostly false, so that the binomial
-    tail is computed among the brightest 15, 30, 60 and all of the blobs. The least counts, multiplied by the number of
-    choices.
-    """
-    p = 1 - np.exp(-predicted * np.pi * radius_px**2 / (camera.width_px * camera.height_px))
-    counts = [count for count in (15, 30, 60) if count < blobs] + [blobs]
-    tails = [log10_tail(max(count - 2, 0), int((observed < count).sum()) - 2, p) for count in counts]
-    return float(min(tails) + np.log10(len(counts)) + np.log10(patterns))
-
-
-def mutual_nearest(
-    observed_px: Floats, predicted_px: Floats, radius_px: float, rows: NDArray
-) -> tuple[NDArray, NDArray]:
-    """Mutual nearest neighbors within a radius: indices of observed_px, and `rows` of the predictions."""
-    if not len(predicted_px) or not len(observed_px):
-        return np.empty(0, int), np.empty(0, int)
-    distance, nearest = cKDTree(predicted_px).query(observed_px, distance_upper_bound=radius_px)
-    _, back = cKDTree(observed_px).query(predicted_px)
-    match = np.flatnonzero(np.isfinite(distance))
-    match = match[back[nearest[match]] == match]
-    return match, rows[nearest[match]]
-
-
-def fit_camera(camera: Camera, cam_from_ref: Rotation, xy_px: Floats, vectors_ref: Floats) -> tuple[Camera, Rotation]:
-    """Fit attitude, focal length and (with 12 stars or more) the first radial distortion coefficient to the pixels.
-
-    Robust least squares (soft L1 loss beyond one pixel), so that a wrong match has little effect on the lens.
-    """
-    radial = len(xy_px) >= 12
-    start = np.zeros(5 if radial else 4)
-    start[4:] = camera.distortion[0]
-
-    def model(p: Floats) -> tuple[Camera, Rotation]:
-        k1 = float(p[4]) if radial else camera.distortion[0]
-        lens = replace(camera, focal_px=camera.focal_px * float(np.exp(p[3])), distortion=(k1, 0.0, 0.0, 0.0, 0.0))
-        return lens, Rotation.from_rotvec(p[:3]) * cam_from_ref
-
-    def residual(p: Floats) -> Floats:
-        lens, rotation = model(p)
-        return np.nan_to_num(lens.pixels(rotation.apply(vectors_ref)) - xy_px, nan=1e3).ravel()
-
-    scale = np.array([1e-3, 1e-3, 1e-3, 1e-2, 0.3])[: len(start)]
-    return model(fit_soft_l1(residual, start, scale))

@@ -168,7 +168,7 @@ class TrackingMode:
         Of stars closer than reach_px only the brightest is kept.
         """
         tracker = self.tracker
-        rows, xy = tracker.in_field(tracker.camera, cam_from_ref)
+        rows, xy = tracker.field_matcher.in_field(tracker.camera, cam_from_ref)
         inside = tracker.camera.contains(xy, self.reach_px)
         xy = xy[inside][np.argsort(rows[inside])][: 2 * self.max_windows]
         close = np.abs(xy[:, None] - xy).max(axis=2) < self.reach_px

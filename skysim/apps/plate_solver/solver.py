@@ -27,7 +27,8 @@ from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid
-from estimator.trackers.star_tracker import NO_MATCH, StarTracker
+from estimator.trackers.refinement import NO_MATCH
+from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import CATALOGS
 from skysim.core.quantities.utc import check_year

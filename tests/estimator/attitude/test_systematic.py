@@ -162,7 +162,7 @@ def test_the_star_tracker_claims_the_error_of_its_focal_length(focal: float) -> 
     camera = Camera(1600, 1200, 4000.0, (799.5, 599.5), focal_sigma=focal)
     tracker = StarTracker.for_sky(camera, limit_mag=6.0)
     cam_from_ref = Rotation.from_euler("xyz", [80, 10, 30], degrees=True)
-    rows, exact_px = tracker.in_field(camera, cam_from_ref)
+    rows, exact_px = tracker.field_matcher.in_field(camera, cam_from_ref)
     chosen = exact_px[:, 0] > 900
     rows, exact_px = rows[chosen], exact_px[chosen]
     assert len(rows) >= 5

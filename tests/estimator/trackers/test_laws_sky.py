@@ -29,8 +29,9 @@ from estimator.identification.published.master_star import master_star
 from estimator.identification.published.pyramid import pyramid
 from estimator.identification.published.saa import AssumptionPool, saa
 from estimator.identification.registry import IDENTIFIERS
-from estimator.trackers import star_tracker
+from estimator.trackers import refinement
 from estimator.trackers.pipeline import Settings
+from estimator.trackers.refinement import FieldMatcher
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import TrackingMode
 
@@ -169,14 +170,26 @@ def eye() -> StarTracker:
 
 def seen_by(eye: StarTracker, rng: np.random.Generator, truth: Rotation) -> tuple[Centroids, NDArray]:
     """The field's stars, brightest first, each a tenth of a pixel off, and their rows."""
-    rows, xy = eye.in_field(CAMERA, truth)
+    rows, xy = eye.field_matcher.in_field(CAMERA, truth)
     inside = CAMERA.contains(xy, 2)
     rows, xy = rows[inside], xy[inside] + rng.normal(0, 0.1, (int(inside.sum()), 2))
     return Centroids(xy, np.full(len(rows), 0.1), 10 ** (-0.4 * eye.stars.v_mag[rows])), rows
 
 
+@law(FieldMatcher.nearest, FieldMatcher.refine)
+@given(rng=SEEDS)
+def test_a_field_is_matched_from_a_near_attitude(eye: StarTracker, rng: np.random.Generator) -> None:
+    truth = turn(rng)
+    centroids, rows = seen_by(eye, rng, truth)
+    observed, star = eye.field_matcher.nearest(centroids, CAMERA, truth, 3.0)
+    assert np.array_equal(star, rows[observed]) and len(star) >= 0.9 * len(rows)
+    near = Rotation.from_rotvec(1.0 / CAMERA.focal_px * units(rng, 1)[0]) * truth
+    found = eye.field_matcher.refine(centroids, CAMERA, near)
+    assert not found.solved or (found.cam_from_ref * truth.inv()).magnitude() < 0.02
+
+
 @law(
-    StarTracker.in_field,
+    FieldMatcher.in_field,
     StarTracker.solve_centroids,
     StarTracker.solve_matches,
     StarTracker.attitude_of,
@@ -187,7 +200,9 @@ def test_an_attitude_is_the_sky_s_or_none(eye: StarTracker, rng: np.random.Gener
     truth = turn(rng)
     centroids, rows = seen_by(eye, rng, truth)
     everywhere = np.nan_to_num(CAMERA.pixels(truth.apply(eye.stars.vectors)), nan=-1e9)
-    assert set(np.flatnonzero(CAMERA.contains(everywhere)).tolist()) <= set(eye.in_field(CAMERA, truth)[0].tolist())
+    assert set(np.flatnonzero(CAMERA.contains(everywhere)).tolist()) <= set(
+        eye.field_matcher.in_field(CAMERA, truth)[0].tolist()
+    )
     named = eye.solve_matches(centroids, np.arange(len(rows)), rows)
     assert named.solved == (len(rows) >= 2)
     assert not named.solved or (named.cam_from_ref * truth.inv()).magnitude() < 0.02
@@ -235,36 +250,36 @@ def test_no_picture_of_noise_has_an_attitude_at_any_time(
     assert (off >= follower.reach_px).all()
 
 
-@law(star_tracker.mutual_nearest)
+@law(refinement.mutual_nearest)
 @given(rng=SEEDS, radius_px=some.floats(0, 50), counts=some.tuples(some.integers(0, 9), some.integers(0, 9)))
 def test_mutual_neighbors_are_each_other_s_nearest(
     rng: np.random.Generator, radius_px: float, counts: tuple[int, int]
 ) -> None:
     seen, there = (rng.uniform(0, 100, (count, 2)) for count in counts)
     rows = rng.permutation(100)[: len(there)]
-    hit, row = star_tracker.mutual_nearest(seen, there, radius_px, rows)
+    hit, row = refinement.mutual_nearest(seen, there, radius_px, rows)
     between = np.linalg.norm(seen[:, None] - there, axis=2)
     told = {(int(a), int(np.flatnonzero(rows == b)[0])) for a, b in zip(hit, row, strict=True)}
     least = [(a, int(np.argmin(between[a]))) for a in range(len(seen)) if len(there)]
     assert told == {(a, b) for a, b in least if np.argmin(between[:, b]) == a and between[a, b] < radius_px}
 
 
-@law(star_tracker.log10_chance)
+@law(refinement.log10_chance)
 @given(blobs=some.integers(4, 100), predicted=some.integers(1, 100), radius_px=some.floats(0.5, 5))
 def test_more_matches_are_less_of_a_chance(blobs: int, predicted: int, radius_px: float) -> None:
     chances = [
-        star_tracker.log10_chance(np.arange(n), blobs, predicted, radius_px, CAMERA, 1000) for n in range(2, blobs + 1)
+        refinement.log10_chance(np.arange(n), blobs, predicted, radius_px, CAMERA, 1000) for n in range(2, blobs + 1)
     ]
     assert all(b <= a + 1e-9 for a, b in pairwise(chances))
 
 
-@law(star_tracker.fit_camera, slow=True)
+@law(refinement.fit_camera, slow=True)
 @given(rng=SEEDS, longer=some.floats(-0.03, 0.03), off_rad=some.floats(0, 0.01))
 def test_a_camera_is_fitted_to_exact_pixels(rng: np.random.Generator, longer: float, off_rad: float) -> None:
     true, truth = CAMERA.zoomed(1 + longer), turn(rng)
     xy = rng.uniform(0, [639, 479], (20, 2))
     start = Rotation.from_rotvec(off_rad * units(rng, 1)[0]) * truth
-    camera, found = star_tracker.fit_camera(CAMERA, start, xy, truth.inv().apply(true.rays(xy)))
+    camera, found = refinement.fit_camera(CAMERA, start, xy, truth.inv().apply(true.rays(xy)))
     assert abs(camera.focal_px / true.focal_px - 1) < 1e-4
     assert (found * truth.inv()).magnitude() < 1e-4
 
@@ -302,5 +317,5 @@ def test_chance_matches_are_counted_over_the_circles_of_the_predicted_stars() ->
     area = predicted * np.pi * radius_px**2 / (CAMERA.width_px * CAMERA.height_px)
     tails = [stats.binom.logsf(hits - 3, count - 2, -np.expm1(-area)) for count, hits in ((15, 7), (30, 7), (40, 8))]
     wanted = min(tails) / np.log(10) + np.log10(3 * 20)
-    found = star_tracker.log10_chance(observed, 40, predicted, radius_px, CAMERA, 20)
+    found = refinement.log10_chance(observed, 40, predicted, radius_px, CAMERA, 20)
     assert found == pytest.approx(wanted, abs=1e-9)

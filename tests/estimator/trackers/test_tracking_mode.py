@@ -41,7 +41,7 @@ def attitude(t_s: float) -> Rotation:
 def light_of_stars(tracker: StarTracker, cam_from_ref: Rotation, light: float):
     """Gaussian stars, in electrons."""
     image = np.zeros((CAMERA.height_px, CAMERA.width_px))
-    rows, pixels = tracker.in_field(CAMERA, cam_from_ref)
+    rows, pixels = tracker.field_matcher.in_field(CAMERA, cam_from_ref)
     edges_x, edges_y = np.arange(CAMERA.width_px + 1) - 0.5, np.arange(CAMERA.height_px + 1) - 0.5
     for (x, y), mag in zip(pixels, tracker.stars.v_mag[rows], strict=True):
         across, down = (np.diff(erf((e - at) / (PSF_PX * 2**0.5))) / 2 for e, at in ((edges_x, x), (edges_y, y)))
@@ -104,7 +104,7 @@ def test_a_prediction_adds_the_evidence_of_its_smaller_volume(tracker: StarTrack
 
 def test_residuals_of_one_sigma_are_counted_over_2n_less_3(tracker: StarTracker) -> None:
     """Three of the 2 N measured coordinates are spent on the attitude; two stars leave one degree of freedom."""
-    rows, pixels = tracker.in_field(CAMERA, START)
+    rows, pixels = tracker.field_matcher.in_field(CAMERA, START)
     for count in (2, 4, 9):
         xy, sigma = pixels[:count] + 0.1, np.full(count, 0.1)
         match = StarMatch(np.arange(count), rows[:count], START, -9.0)
@@ -155,7 +155,7 @@ def test_half_a_sky_is_called_missing_and_few_stars_few(tracker: StarTracker) ->
     follower = TrackingMode(tracker)
     follower.solve(photograph(tracker, START), 0.0)
     image = photograph(tracker, START, 1)
-    _, pixels = tracker.in_field(CAMERA, START)
+    _, pixels = tracker.field_matcher.in_field(CAMERA, START)
     left = np.sort(pixels[:, 0])[3]
     image[:, int(left) + 6 :] = photograph(tracker, START, 2, light=0.0)[:, int(left) + 6 :]
     report = follower.solve(image, STEP_S)
@@ -194,7 +194,7 @@ def test_another_camera_s_frame_is_bad_input(tracker: StarTracker) -> None:
 
 def test_a_window_holds_its_star_and_no_other(tracker: StarTracker) -> None:
     image = photograph(tracker, START)
-    rows, pixels = tracker.in_field(CAMERA, START)
+    rows, pixels = tracker.field_matcher.in_field(CAMERA, START)
     bright = pixels[tracker.stars.v_mag[rows] < 4.5]
     blobs = in_windows(image, bright + np.array([2.0, -1.0]), 6.0, 4.0)
     nearest = np.abs(blobs.xy_px[:, None] - bright).max(axis=2).min(axis=1)
