@@ -131,13 +131,16 @@ def misfit_factor(chi2: float, degrees_of_freedom: int) -> float:
     return reduced if reduced > 1 + 4 * sqrt(2 / degrees_of_freedom) else 1.0
 
 
-def fit_soft_l1(residual: Callable[[Floats], Floats], start: Floats, scale: Floats) -> Floats:
+def fit_soft_l1(
+    residual: Callable[[Floats], Floats], start: Floats, scale: Floats, converged_fall: float = CONVERGED_FALL
+) -> Floats:
     """Return the parameters that minimize sum(2 (sqrt(1 + r^2) - 1)), the soft L1 loss of residuals (N,).
 
     It grows as |r| beyond 1, so that a few gross errors have little effect. Levenberg-Marquardt on the weights
     1 / sqrt(1 + r^2) of iteratively reweighted least squares; slopes by differences of SLOPE_STEP times the scale.
 
     scale : (P,) change of each parameter that changes the residuals by about as much as any other's
+    converged_fall : the fit ends at a step that lowers the loss by no more than this fraction
     """
     point, r = np.asarray(start, dtype=float), residual(start)
     damping = 1e-4
@@ -155,7 +158,7 @@ def fit_soft_l1(residual: Callable[[Floats], Floats], start: Floats, scale: Floa
             return point
         point, fall, r = point + scale * change, soft_l1(r) - soft_l1(tried), tried
         damping = max(damping / 10, MIN_DAMPING)
-        if fall <= CONVERGED_FALL * soft_l1(r):
+        if fall <= converged_fall * soft_l1(r):
             return point
     return point
 

@@ -33,6 +33,9 @@ MISFIT_SHARE = 0.8  # near misses per match; centroid errors that are claimed th
 MAX_DISTORTION_SIGMA = 1.5  # of an undistorted lens
 # A detection brighter than its star by this much is a mismatch: more than colors, variables and doubles explain.
 TOO_BRIGHT_MAG = 2.0
+BEHIND = 1e-3  # least z of a direction in the lens fit
+# The lens fit ends at a step that lowers the loss by this fraction: sqrt(N / 10^6) standard deviations for N stars.
+CONVERGED_FALL = 1e-6
 
 
 class FieldMatcher:
@@ -206,18 +209,21 @@ def fit_camera(camera: Camera, cam_from_ref: Rotation, xy_px: Floats, vectors_re
 
     Robust least squares (soft L1 loss beyond one pixel), so that a wrong match has little effect on the lens.
     """
-    radial = len(xy_px) >= 12
-    start = np.zeros(5 if radial else 4)
-    start[4:] = camera.distortion[0]
-
-    def model(p: Floats) -> tuple[Camera, Rotation]:
-        k1 = float(p[4]) if radial else camera.distortion[0]
-        lens = replace(camera, focal_px=camera.focal_px * float(np.exp(p[3])), distortion=(k1, 0.0, 0.0, 0.0, 0.0))
-        return lens, Rotation.from_rotvec(p[:3]) * cam_from_ref
+    count, k1 = (5 if len(xy_px) >= 12 else 4), camera.distortion[0]
+    start = np.zeros(count)
+    start[4:] = k1
+    R_cam_from_ref = cam_from_ref.as_matrix()
 
     def residual(p: Floats) -> Floats:
-        lens, rotation = model(p)
-        return np.nan_to_num(lens.pixels(rotation.apply(vectors_ref)) - xy_px, nan=1e3).ravel()
+        # As `Camera.pixels`, without its checks: this runs a hundred times a frame.
+        x, y, z = Rotation.from_rotvec(p[:3]).as_matrix() @ R_cam_from_ref @ vectors_ref.T
+        tangent = np.column_stack([x, y]) / np.maximum(z, BEHIND)[:, None]
+        radial = 1 + (p[4] if count == 5 else k1) * np.sum(tangent**2, axis=1)
+        pixels = camera.focal_px * np.exp(p[3]) * radial[:, None] * tangent + camera.center_px
+        return (pixels - xy_px).ravel()
 
-    scale = np.array([1e-3, 1e-3, 1e-3, 1e-2, 0.3])[: len(start)]
-    return model(fit_soft_l1(residual, start, scale))
+    scale = np.array([1e-3, 1e-3, 1e-3, 1e-2, 0.3])[:count]
+    found = fit_soft_l1(residual, start, scale, CONVERGED_FALL)
+    k1 = float(found[4]) if count == 5 else k1
+    lens = replace(camera, focal_px=camera.focal_px * float(np.exp(found[3])), distortion=(k1, 0.0, 0.0, 0.0, 0.0))
+    return lens, Rotation.from_rotvec(found[:3]) * cam_from_ref

@@ -63,6 +63,7 @@ CALIBRATED_SEARCHES = (
     SearchModel(MIN_ERROR_PX, 0.0, 400_000),
 )
 UNCALIBRATED_SEARCHES = (
+    SearchModel(MIN_ERROR_PX, 0.0, 10_000, True),
     SearchModel(MIN_ERROR_PX, 0.0, 100_000, True),
     SearchModel(0.5, 0.0, 100_000, True),
     SearchModel(1.0, 0.005, 100_000, True),
@@ -71,6 +72,7 @@ UNCALIBRATED_SEARCHES = (
     SearchModel(1.0, 0.005, 200_000),
     SearchModel(2.0, 0.01, 100_000),
 )
+QUAD_SEARCHES = tuple(model for model in UNCALIBRATED_SEARCHES if model.by_quads)  # of an unknown field of view
 CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 SETTINGS = Settings()
 
@@ -83,6 +85,7 @@ class StarTracker:
     vectors : (N, 3) apparent directions of `stars` at the time of the frames
     focal_uncertainty : relative; 0 for a calibrated camera, 0.05 if the field of view is only known to 5 %.
         Unless it is 0, the focal length and, with enough stars, the radial distortion are fitted in each frame.
+    searches : of the default identifier; empty for those that suit the focal uncertainty
     """
 
     def __init__(
@@ -92,25 +95,28 @@ class StarTracker:
         vectors: Floats,
         settings: Settings = SETTINGS,
         focal_uncertainty: float = 0.0,
+        searches: tuple[SearchModel, ...] = (),
     ) -> None:
         self.camera, self.settings = camera, settings
         self.focal_uncertainty = focal_uncertainty
-        self.searches: tuple[SearchModel, ...] = UNCALIBRATED_SEARCHES if focal_uncertainty else CALIBRATED_SEARCHES
+        self.searches = searches or (UNCALIBRATED_SEARCHES if focal_uncertainty else CALIBRATED_SEARCHES)
         apparent_stars = replace(stars, vectors=vectors)
         self.stars = catalog.merge_doubles(apparent_stars, settings.merge_px / camera.focal_px)
         field_sr = camera.width_px * camera.height_px / camera.focal_px**2
         index_stars = self.stars.take(
             self.stars.v_mag <= catalog.limit_for_density(self.stars, field_sr, settings.field_stars)
         )
-        widest_rad = camera.zoomed(1 - focal_uncertainty).diagonal_rad
+        longest_rad = 1.02 * camera.zoomed(1 - focal_uncertainty).diagonal_rad
+        if all(model.by_quads for model in self.searches):
+            longest_rad = quad_index.LONGEST * self._height_rad
         self.sky = sky_index.build_without_pairs(self.stars.vectors, self.stars.v_mag)
         self.patterns: sky_index.SkyIndex | None = None
         self.index: pair_index.PairIndex | None = None
         if settings.identifier == "default":
-            self.patterns = sky_index.build(index_stars.vectors, index_stars.v_mag, widest_rad * 1.02)
+            self.patterns = sky_index.build(index_stars.vectors, index_stars.v_mag, longest_rad)
             self.pairs = len(self.patterns.pair)
         else:
-            self.index = pair_index.build(index_stars.vectors, widest_rad * 1.02)
+            self.index = pair_index.build(index_stars.vectors, longest_rad)
             self.pairs = len(self.index.pair)
         self.field_matcher = FieldMatcher(camera, self.stars, self.sky, settings, focal_uncertainty, self.pairs)
         corners = camera.tangents(CORNERS * [camera.width_px, camera.height_px] - 0.5)
@@ -120,8 +126,12 @@ class StarTracker:
     def quads(self) -> quad_index.QuadIndex:
         """The quads of the pattern index, built when they are first needed."""
         assert self.patterns is not None
-        height_rad = 2 * np.arctan(min(self.camera.width_px, self.camera.height_px) / 2 / self.camera.focal_px)
-        return quad_index.build(self.patterns, height_rad)
+        return quad_index.build(self.patterns, self._height_rad)
+
+    @property
+    def _height_rad(self) -> float:
+        """The smaller side of the field of view."""
+        return float(2 * np.arctan(min(self.camera.width_px, self.camera.height_px) / 2 / self.camera.focal_px))
 
     @classmethod
     def for_sky(

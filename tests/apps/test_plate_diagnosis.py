@@ -109,7 +109,7 @@ def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None)
         (spread(trail(400)), FOV_DEG, r"^trails of 4[45]\d px: "),  # 447, and the width of a star
         (bleach, FOV_DEG, r"^overexposed: 80% of the pixels are at 255; "),
         (noise, 20.0, r"^too few lights \(0\): "),
-        (dots, 20.0, r"^no cause found: no field of 5° to 100° fits, nor the mirrored picture; [^-]*$"),
+        (dots, 20.0, r"^no cause found: no field of 2° to 100° fits, nor the mirrored picture; [^-]*$"),
     ],
     ids=["mirrored", "flipped", "wide", "tall", "blurred", "trailed", "streaked", "white", "noise", "dots"],
 )
@@ -128,21 +128,14 @@ def test_short_trails_are_those_that_the_detector_measures() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("change", "focal", "says"),
-    [
-        (mirror, "25 mm", r"^perhaps mirrored: "),
-        (np.array, "5 mm", r"^perhaps wider than 40°: it solves with --fov 66\.\d$"),
-    ],
-    ids=["mirrored", "wide"],
-)
-def test_each_cause_is_named_with_the_field_unknown(change: Change, focal: str, says: str) -> None:
-    assert re.search(says, hint(change(photograph(focal)), None))
+def test_a_mirrored_sky_is_named_with_the_field_unknown() -> None:
+    assert hint(photograph("5 mm"), None) == ""  # 66 degrees wide
+    assert hint(mirror(photograph()), None).startswith("perhaps mirrored: ")
 
 
 @pytest.mark.slow
 def test_what_is_left_for_an_unknown_field_is_a_narrow_one() -> None:
-    assert hint(dots(photograph()), None).endswith("; if the field is below 5°, give --fov and --catalog gaia_v8.0")
+    assert "; if the field is below 4°, give --fov and --catalog gaia_v10.0, after" in hint(dots(photograph()), None)
 
 
 # The catalog's depth
@@ -155,7 +148,7 @@ def test_a_catalog_that_is_too_shallow_is_named_and_a_deeper_one_solves(focal: s
     by_hand = 7996 / 41_253 * fov_deg**2 * 493 / 659
     assert by_hand == pytest.approx(float(expected), abs=0.1)
     image = photograph(focal, 195.0, 25.0)
-    assert hint(image, fov_deg) == (
+    assert hint(image, fov_deg, "hipparcos_hp6.5") == (
         f"the catalog is too shallow for this field: {expected} of its 7996 stars are expected there;"
         " take --catalog gaia_v8.0"
     )
@@ -182,7 +175,7 @@ ANGLES = ("ra_deg", "dec_deg", "roll_deg")
 )
 def test_the_deeper_catalog_has_stars_enough(fov_deg: float, limit_mag: float, says: str) -> None:
     """Fifteen in the field: of 4:3, 45,709 stars to V 8, 130,337 to V 9 and 357,037 to V 10 (`catalog info`)."""
-    one = plate_solver.make_solver(fov_deg, None)
+    one = plate_solver.make_solver(fov_deg, None, catalog="hipparcos_hp6.5")
     one.stars.v_mag[-1] = limit_mag
     share = diagnosis.sphere_share((1024, 768), fov_deg)
     assert diagnosis.deeper_catalog(one, share) == says
@@ -241,6 +234,6 @@ def test_a_refusal_is_printed_with_what_was_seen_and_tried(tmp_path: Path, capsy
         f"{tmp_path / 'x.png'}: no identification beyond chance",
         f"  seen:   {found['lights']} lights, the brightest pixel {image.max()} DN, the background"
         f" {np.median(image):g} DN",
-        "  tried:  fields 14.1° to 15.72° wide, stars to V 6.7",
+        "  tried:  fields 14.1° to 15.72° wide, stars to V 8",
         "  likely: perhaps mirrored: it solves when flipped left to right; flip it, and solve that",
     ]

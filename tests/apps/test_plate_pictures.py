@@ -120,7 +120,8 @@ def test_exif_tells_the_field_by_the_diagonal(sky: tuple[Scene, Frame, Truth], g
     found = answer(with_exif(tmp_path / "x.jpg", gray, 1, focal_35mm), None)
     check_right(found, sky[2])
     (narrow, wide), search = found["tried_fov_deg"]
-    assert (focal_35mm, search) == (133, (5, 40))
+    assert focal_35mm == 133
+    assert search[0] < 3 < 99 < search[1]
     assert narrow < 0.93 * FOV_DEG < 1.07 * FOV_DEG < wide
     assert math.sqrt(narrow * wide) == pytest.approx(FOV_DEG, rel=0.01)  # the longer side would be 4 % off
 
@@ -177,12 +178,14 @@ class FixedTracker:
         return self.answer
 
 
-@pytest.mark.parametrize(("fov_deg", "tries"), [(12.0, 1), (None, 5)])
+@pytest.mark.parametrize("fov_deg", [12.0, None])
 @pytest.mark.parametrize("hypotheses", [1, 4])
 def test_every_hypothesis_takes_its_share_of_chance(
-    monkeypatch: pytest.MonkeyPatch, fov_deg: float | None, tries: int, hypotheses: int
+    monkeypatch: pytest.MonkeyPatch, fov_deg: float | None, hypotheses: int
 ) -> None:
     one = solver.replace(plate_solver.make_solver(fov_deg, None), hypotheses=hypotheses)
+    tries = len(one.candidate_cameras(64, 48))
+    assert tries == 1 if fov_deg else tries > 8
     limit = ACCEPT_LOG10_CHANCE - math.log10(tries * hypotheses)
     for log10_chance, accepted in ((limit - 0.01, True), (limit + 0.01, False)):
         tracker = FixedTracker(log10_chance)
@@ -274,7 +277,7 @@ def test_python_gets_what_was_seen_and_tried(gray: NDArray, tmp_path: Path) -> N
     assert (found.brightest_dn, found.background_dn) == (gray.max(), np.median(gray))
     ((narrow, wide),) = found.tried_fov_deg
     assert (narrow, wide) == pytest.approx((0.948 * FOV_DEG, 1.058 * FOV_DEG), rel=2e-3)
-    assert found.catalog_limit_mag == 6.7  # the reddest of Hp 6.5
+    assert found.catalog_limit_mag == 8.0
     assert package.solve(with_exif(path, gray), fov_deg=FOV_DEG, catalog="gaia_v8.0").catalog_limit_mag == 8.0
     with pytest.raises(InputError, match=r"--catalog: unknown catalog 'deep'; allowed: gaia_v8.0, hipparcos_hp6.5; or"):
         package.solve(path, catalog="deep")

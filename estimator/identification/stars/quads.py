@@ -100,12 +100,22 @@ def _test_quad(detections: Detections, quads: QuadIndex, sky: SkyIndex, quad: In
                 # The cells along the last axis are contiguous: one loop covers them.
                 row = ((i * SIDE + j) * SIDE + k) * SIDE
                 for q in range(quads.first[row + low[3]], quads.first[row + high[3] + 1]):
-                    if np.abs(quads.code[q] - code).max() > gate:
+                    checks[0] += 1
+                    if not _alike(quads.code, q, code, gate):
                         continue
                     candidate = _test_match(detections, sky, quad, quads.star[q], length, checks)
                     if candidate.dex >= search.DECISIVE_DEX:
                         return candidate
     return no_hypothesis()
+
+
+@jit
+def _alike(codes: Floats, q: int, code: Floats, gate: float) -> bool:
+    """Whether no coordinate of the code in row q differs by more than the gate."""
+    alike = True
+    for axis in range(4):  # without a temporary array, which would cost more than the comparison
+        alike = alike and abs(codes[q, axis] - code[axis]) <= gate
+    return alike
 
 
 @jit
@@ -126,13 +136,16 @@ def _longest_first(tangent: Floats, quad: Ints) -> None:
 def _code_gate(detections: Detections, quad: Ints, length: float) -> float:
     """Greatest difference of the codes of a quad and of its image.
 
-    The errors of C or D and of the two ends are each sigma / L; a wrong focal length changes an angle at the tangent t
-    by up to a fraction t^2 more than a small one, of C and of L.
+    The errors of C or D and of the two ends are each sigma / L. At the angle a from the boresight a focal length that
+    is wrong by the fraction u changes small angles by (1 - u) (1 + 2 u sin^2 a) along the radius and by
+    (1 - u) (1 + u sin^2 a) across it: ratios differ by up to 2 u sin^2 a of the outermost star.
     """
-    sigma, edge = 0.0, np.abs(detections.field).max()
+    sigma, r2 = 0.0, 0.0
     for n in quad:
         sigma = max(sigma, detections.sigma[n])
-    return GATE_SIGMA * sigma / length + detections.focal_uncertainty * edge * edge
+        r2 = max(r2, detections.tangent[n, 0] ** 2 + detections.tangent[n, 1] ** 2)
+    # Coordinates are at most one half along and across, so that half of this difference reaches them.
+    return GATE_SIGMA * sigma / length + detections.focal_uncertainty * r2 / (1 + r2)
 
 
 @jit

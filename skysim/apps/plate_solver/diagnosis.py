@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.core.camera import Camera
-from estimator.core.types import Attitude, Blobs, Centroids, FramePriors
+from estimator.core.types import Blobs, Centroids, FramePriors
 from estimator.detection.detect import DETECTORS
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.trackers.pipeline import Clock
-from skysim.apps.plate_solver.solver import FIELD_SEARCH, FieldSearch, Solver, best_attitude, solve_centroids
+from skysim.apps.plate_solver.solver import FIELD_SEARCH, Solver, best_attitude, solve_centroids
 
-WIDE_SEARCH = FieldSearch(widest_deg=100.0, narrowest_deg=FIELD_SEARCH.widest_deg, trackers=3)
 MIN_CATALOG_STARS, ENOUGH_CATALOG_STARS = 6.0, 15.0  # expected in a field: hardly solvable below, safe above
 # Stars of the Gaia catalogs of `skysim catalog build`: 45,709 to V 8, 130,337 to V 9, 357,037 to V 10, their limit.
 GAIA_STARS, GAIA_DEX_PER_MAG, GAIA_LIMITS_MAG = 45_709, 0.45, (8, 9, 10)
@@ -127,26 +126,16 @@ def reversed_columns(centroids: Centroids, width_px: int) -> Centroids:
 
 def other_field(refusal: Refusal) -> str:
     """It solves with another field of view than those that were tried; with little effort only."""
-    if not refusal.can_be_tried:
+    if not refusal.can_be_tried or not all(solver.field_is_known for solver in refusal.solvers):
         return ""
-    for search in (FIELD_SEARCH, WIDE_SEARCH):
-        if any(solver.search is search and not solver.field_is_known for solver in refusal.solvers):
-            continue
-        attitude = solve_with(search, refusal)
-        if attitude.solved:
-            assert attitude.camera is not None
-            fov_deg = math.degrees(attitude.camera.fov_rad)
-            if search is WIDE_SEARCH:
-                return f"perhaps wider than {FIELD_SEARCH.widest_deg:g}°: it solves with --fov {fov_deg:.1f}"
-            return f"perhaps another field of view: it solves with --fov {fov_deg:.1f}"
-    return ""
-
-
-def solve_with(search: FieldSearch, refusal: Refusal) -> Attitude:
-    """The attitude by the least effort with fields of another range."""
-    unknown = replace(refusal.solvers[0], fov_deg=None, camera=None, opencv_calibration=None, search=search)
+    unknown = replace(refusal.solvers[0], fov_deg=None, camera=None, opencv_calibration=None)
+    cameras = unknown.candidate_cameras(*refusal.size_px)
     trackers = unknown.trackers(*refusal.size_px, refusal.date_utc)
-    return best_attitude(refusal.centroids, trackers, Clock(), 0, search.trackers)[0]
+    attitude, _ = best_attitude(refusal.centroids, trackers, Clock(), 0, len(cameras))
+    if not attitude.solved:
+        return ""
+    assert attitude.camera is not None
+    return f"perhaps another field of view: it solves with --fov {math.degrees(attitude.camera.fov_rad):.1f}"
 
 
 def overexposed(refusal: Refusal) -> str:
@@ -206,15 +195,17 @@ def few_lights(refusal: Refusal) -> str:
 def unknown_cause(refusal: Refusal) -> str:
     """No cause was found: what is left."""
     solver = refusal.solvers[0]
-    narrow_deg = min(FIELD_SEARCH.narrowest_deg, *(one.tried_fov_deg(*refusal.size_px)[0] for one in refusal.solvers))
+    unknown = replace(solver, fov_deg=None, camera=None, opencv_calibration=None)  # `other_field` tried it
+    narrow_deg = min(one.tried_fov_deg(*refusal.size_px)[0] for one in (unknown, *refusal.solvers))
     text = (
-        f"no cause found: no field of {narrow_deg:g}° to {WIDE_SEARCH.widest_deg:g}° fits, nor the mirrored picture;"
+        f"no cause found: no field of {narrow_deg:.1g}° to {FIELD_SEARCH.widest_deg:g}° fits, nor the mirrored picture;"
         " are there trees, lamps or clouds? crop them away"
     )
     share = sphere_share(refusal.size_px, solver.tried_fov_deg(*refusal.size_px)[0])
     if len(solver.stars) * share >= ENOUGH_CATALOG_STARS:
         return text
-    field = "or take " if solver.field_is_known else f"if the field is below {narrow_deg:g}°, give --fov and "
+    enough_deg = narrow_deg * math.sqrt(ENOUGH_CATALOG_STARS / (len(solver.stars) * share))
+    field = "or take " if solver.field_is_known else f"if the field is below {enough_deg:.1g}°, give --fov and "
     return f"{text}; {field}{deeper_catalog(solver, share)}"
 
 

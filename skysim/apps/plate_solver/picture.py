@@ -59,8 +59,8 @@ def solve(
 ) -> PlateSolution:
     """Solve the attitude of an image file of the sky, lost in space. Public as `skysim.solve`.
 
-    fov_deg  : horizontal field of view to 5 %; if neither it nor `camera` is given, the field that EXIF tells, and 5 to
-        40 degrees
+    fov_deg  : horizontal field of view to 5 %; if neither it nor `camera` is given, the field that EXIF tells, and 2 to
+        100 degrees
     camera   : a scene, a camera file or an OpenCV calibration in place of fov_deg
     time_utc : when the image was taken; the FITS header's date if left out
     catalog  : name or file of a deeper star catalog, for fields of a few degrees

@@ -1,9 +1,10 @@
 """Plate solver: right ascension, declination and roll of images from any camera, lost in space.
 
 If the field of view is known (a camera file, an OpenCV calibration or `--fov`), one `StarTracker` solves the image.
-Otherwise 5 to 40 degrees are split into N overlapping ranges of focal length in geometric progression, each searched
-by a tracker that fits the focal length within its range. The image's stars are detected once; all trackers are tried
-with little effort before any is tried with more.
+Otherwise 2 to 100 degrees are split into N overlapping ranges of focal length, each searched by quads of stars
+(`estimator.identification.stars.quads`) with a tracker that fits the focal length within its range. The image's stars
+are detected once; all trackers are tried with little effort before any is tried with more. A tracker has the brightest
+stars of the catalog, as many as its narrowest field needs.
 
 Every tracker is one more opportunity for a false match. With P the probability that the best match is due to chance,
 it is accepted if P <= P_accept / N (Bonferroni), and if no solution elsewhere on the sky has a P less than 1000 times
@@ -22,13 +23,14 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 
 from estimator.catalog import catalog as star_catalog
+from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid
 from estimator.trackers.refinement import NO_MATCH
-from estimator.trackers.star_tracker import StarTracker
+from estimator.trackers.star_tracker import QUAD_SEARCHES, StarTracker
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import CATALOGS
 from skysim.core.quantities.utc import check_year
@@ -41,7 +43,7 @@ if TYPE_CHECKING:
 CALIBRATED_UNCERTAINTY = 0.003
 FOV_UNCERTAINTY = 0.055  # 5 % that --fov allows, plus 0.5 % for the definition of the field of view
 FOV_LIMITS_DEG = 1.0, 120.0
-CATALOG = CATALOGS / "hipparcos_hp6.5.ecsv"
+CATALOG = CATALOGS / "gaia_v8.0.ecsv"
 DEFAULT_EPOCH = datetime.datetime(2020, 1, 1, 12)
 
 
@@ -49,39 +51,49 @@ DEFAULT_EPOCH = datetime.datetime(2020, 1, 1, 12)
 class FieldSearch:
     """Options of the search over unknown horizontal fields of view.
 
-    The ranges are wide because one index of star pairs serves fields 1.5 times as wide, and a search takes as long
-    for a narrow range.
+    A range is as wide as the codes of quads allow: a focal length wrong by the fraction u changes the code of stars at
+    the angle a from the boresight by up to 2 u sin^2 a (`quads._code_gate`). In narrow fields that is nothing, and the
+    lengths of an index's quads, in units of the field's height, limit the range.
 
     widest_deg, narrowest_deg : limits of the fields of view
-    trackers   : number of trackers that share this range
+    typical_deg : field that is tried first
+    max_uncertainty : greatest relative half-width of a range of focal lengths
+    max_warp   : greatest u sin^2 a, a of the corner
     overlap    : of neighboring ranges, as a fraction of the focal length
+    stars      : mean number of catalog stars in the narrowest field of a tracker
+    least_stars : mean number in the middle of a range below which the catalog is too shallow for it
     decisive_log10_chance : a solution below this ends the search without trying other fields of view
     margin_dex : by which a solution must beat those with another attitude
     same_attitude_rad : solutions that differ by less than this are the same
     """
 
-    widest_deg: float = 40.0
-    narrowest_deg: float = 5.0
-    trackers: int = 5
+    widest_deg: float = 100.0
+    narrowest_deg: float = 2.0
+    typical_deg: float = 22.0
+    max_uncertainty: float = 0.25
+    max_warp: float = 0.04
     overlap: float = 0.01
+    stars: float = 300.0
+    least_stars: float = 4.0
     decisive_log10_chance: float = -10.0
     margin_dex: float = 3.0
     same_attitude_rad: float = math.radians(0.2)
 
     def cameras(self, width_px: int, height_px: int) -> list[tuple[Camera, float]]:
-        """The cameras to try, each with its relative focal-length uncertainty, from the middle of the range outward."""
-        count = self.trackers
-        widest, narrowest = (math.tan(math.radians(deg) / 2) for deg in (self.widest_deg, self.narrowest_deg))
-        ratio = (widest / narrowest) ** (1 / count)
-        from_middle_out = sorted(range(count), key=lambda n: abs(n - (count - 1) / 2))
-        # A tracker of focal length f covers f (1 - u) to f (1 + u): u = (ratio - 1) / (ratio + 1) makes neighbors meet.
-        uncertainty = (ratio - 1) / (ratio + 1)
-        # Half-field tangents: range n begins at widest / ratio^n, where the focal length is f (1 - u).
-        tangents = [widest / ratio**n * (1 - uncertainty) for n in from_middle_out]
-        return [
-            (Camera.from_fov(width_px, height_px, 2 * math.atan(tangent)), uncertainty + self.overlap)
-            for tangent in tangents
-        ]
+        """The cameras to try, each with its relative focal-length uncertainty, from the typical field outward."""
+        out = []
+        narrowest, tangent = (math.tan(math.radians(deg) / 2) for deg in (self.narrowest_deg, self.widest_deg))
+        diagonal2 = 1 + (height_px / width_px) ** 2  # of half the image, in units of half its width
+        while tangent > narrowest:  # of the half field at the lower end of a range
+            corner2 = diagonal2 * tangent**2
+            uncertainty = min(self.max_uncertainty, self.max_warp * (1 + corner2) / corner2)
+            # A focal length f covers f (1 - u) to f (1 + u).
+            tangent *= 1 - uncertainty
+            camera = Camera.from_fov(width_px, height_px, 2 * math.atan(tangent))
+            out.append((camera, uncertainty + self.overlap))
+            tangent /= 1 + uncertainty
+        typical_rad = math.radians(self.typical_deg)
+        return sorted(out, key=lambda one: abs(math.log(one[0].fov_rad / typical_rad)))
 
 
 FIELD_SEARCH = FieldSearch()
@@ -126,16 +138,15 @@ class Solver:
             return [(camera, CALIBRATED_UNCERTAINTY)]
         if self.fov_deg:
             return [(Camera.from_fov(width_px, height_px, math.radians(self.fov_deg)), self.fov_uncertainty)]
-        return self.search.cameras(width_px, height_px)
+        cameras = self.search.cameras(width_px, height_px)
+        return [one for one in cameras if self.mean_stars(one[0]) >= self.search.least_stars]
 
     def tried_fov_deg(self, width_px: int, height_px: int) -> tuple[float, float]:
         """Narrowest and widest horizontal field that is tried for this image size."""
-        if not self.field_is_known:
-            return self.search.narrowest_deg, self.search.widest_deg
-        ((camera, uncertainty),) = self.candidate_cameras(width_px, height_px)
-        fields_rad = (camera.zoomed(1 + change).fov_rad for change in (uncertainty, -uncertainty))
-        narrow_deg, wide_deg = (round(math.degrees(field_rad), 2) for field_rad in fields_rad)
-        return narrow_deg, wide_deg
+        cameras = self.candidate_cameras(width_px, height_px)
+        narrow_rad = min(camera.zoomed(1 + uncertainty).fov_rad for camera, uncertainty in cameras)
+        wide_rad = max(camera.zoomed(1 - uncertainty).fov_rad for camera, uncertainty in cameras)
+        return round(math.degrees(narrow_rad), 2), round(math.degrees(wide_rad), 2)
 
     def trackers(self, width_px: int, height_px: int, date_utc: datetime.datetime | None) -> Iterator[StarTracker]:
         """Yield the trackers for an image of this size and date: one, or one per range of fields of view.
@@ -146,16 +157,30 @@ class Solver:
         if (width_px, height_px, date_utc) not in self.tracker_cache:
             self.tracker_cache.clear()  # keep the trackers of one image size and date only
         cached = self.tracker_cache.setdefault((width_px, height_px, date_utc), {})
+        vectors = None
         for camera, uncertainty in self.candidate_cameras(width_px, height_px):
             if (camera, uncertainty) not in cached:
-                vectors = (
-                    star_catalog.apparent(self.stars, star_catalog.on_earth(date_utc))
-                    if date_utc
-                    else star_catalog.at_epoch(self.stars, DEFAULT_EPOCH.year)
-                )
-                tracker = StarTracker(camera, self.stars, vectors, self.settings, uncertainty)
-                cached[camera, uncertainty] = tracker
+                vectors = self.vectors(date_utc) if vectors is None else vectors
+                cached[camera, uncertainty] = self.tracker(camera, vectors, uncertainty)
             yield cached[camera, uncertainty]
+
+    def mean_stars(self, camera: Camera) -> float:
+        """Mean number of catalog stars in the field of a camera."""
+        return len(self.stars) * camera.width_px * camera.height_px / camera.focal_px**2 / (4 * math.pi)
+
+    def vectors(self, date_utc: datetime.datetime | None) -> Floats:
+        """(N, 3) directions of the stars as seen from the Earth at a date, or at the default epoch."""
+        if date_utc is None:
+            return star_catalog.at_epoch(self.stars, DEFAULT_EPOCH.year)
+        return star_catalog.apparent(self.stars, star_catalog.on_earth(date_utc))
+
+    def tracker(self, camera: Camera, vectors: Floats, uncertainty: float) -> StarTracker:
+        """A tracker with the brightest stars of the catalog, as many as its narrowest field needs."""
+        narrowest = camera.zoomed(1 + uncertainty)
+        field_sr = camera.width_px * camera.height_px / narrowest.focal_px**2
+        bright = self.stars.v_mag <= star_catalog.limit_for_density(self.stars, field_sr, self.search.stars)
+        searches = () if self.field_is_known else QUAD_SEARCHES
+        return StarTracker(camera, self.stars.take(bright), vectors[bright], self.settings, uncertainty, searches)
 
 
 def make_solver(
@@ -259,7 +284,7 @@ def solve_centroids(
         attitude = first.solve_centroids(centroids, clock)
         allowed = ACCEPT_LOG10_CHANCE - math.log10(solver.hypotheses)
         return (Attitude(NO_MATCH) if log10_chance(attitude) > allowed and attitude.solved else attitude), first
-    tries = solver.search.trackers * solver.hypotheses
+    tries = len(solver.candidate_cameras(*size_px)) * solver.hypotheses
     for effort in range(first.efforts):  # try all fields of view quickly before trying any thoroughly
         trackers = solver.trackers(*size_px, date_utc)
         attitude, tracker = best_attitude(centroids, trackers, clock, effort, tries)
@@ -273,7 +298,7 @@ def best_attitude(
     trackers: Iterator[StarTracker],
     clock: Clock,
     effort: int,
-    tries: int = FIELD_SEARCH.trackers,
+    tries: int,
 ) -> tuple[Attitude, StarTracker]:
     """Return the most significant attitude among those of trackers with different fields of view, and its tracker.
 

@@ -33,7 +33,7 @@ def solve(
     ] = None,
     fov: Annotated[
         float | None,
-        typer.Option(help="Horizontal field of view in degrees, to 5 %; default: EXIF's, then 5 to 40 are searched."),
+        typer.Option(help="Horizontal field of view in degrees, to 5 %; default: EXIF's, then 2 to 100 are searched."),
     ] = None,
     camera: Annotated[
         Path | None,

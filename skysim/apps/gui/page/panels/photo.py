@@ -20,7 +20,7 @@ class PhotoPanel:
 
     def __init__(self, tab: Tab) -> None:
         self.tab, self.live, self.logged = tab, False, ""
-        self.fov = ui.number("field of view, deg (empty: 5 to 40 are tried)", min=1, max=120)
+        self.fov = ui.number("field of view, deg (empty: 2 to 100 are tried)", min=1, max=120)
         self.fov.props("dense outlined clearable").classes("w-full").mark("fov")
         self.upload = ui.upload(
             label="Drop a FITS, PNG, JPEG, TIFF or BMP here",
