@@ -27,8 +27,8 @@ from estimator.core import vectors
 from estimator.core.arrays import Floats
 from estimator.core.jit import jit
 
-PER_CIRCLE = 6  # stars of quads in a circle as high as the field
-LONGEST, SHORTEST = 1.0, 0.15  # distance of A and B, in units of the field's height
+PER_CIRCLE = 10  # stars of quads in a circle as high as the field
+LONGEST, SHORTEST = 0.75, 0.15  # distance of A and B, in units of the field's height
 NEIGHBORS = 60  # greatest number of stars near one star that are combined with it
 SIDE = 20  # cells along each of the four axes
 ALONG, ACROSS = 0.5, 0.87  # bounds of the coordinates along B to A and across, since C is nearer to A than B is
