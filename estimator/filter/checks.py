@@ -31,8 +31,9 @@ def checked_samples(
 ) -> Floats:
     """Return (N, 5) gyro samples: end of the interval, rotation about x, y, z, and how it was measured (`propagate`).
 
-    A missing sample has the rotation 0, whatever was given. Raises ValueError for wrong shapes, non-finite numbers, and
-    intervals not above 0 and up to a tenth of the bias's time: the process noise is a series in the ratio of the two.
+    A missing sample keeps the rotation that was given, and 0 for NaN. Raises ValueError for wrong shapes, non-finite
+    numbers, and intervals not above 0 and up to a tenth of the bias's time: the process noise is a series in the ratio
+    of the two.
     """
     ends_s, angle = np.asarray(t_s, float), np.asarray(angle_rad, float)
     absent = np.zeros(ends_s.shape) if missing is None else np.asarray(missing)
@@ -40,7 +41,7 @@ def checked_samples(
     if not count or shapes != [(count,), (count, 3), (count,), (count,)]:
         raise ValueError(f"propagate: shapes {shapes}; allowed: (N,), (N, 3), (N,), (N,) with N of 1 or more")
     samples, lost = np.empty((count, 5)), absent != 0
-    samples[:, 0], samples[:, 1:4] = ends_s, np.where(lost[:, None], 0.0, angle)
+    samples[:, 0], samples[:, 1:4] = ends_s, np.where(lost[:, None] & np.isnan(angle), 0.0, angle)
     if not (np.isfinite(samples[:, :4]).all() and np.isfinite(np.asarray(saturated, float)).all()):
         raise ValueError("propagate: NaN or infinite times or angles; allowed: finite ones")
     step_s, longest_s = np.diff(ends_s, prepend=start_s), 0.1 * gyro.bias_time_s

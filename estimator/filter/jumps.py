@@ -16,8 +16,8 @@ CONFIRMATIONS = 3
 ENOUGH = math.log(100.0)
 # Distance by which the probability of an error of the filter's own models decreases by a factor e (`assumed`).
 MODEL_DISTANCE = 5.0
-# A change of rate is a shock from this multiple of the gyro's noise on (`assumed`).
-SHOCK_SIGMA = 10.0
+# A bend of the rate is a shock from this multiple of the gyro's noise in an interval; its own is sqrt(6) (`assumed`).
+SHOCK_SIGMA = 20.0
 
 
 class Jump(NamedTuple):
@@ -68,14 +68,16 @@ def log_odds(jump: Jump, model: JumpModel) -> float:
 
 
 def shock_rad(start_s: float, samples: Floats, arw_rad_sqrt_s: float) -> float:
-    """Rotation that the gyro may have missed at the sharpest change of its rate: the change times the interval.
+    """Rotation that the gyro may have missed at the sharpest bend of its rate: second difference times interval.
 
-    A rate that changes within an interval, or faster than the gyro follows, is known to about this. A knock shows so
-    even where its saturation is not flagged. The gyro's noise is no shock.
+    A knock shows so even where its saturation is not flagged: a rate that steps within an interval, or faster than the
+    gyro follows, is known to about this. A smooth maneuver and the gyro's noise are no shocks.
 
     start_s : begin of the first interval;  samples : (N, 5) rows as of `propagate.advance`
     """
     step_s = np.diff(samples[:, 0], prepend=start_s)
-    change_rad_s = np.linalg.norm(np.diff(samples[:, 1:4] / step_s[:, None], axis=0), axis=1)
-    turn_rad = change_rad_s * step_s[1:]
-    return float(turn_rad[turn_rad > SHOCK_SIGMA * arw_rad_sqrt_s * np.sqrt(step_s[1:])].max(initial=0.0))
+    if len(step_s) < 3:
+        return 0.0
+    bend_rad_s = np.linalg.norm(np.diff(samples[:, 1:4] / step_s[:, None], n=2, axis=0), axis=1)
+    turn_rad, noise_rad = bend_rad_s * step_s[2:], arw_rad_sqrt_s * np.sqrt(step_s[2:])
+    return float(turn_rad[turn_rad > SHOCK_SIGMA * noise_rad].max(initial=0.0))

@@ -150,15 +150,16 @@ class AttitudeFilter:
         # The chi-square of 3 degrees of freedom with the tail probability of gate_sigma for a scalar Gaussian.
         self._gate = float(chdtri(3, chdtrc(1, not_negative("gate_sigma", gate_sigma) ** 2)))
         self._layout = build_layout(gyro, self._tracker, considered)
-        sigmas = {
+        sigma_bias = not_negative("sigma_bias_rad_s", sigma_bias_rad_s) * np.ones(3)
+        sigmas: dict[str, ArrayLike] = {
             "attitude": not_negative("sigma_attitude_rad", sigma_attitude_rad) * np.ones(3),
-            "bias": not_negative("sigma_bias_rad_s", sigma_bias_rad_s) * np.ones(3),
+            "bias": sigma_bias,
             "scale": gyro.scale,
             "misalignment": gyro.misalignment_rad,
             "mounting": self._tracker.mounting_rad,
             "systematic": 1.0,
         }
-        self._initial_bias_variance = sigmas["bias"] ** 2
+        self._initial_bias_variance = sigma_bias**2
         self._current = start_state(float(t_s), wxyz_of(body_from_ref), sigmas, self._layout)
         self._segments = [_Segment(self._current, np.empty((0, 5)), None)]  # rows of checked_samples
         self._refused: list[tuple[State, Solution]] = []  # in a row, each agrees with the one before
@@ -205,7 +206,7 @@ class AttitudeFilter:
         t_s       : (N,) ends of the sample intervals; the first interval begins at the filter's time
         angle_rad : (N, 3) rotation angle in each interval, about the body axes
         saturated : (N,) whether the gyro was at its rate limit
-        missing   : (N,) whether there is no sample (an outage), whatever its angle; None if there always is one
+        missing   : (N,) whether there is no sample (an outage) and its angle is a guess, NaN for 0; None: never
 
         Raises ValueError for other shapes, non-finite numbers, times that do not increase, or intervals that are too
         long.

@@ -94,7 +94,9 @@ def inverse_response(values: Floats, columns: Ints) -> Floats:
         if columns[k] >= 0:
             response[k // 3, k % 3] += values[columns[k]]
             known = known or values[columns[k]] != 0
-    return np.linalg.inv(response) if known else response
+    if known:
+        response[:] = np.linalg.inv(response)
+    return response
 
 
 @jit

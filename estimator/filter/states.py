@@ -111,8 +111,17 @@ def propagate_state(state: State, samples: Floats, gyro: GyroModel, tracker: Tra
         gyro.outage_rad_s,
     )
     slow = layout.slices["systematic"]
-    after = advance(tuple(state[:6]), samples, noise, layout.columns, (slow.start, slow.stop))
-    return State(float(samples[-1, 0]), *after, *state[6:])
+    wxyz, values, covariance, saturation_rad, lost_rad = advance(
+        tuple(state[:6]), samples, noise, layout.columns, (slow.start, slow.stop)
+    )
+    return state._replace(
+        t_s=float(samples[-1, 0]),
+        ref_from_body_wxyz=wxyz,
+        values=values,
+        covariance=covariance,
+        saturation_rad=saturation_rad,
+        lost_rad=lost_rad,
+    )
 
 
 def decorrelate(state: State, tracker: TrackerModel, layout: Layout) -> State:
