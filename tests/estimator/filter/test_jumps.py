@@ -90,6 +90,25 @@ def test_a_wrong_start_is_given_up_at_the_third_solution(off: float) -> None:
     assert vehicle.error_rad() < 5 * np.linalg.norm(vehicle.mekf.state.sigma_attitude_rad)
 
 
+def test_what_confirmed_a_restart_supports_the_filter_after_it() -> None:
+    vehicle = Vehicle(9, start=WRONG.inv())
+    assert vehicle.updates(HOME, 3)[-1].status == RESET
+    assert RESET not in [update.status for update in vehicle.updates(WRONG, 10)]
+    assert vehicle.update(HOME).status == USED
+
+
+def test_solutions_agree_within_the_error_that_each_names_as_systematic() -> None:
+    """They differ by 200 arcsec, with 1 of noise: 4.7 sigma of two slow errors of 30 about each axis."""
+    unit = ARCSEC_RAD**2 * np.eye(3)
+    for systematic, last in ((30.0, RESET), (6.0, OUTSIDE_GATE)):
+        mekf = AttitudeFilter(GYRO, 0.0, WRONG, 1e-3, 0.0)
+        for k, off in enumerate((100.0, -100.0, 100.0)):
+            mekf.propagate([k + 1.0], np.zeros((1, 3)), [False])
+            seen = Rotation.from_rotvec([0.0, off * ARCSEC_RAD, 0.0])
+            told = mekf.update(k + 1.0, seen, (1 + systematic**2) * unit, systematic**2 * unit)
+        assert told.status == last
+
+
 @pytest.mark.parametrize("wrong", [1, 3])
 def test_a_wrong_first_answer_is_given_up_when_the_right_ones_outnumber_it(wrong: int) -> None:
     vehicle = Vehicle(4, sigma_rad=2.0)  # knows nothing at the start

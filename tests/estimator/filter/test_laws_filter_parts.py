@@ -134,6 +134,21 @@ def test_a_gyro_sample_moves_the_errors_as_it_moves_the_truth(
     assert states.propagate_state(before, samples[:0], quiet, known, layout) is before
 
 
+@law(states.propagate_state)
+@given(rng=SEEDS, share=some.floats(0, 1), time_s=some.floats(0.1, 100))
+def test_the_slow_error_returns_to_its_unit_variance(rng: np.random.Generator, share: float, time_s: float) -> None:
+    layout, tracker = states.build_layout(GYRO, TRACKER, ()), replace(TRACKER, systematic_time_s=time_s)
+    before, slow = state_of(rng, layout), layout.slices["systematic"]
+    before.covariance[slow] = before.covariance[:, slow] = 0.0
+    before.covariance[slow, slow] = share * np.eye(3)
+    samples = np.column_stack([1.0 + np.arange(1, 5) / 20, np.zeros((4, 4))])
+    after = states.propagate_state(before, samples, GYRO, tracker, layout)
+    kept = np.exp(-0.2 / time_s)
+    np.testing.assert_allclose(after.values[slow], kept * before.values[slow], rtol=1e-9, atol=0)
+    variance = share * kept**2 + 1 - kept**2
+    np.testing.assert_allclose(after.covariance[slow, slow], variance * np.eye(3), rtol=1e-9, atol=1e-15)
+
+
 @law(states.decorrelate)
 @given(rng=SEEDS)
 def test_a_turn_makes_the_slow_error_another_one_and_nothing_else(rng: np.random.Generator) -> None:
@@ -207,11 +222,11 @@ def test_an_adopted_solution_leaves_no_residual_and_its_own_covariance(rng: np.r
     np.testing.assert_allclose(np.diag(after.covariance - prior.covariance)[3:6], 1e-8, rtol=1e-6, atol=0)
     np.testing.assert_array_equal(after.values, prior.values)
     assert_covariance(after.covariance)
-    # A second solution with the same offset and hardly any noise takes the noise of the first away, and nothing else.
-    exact = solution._replace(noise_rad2=1e-18 * np.eye(3))
-    again = correct.correct(after, correct.innovation(after, exact, layout), layout)
-    offset = again.covariance[:3] + rows @ again.covariance
-    assert np.abs(offset[:, :3] + offset @ rows.T).max() < 1e-12
+    # The error is the offset's and the noise, with opposite sign: their sum with the offset is the noise alone.
+    both = rows.copy()
+    both[:, :3] = np.eye(3)
+    left = both @ after.covariance @ both.T
+    np.testing.assert_allclose(left, solution.noise_rad2, rtol=0, atol=1e-9 * np.trace(expected))
 
 
 @law(correct.wxyz_of, correct.right_jacobian, correct.root)

@@ -149,14 +149,14 @@ def test_a_constant_error_of_the_tracker_is_claimed_once(named_by: str) -> None:
 
 
 def test_an_error_that_changes_faster_than_assumed_does_not_close_the_gate() -> None:
-    """A slow error of 100 sigma of the noise, assumed constant, that is another one after a minute."""
+    """A slow error, assumed constant, is the opposite after a minute: 6.4 sigma, or 4.5 of two independent ones."""
     noise_rad2, tracker = (2 * ARCSEC_RAD) ** 2 * np.eye(3), TrackerModel(200 * ARCSEC_RAD, np.inf, np.inf)
-    mekf = AttitudeFilter(GYRO, 0.0, Rotation.identity(), SIGMA_RAD, 0.0, tracker=tracker)
+    mekf = AttitudeFilter(GYRO, 0.0, Rotation.identity(), 1.0, 0.0, tracker=tracker)
     for k in range(80):
         mekf.propagate([k + 1.0], np.zeros((1, 3)), [False])
-        offset = np.array([150.0, -200.0, 100.0]) * ARCSEC_RAD * (1 if k < 60 else -1)
+        offset = np.array([360.0, -400.0, 350.0]) * ARCSEC_RAD * (1 if k < 60 else -1)
         assert mekf.update(k + 1.0, Rotation.from_rotvec(-offset), noise_rad2).status == USED
-    assert (np.abs(mekf.state.body_from_ref.as_rotvec()) < 2 * mekf.state.sigma_attitude_rad).all()
+    assert (np.abs(mekf.state.body_from_ref.as_rotvec()) < 2.5 * mekf.state.sigma_attitude_rad).all()
 
 
 def test_the_slow_error_is_another_one_after_a_turn() -> None:
