@@ -34,19 +34,14 @@ def advance(
     wxyz, values, covariance = wxyz.copy(), values.copy(), covariance.copy()
     size = len(values)
     inverse = inverse_response(values, columns)
-    turned, rotation, rows, buffer = np.empty(3), np.empty(3), np.zeros((3, size)), np.empty((3, size))
+    rotation, rows, buffer = np.empty(3), np.zeros((3, size)), np.empty((3, size))
     exponential, decay = np.empty((3, 6)), np.ones(size)
     for n in range(len(samples)):
         step_s = samples[n, 0] - t_s
         t_s = samples[n, 0]
         # Integral of the decaying bias over the interval, divided by the bias.
         effective_s = step_s * (1 - step_s * decay_per_s / 2)
-        for i in range(3):
-            turned[i] = samples[n, 1 + i] - effective_s * values[3 + i]
-        for i in range(3):
-            rotation[i] = 0.0
-            for j in range(3):
-                rotation[i] += inverse[i, j] * turned[j]
+        remove_errors(samples[n, 1:4], effective_s, values, inverse, rotation)
         rotate_quaternion(wxyz, rotation)
         transition(rotation, 1.0, exponential)
         fill_rows(exponential, inverse, rotation, effective_s, columns, rows)
@@ -66,6 +61,15 @@ def advance(
         for i in range(slow[0], slow[1]):
             covariance[i, i] -= math.expm1(-2 * step_s * slow_per_s)
     return wxyz, values, covariance, saturation_rad, lost_rad
+
+
+@jit
+def remove_errors(angle: Floats, effective_s: float, values: Floats, inverse: Floats, out: Floats) -> None:
+    """Fill the rotation (3,) A (a - T b) of a measured angle a."""
+    for i in range(3):
+        out[i] = 0.0
+        for j in range(3):
+            out[i] += inverse[i, j] * (angle[j] - effective_s * values[3 + j])
 
 
 @jit

@@ -160,8 +160,8 @@ class FilterConfig(ConfigModel):
     rate_limit_deg_s : largest rate that the gyro measures; from nine tenths of it a rate counts as saturated, also
         where the IMU does not say so
     start_deg, start_bias_deg_h : standard deviation of attitude and bias about each axis at the start
-    systematic_arcsec : standard deviation about each axis of the tracker's slow error, which does not average out; added
-        to what a dome tracker knows of its survey
+    systematic_arcsec : standard deviation about each axis of the tracker's slow error, which does not average out;
+        added to what a dome tracker knows of its survey
     systematic_time, systematic_angle_deg : time and rotation after which the slow error is another one
     mounting_arcsec : standard deviation of the tracker's mount about each axis
     floor_arcsec : error that all lights of one frame share, another one in every frame, added to the covariance
