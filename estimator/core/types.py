@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -170,14 +170,17 @@ class FilterState:
 
     body_from_ref : reference (ICRS, or lab under the dome) to body
     bias_rad_s    : (3,) of the gyro, in body axes
-    covariance    : (6, 6) of the small rotation in body axes (rad^2), then of the bias (rad^2/s^2), with the
-        systematic error of the last solution used
+    covariance    : (N, N) of the small rotation in body axes (rad^2), of the bias (rad^2/s^2), then of `others` in
+        order; N is 6 without others
+    others        : estimates of the filter's other states by name: "scale" (3,) of the gyro's axes, "misalignment"
+        (6,) of its matrix off the diagonal, row by row (rad), "mounting" (3,) of the tracker in body axes (rad)
     """
 
     t_s: float
     body_from_ref: Rotation
     bias_rad_s: Floats
     covariance: Floats
+    others: dict[str, Floats] = field(default_factory=dict)
 
     @property
     def sigma_attitude_rad(self) -> Floats:
@@ -187,7 +190,16 @@ class FilterState:
     @property
     def sigma_bias_rad_s(self) -> Floats:
         """(3,) standard deviation of the gyro bias in body axes."""
-        return np.sqrt(np.diag(self.covariance)[3:])
+        return np.sqrt(np.diag(self.covariance)[3:6])
+
+    def sigma(self, name: str) -> Floats:
+        """Standard deviations of one of the `others`; raises KeyError for a name that is not among them."""
+        first = 6
+        for other, values in self.others.items():
+            if other == name:
+                return np.sqrt(np.diag(self.covariance)[first : first + len(values)])
+            first += len(values)
+        raise KeyError(name)
 
 
 def ra_dec_roll_rad(cam_from_icrs: Rotation) -> tuple[float, float, float]:

@@ -1,4 +1,4 @@
-"""Compiled propagation of the filter: gyro samples advance attitude, bias and covariance between two solutions."""
+"""Compiled propagation of the filter: gyro samples advance attitude, other states and covariance between solutions."""
 
 from __future__ import annotations
 
@@ -6,71 +6,142 @@ import math
 
 import numpy as np
 
-from estimator.core.arrays import Floats
+from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
+
+# The last column of a sample.
+MEASURED, SATURATED, MISSING = 0, 1, 2
 
 
 @jit
 def advance(
-    state: tuple[float, Floats, Floats, Floats, float],
+    state: tuple[float, Floats, Floats, Floats, float, float],
     samples: Floats,
-    noise: tuple[float, float, float],
-) -> tuple[Floats, Floats, Floats, float]:
-    """Return attitude, bias, covariance and saturation_rad after the samples; equations: see AttitudeFilter.
+    noise: tuple[float, float, float, float, float],
+    columns: Ints,
+    slow: tuple[int, int],
+) -> tuple[Floats, Floats, Floats, float, float]:
+    """Return attitude, values, covariance, saturation_rad and lost_rad after the samples; equations: AttitudeFilter.
 
-    state   : t_s, ref_from_body_wxyz, bias_rad_s, covariance, saturation_rad
-    samples : (N, 5) rows of t_s, the rotation in the interval that ends there (3), and whether the gyro was saturated
-    noise   : arw^2, bias^2, 1 / bias_time
+    state   : t_s, ref_from_body_wxyz, values (N,), covariance (N, N), saturation_rad, lost_rad
+    samples : (M, 5) rows of t_s, the rotation in the interval that ends there (3), and MEASURED, SATURATED or MISSING
+    noise   : arw^2, bias^2, 1 / bias_time, 1 / systematic_time, outage_rad_s
+    columns : (9,) state of each element of the gyro's matrix M, row by row; -1 if it is none
+    slow    : first and last + 1 of the normalized systematic states
     """
-    t_s, wxyz, bias, covariance, saturation_rad = state
-    arw2, bias2, decay_per_s = noise
-    wxyz, bias, covariance = wxyz.copy(), bias.copy(), covariance.copy()
-    rotation, matrix, buffer = np.empty(3), np.zeros((6, 6)), np.empty((6, 6))
+    t_s, wxyz, values, covariance, saturation_rad, lost_rad = state
+    arw2, bias2, decay_per_s, slow_per_s, outage_rad_s = noise
+    wxyz, values, covariance = wxyz.copy(), values.copy(), covariance.copy()
+    size = len(values)
+    inverse = inverse_response(values, columns)
+    rotation, rows, buffer = np.empty(3), np.zeros((3, size)), np.empty((3, size))
+    exponential, decay = np.empty((3, 6)), np.ones(size)
     for n in range(len(samples)):
         step_s = samples[n, 0] - t_s
         t_s = samples[n, 0]
         # Integral of the decaying bias over the interval, divided by the bias.
         effective_s = step_s * (1 - step_s * decay_per_s / 2)
-        decay = math.exp(-step_s * decay_per_s)
-        for i in range(3):
-            rotation[i] = samples[n, 1 + i] - effective_s * bias[i]
-            bias[i] *= decay
-            matrix[i + 3, i + 3] = decay
+        remove_errors(samples[n, 1:4], effective_s, values, inverse, rotation)
         rotate_quaternion(wxyz, rotation)
-        transition(rotation, effective_s, matrix)
-        propagate_covariance(matrix, covariance, buffer)
-        # Process noise: `bias_variance` is the variance gained by the bias in the interval, u^2 T to first order.
+        transition(rotation, 1.0, exponential)
+        fill_rows(exponential, inverse, rotation, effective_s, columns, rows)
+        decay[3:6] = math.exp(-step_s * decay_per_s)
+        decay[slow[0] : slow[1]] = math.exp(-step_s * slow_per_s)
+        for i in range(3, size):
+            values[i] *= decay[i]
+        propagate_covariance(rows, decay, covariance, buffer)
+        # While the rate is unknown the standard deviation grows linearly: the variance by a difference of squares.
+        previous_rad, grown_rad = saturation_rad, unknown_rad(samples[n], outage_rad_s * step_s)
+        saturation_rad = previous_rad + grown_rad if grown_rad > 0 else 0.0
+        lost_rad += grown_rad
+        # The variance gained by the bias in the interval, u^2 T to first order.
         bias_variance = -bias2 * math.expm1(-2 * step_s * decay_per_s)
-        angle_variance = arw2 * step_s + bias_variance * step_s**2 / 3
-        # In saturation the attitude's standard deviation grows linearly: the variance grows by a difference of squares.
-        previous_rad = saturation_rad
-        saturation_rad = 0.0
-        if samples[n, 4]:
-            saturation_rad = previous_rad + max(abs(samples[n, 1]), abs(samples[n, 2]), abs(samples[n, 3]))
-            angle_variance += saturation_rad**2 - previous_rad**2
-        for i in range(3):
-            covariance[i, i] += angle_variance
-            covariance[i, i + 3] -= bias_variance * step_s / 2
-            covariance[i + 3, i] -= bias_variance * step_s / 2
-            covariance[i + 3, i + 3] += bias_variance
-    return wxyz, bias, covariance, saturation_rad
+        missed_variance = saturation_rad**2 - min(previous_rad, saturation_rad) ** 2
+        add_noise(covariance, arw2 * step_s + missed_variance, bias_variance, step_s)
+        for i in range(slow[0], slow[1]):
+            covariance[i, i] -= math.expm1(-2 * step_s * slow_per_s)
+    return wxyz, values, covariance, saturation_rad, lost_rad
 
 
 @jit
-def propagate_covariance(matrix: Floats, covariance: Floats, buffer: Floats) -> None:
-    """covariance <- matrix covariance matrix^T, exactly symmetric; `buffer` holds the first product."""
-    size = len(matrix)
-    for i in range(size):
+def remove_errors(angle: Floats, effective_s: float, values: Floats, inverse: Floats, out: Floats) -> None:
+    """Fill the rotation (3,) A (a - T b) of a measured angle a."""
+    for i in range(3):
+        out[i] = 0.0
+        for j in range(3):
+            out[i] += inverse[i, j] * (angle[j] - effective_s * values[3 + j])
+
+
+@jit
+def unknown_rad(sample: Floats, outage_rad: float) -> float:
+    """Standard deviation of the rotation that a sample leaves unknown: 0, or while saturated as much as is measured."""
+    if sample[4] == MISSING:
+        return outage_rad
+    return max(abs(sample[1]), abs(sample[2]), abs(sample[3])) if sample[4] == SATURATED else 0.0
+
+
+@jit
+def add_noise(covariance: Floats, angle_variance: float, bias_variance: float, step_s: float) -> None:
+    """Add Farrenkopf's process noise of an interval to attitude and bias; `angle_variance` without the bias's part."""
+    for i in range(3):
+        covariance[i, i] += angle_variance + bias_variance * step_s**2 / 3
+        covariance[i, i + 3] -= bias_variance * step_s / 2
+        covariance[i + 3, i] -= bias_variance * step_s / 2
+        covariance[i + 3, i + 3] += bias_variance
+
+
+@jit
+def inverse_response(values: Floats, columns: Ints) -> Floats:
+    """(3, 3) inverse of I + M, with the elements of M among the values."""
+    response, known = np.eye(3), False
+    for k in range(9):
+        if columns[k] >= 0:
+            response[k // 3, k % 3] += values[columns[k]]
+            known = known or values[columns[k]] != 0
+    if known:
+        response[:] = np.linalg.inv(response)
+    return response
+
+
+@jit
+def fill_rows(exponential: Floats, inverse: Floats, p: Floats, effective_s: float, columns: Ints, rows: Floats) -> None:
+    """Fill the attitude rows (3, N) of the transition matrix: exp(-[p]), -T J A, and -(J A)_i p_j for M_ij.
+
+    exponential : (3, 6) of `transition` with an effective time of 1;  inverse : A = (I + M)^-1
+    """
+    for i in range(3):
+        for j in range(3):
+            rows[i, j] = exponential[i, j]
+            total = 0.0
+            for k in range(3):
+                total += exponential[i, 3 + k] * inverse[k, j]
+            rows[i, 3 + j] = effective_s * total
+            for k in range(3):
+                if columns[3 * j + k] >= 0:
+                    rows[i, columns[3 * j + k]] = total * p[k]
+
+
+@jit
+def propagate_covariance(rows: Floats, decay: Floats, covariance: Floats, buffer: Floats) -> None:
+    """covariance <- F covariance F^T, exactly symmetric; F has these three rows, and below them `decay` as diagonal."""
+    size = len(decay)
+    for i in range(3):
         for j in range(size):
-            buffer[i, j] = 0.0
+            total = 0.0
             for k in range(size):
-                buffer[i, j] += matrix[i, k] * covariance[k, j]
-    for i in range(size):
+                total += rows[i, k] * covariance[k, j]
+            buffer[i, j] = total
+    for i in range(3):
         for j in range(i + 1):
             total = 0.0
             for k in range(size):
-                total += buffer[i, k] * matrix[j, k]
+                total += buffer[i, k] * rows[j, k]
             covariance[i, j] = covariance[j, i] = total
+        for j in range(3, size):
+            covariance[i, j] = covariance[j, i] = buffer[i, j] * decay[j]
+    for i in range(3, size):
+        for j in range(3, i + 1):
+            covariance[i, j] = covariance[j, i] = covariance[i, j] * decay[i] * decay[j]
 
 
 @jit

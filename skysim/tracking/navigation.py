@@ -12,7 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude
-from estimator.filter.mekf import AttitudeFilter, GyroModel
+from estimator.filter.mekf import AttitudeFilter
+from estimator.filter.models import GyroModel, JumpModel, TrackerModel
 from skysim.core import quaternion
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats, Mount
@@ -156,6 +157,15 @@ def build_filter(config: FilterConfig, lab_from_body: Rotation) -> AttitudeFilte
         math.radians(config.arw_deg_sqrt_h) / math.sqrt(hour_s),
         math.radians(config.bias_deg_h) / hour_s,
         config.bias_time_s,
+        config.scale_ppm * 1e-6,
+        config.misalignment_arcsec * ARCSEC_RAD,
+        math.radians(config.rate_limit_deg_s or math.inf),
+    )
+    tracker = TrackerModel(
+        config.systematic_arcsec * ARCSEC_RAD,
+        config.systematic_time_s,
+        math.radians(config.systematic_angle_deg),
+        config.mounting_arcsec * ARCSEC_RAD,
     )
     return AttitudeFilter(
         gyro,
@@ -165,4 +175,7 @@ def build_filter(config: FilterConfig, lab_from_body: Rotation) -> AttitudeFilte
         math.radians(config.start_bias_deg_h) / hour_s,
         config.floor_arcsec * ARCSEC_RAD,
         config.gate_sigma,
+        tracker,
+        JumpModel(config.missed_per_h / hour_s, config.wrong_share, config.wrong_repeat),
+        config.considered,
     )

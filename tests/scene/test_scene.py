@@ -670,6 +670,14 @@ def test_a_free_vehicle_is_in_no_room(key: str, value: str, says: str) -> None:
             "site.latitude_deg: 91 is not allowed; it should be less than or equal",
         ),
         ("filter", "{latency: -1 s}", "filter.latency: '-1 s' is not allowed; it should be greater than or"),
+        (
+            "filter",
+            "{considered: [gain]}",
+            "it should be 'bias', 'scale', 'misalignment', 'mounting' or 'systematic'",
+        ),
+        ("filter", "{wrong_share: 1}", "filter.wrong_share: 1 is not allowed; it should be less than 1"),
+        ("filter", "{scale_ppm: -1}", "filter.scale_ppm: -1 is not allowed; it should be greater than or"),
+        ("filter", "{systematic_time: 0 s}", "filter.systematic_time: '0 s' is not allowed; it should be greater than"),
     ],
 )
 def test_a_slip_in_what_flies_is_told_with_its_key(key: str, value: str, says: str) -> None:

@@ -23,7 +23,7 @@ from skysim.simulation.checks.dome import assumptions
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking import exposure_control
 from skysim.tracking.exposure_control import ExposureController
-from skysim.tracking.navigation import Navigation
+from skysim.tracking.navigation import Navigation, build_filter
 
 PERFECT = (
     "gyro: {arw_deg_sqrt_h: 0, bias_deg_h: 0, turn_on_bias_deg_h: 0, scale_ppm: 0, misalignment_arcsec: 0,"
@@ -240,6 +240,27 @@ def test_the_filter_is_told_a_solution_in_its_own_axes() -> None:
     along = int(np.argmax(np.abs(boresight_body)))
     np.testing.assert_allclose(sigma[along], 200, rtol=0.01)
     np.testing.assert_allclose(np.delete(sigma, along), 20, rtol=0.01)
+
+
+def test_the_keys_of_a_filter_reach_its_states_in_their_units() -> None:
+    keys = "{start_deg: 0.1, scale_ppm: 300, misalignment_arcsec: 20, mounting_arcsec: 50, rate_limit_deg_s: 10,"
+    keys += " systematic_arcsec: 30, considered: [scale]}"
+    loaded = loader.load("afit_simsat", {"vehicle.imu": "{}", "filter": keys})
+    assert loaded.filter is not None
+    built = build_filter(loaded.filter, Rotation.identity())
+    for name, sigma in (("scale", 300e-6), ("misalignment", 20 * ARCSEC), ("mounting", 50 * ARCSEC)):
+        np.testing.assert_allclose(built.state.sigma(name), sigma, rtol=1e-12, atol=0)
+    # One precise solution: attitude and mount share the 50, the slow error adds its 30, of which nothing is learned.
+    assert built.update(0.0, Rotation.identity(), (ARCSEC * np.eye(3)) ** 2).status == "used"
+    sigma = built.state.sigma_attitude_rad / ARCSEC
+    start = np.radians(0.1) / ARCSEC
+    np.testing.assert_allclose(sigma, 1 / np.sqrt(1 / (50**2 + 30**2 + 1) + 1 / start**2), rtol=1e-3)
+    assert (built.state.sigma("mounting") < 50 * ARCSEC).all()
+    np.testing.assert_array_equal(built.state.others["scale"], np.zeros(3))
+    # Nine tenths of the rate limit is a saturation, without the IMU's word.
+    before = built.state.sigma_attitude_rad
+    built.propagate([0.1], [[np.radians(0.95), 0.0, 0.0]], [False])
+    assert (built.state.sigma_attitude_rad > before + np.radians(0.4)).all()
 
 
 # --- what the star tracker will not work under, and what its beliefs are worth ------------------------------

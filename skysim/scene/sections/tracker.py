@@ -147,17 +147,28 @@ class TrackerConfig(ConfigModel):
 
 
 class FilterConfig(ConfigModel):
-    """Noise model and settings of the attitude filter (MEKF: attitude and gyro bias), for gyro and star tracker.
+    """Noise model and settings of the attitude filter (MEKF: attitude and gyro errors), for gyro and star tracker.
 
     The bias is modeled as a Gauss-Markov process about zero in body axes. If imu.earth_rate is uncompensated, the
     filter estimates the Earth rate as bias while the attitude is constant. When the vehicle rotates, this bias
-    changes in body axes, so bias_deg_h must allow for it (15) and bias_time must be that of the rotation. The same
-    holds for the gyro's scale factor and misalignment.
+    changes in body axes, so bias_deg_h must allow for it (15) and bias_time must be that of the rotation. The gyro's
+    scale factors and misalignments, the tracker's slow error and its mount are states too, if their standard deviation
+    is not 0; one that is `considered` counts in the covariance, but its value is not estimated.
 
     arw_deg_sqrt_h, bias_deg_h, bias_time : of the gyro; the bias a Gauss-Markov process
-    start_deg, start_bias_deg_h           : standard deviation of attitude and bias about each axis at the start
-    floor_arcsec : systematic error of a star tracker's solution, the same in every frame, added to its covariance
+    scale_ppm, misalignment_arcsec        : standard deviation of the gyro's scale factors and of its axes' directions
+    rate_limit_deg_s : largest rate that the gyro measures; from nine tenths of it a rate counts as saturated, also
+        where the IMU does not say so
+    start_deg, start_bias_deg_h : standard deviation of attitude and bias about each axis at the start
+    systematic_arcsec : standard deviation about each axis of the tracker's slow error, which does not average out;
+        added to what a dome tracker knows of its survey
+    systematic_time, systematic_angle_deg : time and rotation after which the slow error is another one
+    mounting_arcsec : standard deviation of the tracker's mount about each axis
+    floor_arcsec : error that all lights of one frame share, another one in every frame, added to the covariance
+    considered   : states that are considered
     gate_sigma   : a solution with a larger innovation is rejected
+    missed_per_h : how often the gyro misses a motion in silence
+    wrong_share, wrong_repeat : probability that a wrong solution begins at a frame, and that the next agrees with it
     latency      : from the end of an exposure to its solution
     time_tag_sigma : standard deviation of a frame's time, which adds sigma^2 w w^T to the covariance at the rate w
     """
@@ -165,9 +176,23 @@ class FilterConfig(ConfigModel):
     arw_deg_sqrt_h: NotNegative = 0.07
     bias_deg_h: NotNegative = 1.0
     bias_time_s: Annotated[Time, Field(gt=0)] = 300.0
+    scale_ppm: NotNegative = 0.0
+    misalignment_arcsec: NotNegative = 0.0
+    rate_limit_deg_s: Positive | None = None
     start_deg: Positive = 1.0
     start_bias_deg_h: Positive = 10.0
-    floor_arcsec: NotNegative = 1.0
+    systematic_arcsec: NotNegative = 1.0
+    systematic_time_s: Annotated[Time, Field(gt=0)] = 3600.0
+    systematic_angle_deg: Positive = 10.0
+    mounting_arcsec: NotNegative = 0.0
+    floor_arcsec: NotNegative = 0.0
+    considered: tuple[Literal["bias", "scale", "misalignment", "mounting", "systematic"], ...] = (
+        "mounting",
+        "systematic",
+    )
     gate_sigma: Positive = 5.0
+    missed_per_h: Annotated[Number, Field(gt=0, lt=3600)] = 1e-4
+    wrong_share: Annotated[Number, Field(gt=0, lt=1)] = 1e-4
+    wrong_repeat: Annotated[Number, Field(gt=0, lt=1)] = 0.75
     latency_s: Annotated[Time, Field(ge=0)] = 0.0
     time_tag_sigma_s: Annotated[Time, Field(ge=0)] = 0.0

@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
+from tumble import tumble_angle_rad, tumble_body_from_ref
 
 from estimator.core.types import FilterState
 from estimator.filter.mekf import (
@@ -44,27 +45,6 @@ def measured(body_from_ref: Rotation, covariance_rad2: np.ndarray, rng: np.rando
 
 
 # ---- A tumble, integrated by another method ----
-
-
-def tumble_rad_s(t_s: np.ndarray) -> np.ndarray:
-    """(..., 3) rate in body axes."""
-    return np.stack([0.2 * np.sin(0.5 * t_s), 0.1 * np.cos(0.4 * t_s), 0.05 + 0.1 * np.sin(0.3 * t_s)], -1)
-
-
-def tumble_angle_rad(t_s: np.ndarray) -> np.ndarray:
-    """The gyro's perfect increments: the integral of each rate between the times."""
-    integral = np.stack([-0.4 * np.cos(0.5 * t_s), 0.25 * np.sin(0.4 * t_s), 0.05 * t_s - np.cos(0.3 * t_s) / 3], -1)
-    return np.diff(integral, axis=0)
-
-
-def tumble_body_from_ref(t_s: np.ndarray) -> Rotation:
-    """Poisson's equation C' = -[w] C by an eighth-order Runge-Kutta on the matrix, from the identity at time 0."""
-
-    def slope(t: float, c: np.ndarray) -> np.ndarray:
-        return -np.cross(tumble_rad_s(t), c.reshape(3, 3), axisb=0, axisc=0).ravel()
-
-    ivp = solve_ivp(slope, (0, t_s[-1]), np.eye(3).ravel(), "DOP853", t_s, rtol=1e-12, atol=1e-13)
-    return Rotation.from_matrix(ivp.y.T.reshape(-1, 3, 3))
 
 
 def test_the_gyro_is_followed() -> None:
@@ -508,10 +488,15 @@ def turning() -> AttitudeFilter:
     return mekf
 
 
-def after_turning(mekf: AttitudeFilter, second: int, jump: Rotation = HOME) -> Update:
-    """One second on, and an exact solution; jump * the vehicle's true body_from_ref."""
-    t_s = second + np.arange(1, 101) / 100
-    mekf.propagate(t_s, np.tile([0.0, 0.0, 1e-3], (100, 1)), np.zeros(100, bool))
+def after_turning(mekf: AttitudeFilter, second: int, jump: Rotation = HOME, outage: int = 0) -> Update:
+    """One second on, and an exact solution; jump * the vehicle's true body_from_ref.
+
+    outage : number of gyro samples that are missing at its end
+    """
+    t_s, angle = second + np.arange(1, 101) / 100, np.tile([0.0, 0.0, 1e-3], (100, 1))
+    missing = np.arange(100) >= 100 - outage
+    angle[missing] = np.nan
+    mekf.propagate(t_s, angle, np.zeros(100, bool), missing)
     return mekf.update(t_s[-1], true(second + 1, jump), TRACKER_RAD2)
 
 
@@ -563,9 +548,11 @@ def test_solutions_that_stand_still_while_the_vehicle_turns_do_not_agree() -> No
         assert after_turning(mekf, k, still).status == OUTSIDE_GATE
 
 
-def test_a_true_jump_is_taken_at_the_third_solution() -> None:
+@pytest.mark.parametrize("outage", [5, 20, 50])
+def test_a_jump_during_an_outage_is_taken_at_the_third_solution(outage: int) -> None:
     mekf, jump = turning(), wild(0.3, -0.2, 0.6)
-    assert [after_turning(mekf, k, jump).status for k in (3, 4)] == [OUTSIDE_GATE, OUTSIDE_GATE]
+    assert after_turning(mekf, 3, jump, outage).status == OUTSIDE_GATE
+    assert after_turning(mekf, 4, jump).status == OUTSIDE_GATE
     before = mekf.state
     assert after_turning(mekf, 5, jump).status == RESET
     state = mekf.state

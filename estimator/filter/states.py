@@ -1,0 +1,137 @@
+"""States of the attitude filter: which there are, in which order, and their estimate at one time."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from estimator.core.arrays import Floats, Ints
+from estimator.filter.models import STATES, GyroModel, TrackerModel
+from estimator.filter.propagate import advance
+
+DIAGONAL = np.arange(0, 9, 4)
+OFF_DIAGONAL = np.array([1, 2, 3, 5, 6, 7])
+
+
+class Layout(NamedTuple):
+    """Order of the error states: attitude (3), bias (3), then those in use, then the tracker's slow error (3).
+
+    The slow error is normalized: its standard deviation is 1, and each solution has the matrix that makes it an angle.
+
+    size      : N
+    slices    : of each state by name, "attitude" and "systematic" included
+    columns   : (9,) state of each element of the gyro's matrix M, row by row; -1 if it is none
+    estimated : (N,) whether its value is estimated; False if it is only considered
+    """
+
+    size: int
+    slices: dict[str, slice]
+    columns: Ints
+    estimated: Floats
+
+    @property
+    def reported(self) -> dict[str, slice]:
+        """The slices without the normalized slow error, whose effect is in the covariance of the attitude."""
+        return {name: rows for name, rows in self.slices.items() if name != "systematic"}
+
+
+class State(NamedTuple):
+    """State of the filter at one time.
+
+    values         : (N,) estimates in the order of Layout; those of the attitude are 0
+    covariance     : (N, N) of the errors
+    saturation_rad : standard deviation of the attitude from the saturation or outage that now lasts, else 0
+    lost_rad       : rotation that the gyro may have missed since the last solution that was used
+    used_s, used_wxyz : time and attitude of the last solution that was used, or of the start
+    support        : number of solutions used in agreement, see Jump
+    """
+
+    t_s: float
+    ref_from_body_wxyz: Floats
+    values: Floats
+    covariance: Floats
+    saturation_rad: float
+    lost_rad: float
+    used_s: float
+    used_wxyz: Floats
+    support: int
+
+    @property
+    def body_from_ref(self) -> Rotation:
+        return Rotation.from_quat(self.ref_from_body_wxyz, scalar_first=True).inv()
+
+
+def build_layout(gyro: GyroModel, tracker: TrackerModel, considered: tuple[str, ...]) -> Layout:
+    """The states in use. Raises ValueError for a considered one that there is not."""
+    unknown = sorted(set(considered) - set(STATES))
+    if unknown:
+        raise ValueError(f"considered: {unknown[0]!r}; allowed: {', '.join(STATES)}")
+    counts = {
+        "attitude": 3,
+        "bias": 3,
+        "scale": 3 * (gyro.scale > 0),
+        "misalignment": 6 * (gyro.misalignment_rad > 0),
+        "mounting": 3 * (tracker.mounting_rad > 0),
+        "systematic": 3,
+    }
+    slices, size, estimated = {}, 0, []
+    for name, count in counts.items():
+        if count:
+            slices[name] = slice(size, size + count)
+            size += count
+            estimated += [float(name not in considered)] * count
+    columns = np.full(9, -1)
+    for name, elements in (("scale", DIAGONAL), ("misalignment", OFF_DIAGONAL)):
+        if name in slices:
+            columns[elements] = np.arange(slices[name].start, slices[name].stop)
+    return Layout(size, slices, columns, np.array(estimated))
+
+
+def start_state(t_s: float, wxyz: Floats, sigmas: dict[str, ArrayLike], layout: Layout) -> State:
+    """The state at the start: all values 0, all states independent with these standard deviations."""
+    sigma = np.empty(layout.size)
+    for name, rows in layout.slices.items():
+        sigma[rows] = sigmas[name]
+    return State(t_s, wxyz, np.zeros(layout.size), np.diag(sigma**2), 0.0, 0.0, t_s, wxyz, 0)
+
+
+def propagate_state(state: State, samples: Floats, gyro: GyroModel, tracker: TrackerModel, layout: Layout) -> State:
+    """Propagate a state through gyro samples, rows as of `advance`."""
+    if not len(samples):
+        return state
+    noise = (
+        gyro.arw_rad_sqrt_s**2,
+        gyro.bias_rad_s**2,
+        1 / gyro.bias_time_s,
+        1 / tracker.systematic_time_s,
+        gyro.outage_rad_s,
+    )
+    slow = layout.slices["systematic"]
+    wxyz, values, covariance, saturation_rad, lost_rad = advance(
+        tuple(state[:6]), samples, noise, layout.columns, (slow.start, slow.stop)
+    )
+    return state._replace(
+        t_s=float(samples[-1, 0]),
+        ref_from_body_wxyz=wxyz,
+        values=values,
+        covariance=covariance,
+        saturation_rad=saturation_rad,
+        lost_rad=lost_rad,
+    )
+
+
+def decorrelate(state: State, tracker: TrackerModel, layout: Layout) -> State:
+    """Let the tracker's slow error change by the rotation since the last solution that was used."""
+    rows = layout.slices["systematic"]
+    # The angle between two quaternions; the scalar product may exceed 1 by rounding.
+    turned_rad = 2 * math.acos(min(abs(float(state.ref_from_body_wxyz @ state.used_wxyz)), 1.0))
+    kept = math.exp(-turned_rad / tracker.systematic_angle_rad)
+    factor = np.ones(layout.size)
+    factor[rows] = kept
+    covariance = state.covariance * np.outer(factor, factor)
+    covariance[rows, rows] += (1 - kept**2) * np.eye(3)
+    return state._replace(values=state.values * factor, covariance=covariance)
