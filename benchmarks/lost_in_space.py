@@ -1,4 +1,4 @@
-"""Lost-in-space identification on sixteen workloads, from centroids and magnitudes, compared with an oracle.
+"""Lost-in-space identification on eighteen workloads, from centroids and magnitudes, compared with an oracle.
 
 `python -m benchmarks.lost_in_space [FIELDS] [SEED] [IDENTIFIER ...]` prints success, wrong attitudes and time. The sky
 is Hipparcos to the workload's limiting magnitude, without the fainter of any two stars closer than 30". Attitudes are
@@ -43,6 +43,7 @@ class Workload:
     brightest     : maximum number of centroids; false_share : fraction of the centroids that are false, after this cut
     false, missing: number of false lights, and fraction of the stars not detected
     false_brighter: whether every false light is brighter than any star
+    lattice       : number of hot pixels on each side of a square lattice over the whole field, at whole pixels
     focal_error   : relative error of the tracker's focal length; focal_uncertainty : that the tracker assumes
     """
 
@@ -56,6 +57,7 @@ class Workload:
     false: int = 0
     missing: float = 0.0
     false_brighter: bool = False
+    lattice: int = 0
     focal_error: float = 0.0
     focal_uncertainty: float = 0.0
 
@@ -81,6 +83,8 @@ WORKLOADS = (
     Workload("17 x 13 deg, 70 % false", (17, 13), 1024, 6.0, 0.2, false_share=0.7),
     Workload("the same, half false, brighter", (17, 13), 1024, 6.0, 0.2, false_share=0.5, false_brighter=True),
     Workload("6 x 6 deg, 70 % false", (6, 6), 1024, 7.5, 0.2, false_share=0.7),
+    Workload("6 x 6 deg, 25 hot pixels, a lattice", (6, 6), 1024, 7.5, 0.2, lattice=5),
+    Workload("the same, brighter than any star", (6, 6), 1024, 7.5, 0.2, lattice=5, false_brighter=True),
     Workload("35 x 20 deg, 70 % false", (35, 20), 1280, 5.5, 0.2, false_share=0.7),
     Workload("23 x 23 deg, 70 % false", (23, 23), 1024, 5.5, 0.2, false_share=0.7),
     Workload("SHEFEX, focal known to 5 %, off 5 %", SHEFEX, 659, 5.75, 0.1, focal_error=0.05, focal_uncertainty=0.05),
@@ -129,6 +133,10 @@ def field(work: Workload, stars: catalog.StarCatalog, rng: np.random.Generator) 
     false = work.false + round(len(row) * work.false_share / (1 - work.false_share))
     detected = xy[row] + work.noise_px * rng.standard_normal((len(row), 2))
     false_xy = rng.uniform(-0.5, [camera.width_px - 0.5, camera.height_px - 0.5], (false, 2))
+    if work.lattice:
+        steps = (np.arange(work.lattice) + 0.5) / work.lattice
+        x, y = np.meshgrid(np.round(steps * camera.width_px), np.round(steps * camera.height_px))
+        false_xy, false = np.column_stack([x.ravel(), y.ravel()]), work.lattice**2
     xy = np.concatenate([detected, false_xy])
     false_mag = rng.choice(stars.v_mag, false) - (stars.v_mag.max() - mag.min(initial=0) if work.false_brighter else 0)
     mag = np.concatenate([mag, false_mag])
