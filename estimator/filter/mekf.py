@@ -26,6 +26,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc, chdtri
 
+from estimator.core import checks
 from estimator.core.arrays import Floats
 from estimator.core.types import FilterState
 from estimator.filter.propagate import advance, rotate_quaternion, transition
@@ -167,6 +168,9 @@ class AttitudeFilter:
         floor_rad: float = 0.0,
         gate_sigma: float = 5.0,
     ) -> None:
+        checks.of_type("filter: gyro", gyro, GyroModel)
+        checks.one_rotation("filter: body_from_ref", body_from_ref)
+        t_s = checks.number("filter: t_s", t_s, -1e300, 1e300, "a finite time in seconds")
         self._gyro = gyro
         self._floor_rad2 = _not_negative("floor_rad", floor_rad) ** 2
         # The chi-square of 3 degrees of freedom with the tail probability of gate_sigma for a scalar Gaussian.
@@ -239,8 +243,11 @@ class AttitudeFilter:
 
         Raises ValueError for a covariance that is not symmetric and positive definite, or a time after the last sample.
         """
+        checks.one_rotation("update: body_from_ref_measured", body_from_ref_measured)
         covariance = _checked_covariance(covariance_rad2) + self._floor_rad2 * np.eye(3)
-        systematic = np.zeros((3, 3)) if systematic_rad2 is None else systematic_rad2
+        systematic = (
+            np.zeros((3, 3)) if systematic_rad2 is None else checks.rows("systematic_rad2", systematic_rad2, 3, 3)
+        )
         solution, now_s = _Solution(body_from_ref_measured, covariance, systematic), self._current.t_s
         if not t_s <= now_s + ROUNDING_S:
             raise ValueError(f"update: a solution at {t_s} s; allowed: up to the last gyro sample, {now_s} s")

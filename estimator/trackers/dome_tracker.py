@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude import systematic
-from estimator.attitude.dome_map import LedMap, Lever, check_lever, on_sphere, project
+from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, on_sphere, project
 from estimator.attitude.nearfield import SOLVERS, fitted_sigma_rad
 from estimator.catalog import pair_index
+from estimator.core import checks
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids, StarMatch
@@ -25,7 +26,15 @@ from estimator.identification.leds import search
 from estimator.identification.leds.index import build_dome_index, corner_rays, inner_field
 from estimator.identification.leds.search import NO_MATCH
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
-from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, process_frame
+from estimator.trackers.pipeline import (
+    Clock,
+    Report,
+    Settings,
+    brightest,
+    check_algorithms,
+    direction_sigma_rad,
+    process_frame,
+)
 from estimator.trackers.refinement import mutual_nearest
 from estimator.trackers.star_tracker import NO_STARS
 
@@ -103,7 +112,7 @@ class DomeTracker:
     """Lost-in-space tracker under an LED dome, with the camera on a lever arm about the bearing center.
 
     cam_from_ref of the result is cam_from_lab; `lever` converts it to the vehicle's attitude. Raises ImageError if
-    the lever is longer than the dome is wide, or if there are too few LEDs.
+    the lever is longer than the dome is wide, if there are too few LEDs, or for anything that is not as described.
     """
 
     def __init__(
@@ -113,6 +122,9 @@ class DomeTracker:
         lever: Lever,
         settings: Settings = SETTINGS,
     ) -> None:
+        checks.of_type("camera", camera, Camera)
+        check_algorithms(settings, IDENTIFIERS, SOLVERS)
+        check_map(leds)
         check_lever(leds, lever)
         self.camera, self.leds, self.lever, self.settings = camera, leds, lever, settings
         self.identify = IDENTIFIERS[settings.identifier](camera, leds, lever, settings)
@@ -127,6 +139,8 @@ class DomeTracker:
 
     def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
         """Identify and solve centroids from any source (the truth included)."""
+        checks.of_type("centroids", centroids, Centroids)
+        centroids.check_values()
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
             return Attitude(NO_STARS)
