@@ -187,12 +187,13 @@ COLUMNS = ("hip", "ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr", "paralla
 def hipparcos() -> StarCatalog:
     """The Hipparcos-2 subset to Hp 6.5 that comes with the package.
 
-    It is in data/catalogs beside the package in a checkout, and in skysim/data/catalogs of an installed one.
-    Raises ImageError where neither has it.
+    It is in data/catalogs beside the package in a checkout, in skysim/data/catalogs where skysim is installed, and in
+    estimator/data/catalogs where the estimator is installed alone. Raises ImageError where none of them has it.
     """
     root = Path(__file__).resolve().parents[2]
     name = "data/catalogs/hipparcos_hp6.5.ecsv"
-    return read(next((path for path in (root / name, root / "skysim" / name) if path.is_file()), root / name))
+    places = root / name, root / "skysim" / name, root / "estimator" / name
+    return read(next((path for path in places if path.is_file()), root / name))
 
 
 def columns(path: str | Path, names: Sequence[str], optional: Sequence[str] = ()) -> tuple[Floats, float]:

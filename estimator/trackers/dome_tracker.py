@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude import systematic
@@ -26,6 +26,7 @@ from estimator.identification.leds import search
 from estimator.identification.leds.index import build_dome_index, corner_rays, inner_field
 from estimator.identification.leds.search import NO_MATCH
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
+from estimator.trackers import warm_up
 from estimator.trackers.pipeline import (
     Clock,
     Report,
@@ -136,6 +137,23 @@ class DomeTracker:
         streak_px : (dx, dy) that lights move during the exposure, from the gyro; None if unknown
         """
         return process_frame(image, self.camera, self.settings, self.solve_centroids, streak_px)
+
+    def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
+        """Compile all that `solve` and `solve_centroids` use: call it before the experiment.
+
+        It takes up to a minute once, and a second where numba finds its code on disk.
+        dtype : of the frames' pixels
+        """
+        fields = []
+        for toward_m in self.leds.position_m[:: max(len(self.leds.position_m) // 40, 1)]:
+            cam_from_lab, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [toward_m])
+            xy_px = project(
+                self.lever.cam_from_body.inv() * cam_from_lab, self.leds.position_m, self.lever, self.camera
+            )
+            fields.append(xy_px[self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), 2.0)])
+        xy_px = max(fields, key=len)
+        warm_up.run(self.camera, xy_px, np.ones(len(xy_px)), dtype, self.solve)
+        self.solve_centroids(Centroids(xy_px, np.full(len(xy_px), 0.1), np.ones(len(xy_px))))
 
     def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
         """Identify and solve centroids from any source (the truth included)."""

@@ -17,7 +17,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.solvers import SOLVERS, covariance
@@ -32,6 +32,7 @@ from estimator.identification.chance import (
 )
 from estimator.identification.stars import quads, search
 from estimator.identification.stars.evidence import Detections, Solution
+from estimator.trackers import warm_up
 from estimator.trackers.pipeline import Clock, Report, Settings, brightest, check_algorithms, process_frame
 from estimator.trackers.refinement import NO_MATCH, FieldMatcher
 
@@ -163,6 +164,30 @@ class StarTracker:
         streak_px : (dx, dy) that stars move during the exposure, from the gyro; None if unknown
         """
         return process_frame(image, self.camera, self.settings, self.solve_centroids, streak_px)
+
+    def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
+        """Compile all that `solve` and `solve_centroids` use, and build the quads: call it before the flight.
+
+        It takes up to a minute once, and a second where numba finds its code on disk. Without it the first frames
+        take that time.
+        dtype : of the frames' pixels
+        """
+        cam_from_ref, xy_px, light = self.rich_field()
+        warm_up.run(self.camera, xy_px, light, dtype, self.solve)
+        # As many false lights as stars: whether the camera model fits the field is tested then.
+        xy_px = np.concatenate([xy_px, xy_px[:, ::-1]])
+        centroids = Centroids(xy_px, np.full(len(xy_px), 0.1), np.concatenate([light, light / 2]))
+        self.solve_centroids(centroids)
+        rows, _ = self.field_matcher.in_field(self.camera, cam_from_ref)
+        self.solve_matches(centroids, np.arange(min(len(rows), 3)), rows[:3])
+
+    def rich_field(self) -> tuple[Rotation, Floats, Floats]:
+        """An attitude with many stars on the sensor, of forty; their (N, 2) pixels and (N,) light, brightest first."""
+        fields = []
+        for cam_from_ref in Rotation.random(40, np.random.Generator(np.random.PCG64(1))):
+            rows, xy_px = self.field_matcher.in_field(self.camera, cam_from_ref)
+            fields.append((cam_from_ref, xy_px, 10 ** (-0.4 * self.stars.v_mag[rows])))
+        return max(fields, key=lambda one: len(one[1]))
 
     @property
     def efforts(self) -> int:

@@ -13,7 +13,7 @@ from enum import IntFlag
 from math import log10, pi
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.centroiding.centroid import CENTROIDERS
@@ -28,6 +28,7 @@ from estimator.detection.windows import in_windows
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.stars import evidence
 from estimator.identification.stars.search import ACCEPT_DEX
+from estimator.trackers import warm_up
 from estimator.trackers.pipeline import Clock, Report, detect_and_centroid, inflate_uncertainty
 from estimator.trackers.star_tracker import StarTracker
 
@@ -122,6 +123,21 @@ class TrackingMode:
             report = self._search(image, streak_px, clock)
         self._store(t_s, report.attitude.cam_from_ref)
         return report
+
+    def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
+        """Compile all that `solve` uses, in windows and in whole frames: `StarTracker.warm_up`; the memory is kept.
+
+        dtype : of the frames' pixels
+        """
+        self.tracker.warm_up(dtype)
+        cam_from_ref, xy_px, light = self.tracker.rich_field()
+        follower = TrackingMode(self.tracker, self.reach_px, self.max_windows, self.max_age_s)
+
+        def look(image: NDArray, streak_px: tuple[float, float] | None) -> None:
+            follower.last = LastSolution(0.0, cam_from_ref, np.zeros(3))
+            follower.solve(image, 0.0, None, streak_px)
+
+        warm_up.run(self.tracker.camera, xy_px, light, dtype, look)
 
     def _predict(self, t_s: float, now_from_then: Rotation | None) -> Rotation | None:
         """Predicted cam_from_ref, or None without a recent attitude."""

@@ -149,7 +149,7 @@ def test_centroids_are_of_one_length_and_their_numbers_usable(
     Centroids(**good).check_values()  # type: ignore[arg-type]
     Centroids(**good | {"covariance_px2": None}).check_values()  # type: ignore[arg-type]
     for name, array in good.items():
-        with pytest.raises(ImageError, match=f"centroids: .* has shape .*; allowed: "):
+        with pytest.raises(ImageError, match=r"centroids: .* has shape .*; allowed: "):
             Centroids(**good | {name: np.resize(array, (count + longer, *array.shape[1:]))})  # type: ignore[arg-type]
         bad = array.copy()
         bad[row] = value
