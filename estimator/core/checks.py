@@ -45,7 +45,14 @@ def of_type(what: str, value: object, *kinds: type) -> None:
     """Raise ImageError unless a value is of one of the types."""
     if not isinstance(value, kinds):
         names = " or ".join(kind.__name__ for kind in kinds)
-        raise ImageError(f"{what} is {excerpt(value)}, a {type(value).__name__}; allowed: {names}")
+        raise ImageError(f"{what} is {excerpt(value)} of type {type(value).__name__}; allowed: {names}")
+
+
+def each_of_type(what: str, values: object, kind: type) -> None:
+    """Raise ImageError unless a value is a list or tuple of things of one type."""
+    of_type(what, values, list, tuple)
+    for k, one in enumerate(values):  # type: ignore[arg-type,var-annotated]
+        of_type(f"{what}: number {k}", one, kind)
 
 
 def one_rotation(what: str, value: object) -> None:

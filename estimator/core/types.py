@@ -112,7 +112,7 @@ class Centroids:
             object.__setattr__(self, "covariance_px2", spread)
 
     def check_values(self) -> None:
-        """Raise ImageError unless positions are finite, and sigmas and fluxes finite and above 0; a microsecond."""
+        """Raise ImageError unless positions are finite, sigmas in their range and fluxes above 0; in a microsecond."""
         spread = self.covariance_px2
         row, fault = _first_fault(self.xy_px, self.sigma_px, self.flux, NO_SPREAD if spread is None else spread)
         if fault:
@@ -146,9 +146,10 @@ class Centroids:
 
 
 NO_SPREAD = np.empty((0, 2, 2))
+MAX_SIGMA_PX = 20.0  # with less accurate lights every star is a candidate for each: a search would take minutes
 FAULTS = {  # by the number that `_first_fault` returns
     1: ("xy_px", "finite numbers"),
-    2: ("sigma_px", "finite, above 0"),
+    2: ("sigma_px", f"above 0, up to {MAX_SIGMA_PX:g}"),
     3: ("flux", "finite, above 0"),
     4: ("covariance_px2", "symmetric and positive definite"),
 }
@@ -160,7 +161,7 @@ def _first_fault(xy_px: Floats, sigma_px: Floats, flux: Floats, spread_px2: Floa
     for n in range(len(xy_px)):
         if not (abs(xy_px[n, 0]) < np.inf and abs(xy_px[n, 1]) < np.inf):
             return n, 1
-        if not 0 < sigma_px[n] < np.inf:
+        if not 0 < sigma_px[n] <= MAX_SIGMA_PX:
             return n, 2
         if not 0 < flux[n] < np.inf:
             return n, 3

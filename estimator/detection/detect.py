@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.core.arrays import Floats, Ints
-from estimator.core.checks import native, number
+from estimator.core.checks import native, number, of_type
 from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Background, Blobs, FramePriors
 from estimator.detection import classify
@@ -56,6 +56,7 @@ def default(
     longer than MAX_STREAK_PX are detected with the filter for round stars.
     """
     image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
+    of_type("priors", priors, FramePriors)
     background = estimate_background(image)
     if priors.streak_px is None or not 2 <= max(map(abs, priors.streak_px)) <= MAX_STREAK_PX:
         blobs = detect_blobs(image, background, threshold_sigma * background.noise, min_area_px, max_blobs, GROW_SIGMA)
@@ -115,6 +116,7 @@ def thesis(
     """
     check_pixel_type(image)
     pixel, image = image.dtype, prepare_image(image, threshold_sigma, min_area_px, max_blobs)
+    of_type("priors", priors, FramePriors)
     full_scale = priors.saturation
     if not np.isfinite(full_scale):
         if pixel.kind != "u":

@@ -28,6 +28,7 @@ from scipy.special import chdtrc, chdtri
 
 from estimator.core import checks
 from estimator.core.arrays import Floats
+from estimator.core.errors import ImageError
 from estimator.core.types import FilterState
 from estimator.filter.propagate import advance, rotate_quaternion, transition
 
@@ -61,6 +62,8 @@ class GyroModel:
     bias_time_s: float
 
     def __post_init__(self) -> None:
+        for name in ("arw_rad_sqrt_s", "bias_rad_s", "bias_time_s"):
+            checks.of_type(f"gyro: {name}", getattr(self, name), float, int, np.floating, np.integer)
         for name in ("arw_rad_sqrt_s", "bias_rad_s"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"gyro: {name} is {getattr(self, name)}; allowed: finite, 0 or more")
@@ -245,9 +248,8 @@ class AttitudeFilter:
         """
         checks.one_rotation("update: body_from_ref_measured", body_from_ref_measured)
         covariance = _checked_covariance(covariance_rad2) + self._floor_rad2 * np.eye(3)
-        systematic = (
-            np.zeros((3, 3)) if systematic_rad2 is None else checks.rows("systematic_rad2", systematic_rad2, 3, 3)
-        )
+        systematic = np.zeros((3, 3)) if systematic_rad2 is None else _checked_systematic(systematic_rad2)
+        t_s = checks.number("update: t_s", t_s, -math.inf, math.inf, "a time in seconds")
         solution, now_s = _Solution(body_from_ref_measured, covariance, systematic), self._current.t_s
         if not t_s <= now_s + ROUNDING_S:
             raise ValueError(f"update: a solution at {t_s} s; allowed: up to the last gyro sample, {now_s} s")
@@ -435,3 +437,12 @@ def _checked_covariance(covariance_rad2: ArrayLike) -> Floats:
     if not valid:
         raise ValueError(f"update: covariance_rad2 {matrix.tolist()}; allowed: (3, 3), symmetric, positive definite")
     return (matrix + matrix.T) / 2
+
+
+def _checked_systematic(systematic_rad2: ArrayLike) -> Floats:
+    """Return the covariance as a (3, 3) array. Raises ImageError unless it is symmetric and nowhere negative."""
+    matrix = checks.rows("update: systematic_rad2", systematic_rad2, 3, 3)
+    rounding = 1e-9 * np.abs(matrix).max()
+    if np.abs(matrix - matrix.T).max() > rounding or np.linalg.eigvalsh(matrix)[0] < -rounding:
+        raise ImageError(f"update: systematic_rad2 {matrix.tolist()}; allowed: (3, 3), symmetric, not negative")
+    return matrix

@@ -201,6 +201,8 @@ class StarTracker:
         """
         checks.of_type("centroids", centroids, Centroids)
         centroids.check_values()
+        if effort is not None:
+            effort = checks.number("effort", effort, 0, self.efforts - 1, f"0 to {self.efforts - 1}, or None", True)
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
             return Attitude(NO_STARS)

@@ -69,7 +69,15 @@ def test_an_array_in_any_disguise_is_the_plain_one(array: NDArray) -> None:
         detect.check_pixel_type(array.tolist())
 
 
-@law(checks.number, checks.of_type, checks.pixel_step, checks.one_rotation, checks.known, checks.excerpt)
+@law(
+    checks.number,
+    checks.of_type,
+    checks.each_of_type,
+    checks.pixel_step,
+    checks.one_rotation,
+    checks.known,
+    checks.excerpt,
+)
 @given(thing=THINGS)
 def test_anything_is_what_is_asked_for_or_one_line(thing: Any) -> None:
     number = answered(lambda: checks.number("x", thing, 0.0, 5.0, "0 to 5"), ImageError)
@@ -82,6 +90,9 @@ def test_anything_is_what_is_asked_for_or_one_line(thing: Any) -> None:
         checks.one_rotation("x", thing)
     with pytest.raises(ImageError, match="allowed: Centroids or Lever"):
         checks.of_type("x", thing, Centroids, Lever)
+    checks.each_of_type("x", [thing, thing], object)
+    with pytest.raises(ImageError, match=r"x: number 1 is .*allowed: Lever|x is .*allowed: list or tuple"):
+        checks.each_of_type("x", [dome_map.Lever(None, None), thing], Lever)  # type: ignore[arg-type]
     with pytest.raises(ImageError, match="'abd' is unknown; did you mean abc\\?; allowed: abc, xyz"):
         checks.known("x", "abd", {"xyz", "abc"})
     assert len(checks.excerpt(thing).splitlines()) <= 1
@@ -256,7 +267,7 @@ def test_a_map_of_other_lengths_is_refused(rng: np.random.Generator) -> None:
     for name, wrong in (("sigma_m", -1.0), ("position_m", None), ("sigma_m", np.nan)):
         with pytest.raises(ImageError, match=f"leds: {name}"):
             dome_map.check_map(LedMap(**good | {name: wrong}))
-    with pytest.raises(ImageError, match="leds is 5, a int; allowed: LedMap"):
+    with pytest.raises(ImageError, match="leds is 5 of type int; allowed: LedMap"):
         dome_map.check_map(5)
 
 
