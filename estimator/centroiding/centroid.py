@@ -71,8 +71,7 @@ def gaussian_fit(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: F
     model does not fit (no convergence, larger than the window) keeps its center of gravity.
     """
     image = prepare(image, blobs, gain_e_dn, priors)
-    rows = _fit_gaussians(image, blobs, gain_e_dn, priors)
-    return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
+    return _gaussian_centroids(image, blobs, gain_e_dn, priors)
 
 
 def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS) -> Centroids:
@@ -89,7 +88,7 @@ def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePr
     streaks = _fit_streaks(image, blobs, gain_e_dn, priors)
     failed = np.isnan(streaks[:, 0])
     if failed.all():
-        return gaussian_fit(image, blobs, gain_e_dn, priors)
+        return _gaussian_centroids(image, blobs, gain_e_dn, priors)
     covariance = streaks[:, [5, 7, 7, 6]].reshape(-1, 2, 2)
     rows = streaks[:, [0, 1, 5, 2]]
     rows[:, 2] = np.sqrt((streaks[:, 5] + streaks[:, 6]) / 2)
@@ -161,6 +160,12 @@ CENTROIDERS: dict[str, Centroider] = {
     "streak": streak,
     "disk": disk,
 }
+
+
+def _gaussian_centroids(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> Centroids:
+    """Centroids of `gaussian_fit` in an image that is prepared."""
+    rows = _fit_gaussians(image, blobs, gain_e_dn, priors)
+    return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
 
 
 def _fit_gaussians(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> Floats:

@@ -89,8 +89,10 @@ def floats(what: str, value: object, shape: tuple[int | None, ...]) -> Floats:
 
 def native(what: str, value: object, dtype: DTypeLike) -> NDArray[Any]:
     """An array of a dtype, as compiled code takes it: C-contiguous, aligned, writable. A copy only if it is needed."""
-    if type(value) is np.ndarray and value.dtype == dtype and value.flags.c_contiguous and value.flags.behaved:
-        return value
+    if type(value) is np.ndarray and value.dtype == dtype:
+        if not value.flags.c_contiguous:
+            return np.ascontiguousarray(value)
+        return value if value.flags.behaved else value.copy()
     try:
         array = np.asarray(value)
         if array.dtype.kind not in "buif":
