@@ -1,4 +1,9 @@
-"""Photometric zero point: the offset between instrumental magnitudes and catalog magnitudes."""
+"""Photometric zero point: the offset between instrumental magnitudes and catalog magnitudes.
+
+The instrumental magnitude of a star is -2.5 log10(flux / exposure). Its difference from the catalog's V is the zero
+point plus the star's color term, which is unknown but constant. The zero point is therefore the median over stars, not
+over sightings, of each star's median difference; the scatter gives the standard deviation that an identifier needs.
+"""
 
 from __future__ import annotations
 

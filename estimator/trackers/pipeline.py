@@ -1,4 +1,10 @@
-"""Settings and processing stages common to all trackers: detection, centroiding, timing."""
+"""Settings and processing stages common to all trackers: detection, centroiding, timing.
+
+A frame passes through four stages, each a function named in `Settings`: detect (frame to blobs), centroid (blobs to
+positions with errors), identify (positions to stars or LEDs) and solve (matches to an attitude). Here are the first
+two. Blobs that cannot be stars (hot pixels, tracks, the Moon, texture) or touch the border are dropped, saturated ones
+get a greater error, and centroids that are too inaccurate to tell one star from another are left out.
+"""
 
 from __future__ import annotations
 
