@@ -3,20 +3,20 @@
 Numpy arrays and floats go in, dataclasses come out. The package imports neither skysim nor MuJoCo.
 """
 
-import lazy_loader
+from estimator.core.lazy import attach
 
 # Loaded on first use, so that `import estimator` is quick.
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = attach(
     __name__,
-    submod_attrs={
+    {
         "catalog.catalog": ["StarCatalog"],
         "core.camera": ["Camera"],
         "core.errors": ["ImageError"],
-        "core.types": ["ra_dec_roll_rad"],
-        "filter.mekf": ["AttitudeFilter"],
+        "core.types": ["Attitude", "Centroids", "ra_dec_roll_rad"],
+        "filter.mekf": ["AttitudeFilter", "GyroModel"],
         "trackers.dome_tracker": ["DomeTracker"],
-        "trackers.pipeline": ["Settings"],
+        "trackers.pipeline": ["Report", "Settings"],
         "trackers.star_tracker": ["StarTracker"],
-        "trackers.tracking_mode": ["TrackingMode"],
+        "trackers.tracking_mode": ["Health", "TrackingMode"],
     },
 )

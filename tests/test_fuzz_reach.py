@@ -29,6 +29,7 @@ SHIPPED = "a file that comes along, each of which a test reads"
 GUARDED = "runs in a child process with limits, whose end of any kind is an error of the file"
 SOURCES = "reads bytes for their digest alone"
 OUT_OF_REACH = {
+    "estimator.catalog.catalog.StarCatalog.read": "hands the file on to the module's `read`",
     "skysim.apps.cli.commands.camera.CameraGroup.parse_args": "words of the command line",
     "skysim.apps.cli.commands.camera.read_camera": "hands the file on to `loader` or `opencv_calibration.read`",
     "skysim.scene.data_sheet.sheet.parsed": "a word of the command line, read as a quantity or a number",

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
@@ -89,8 +90,33 @@ def project(body_from_lab: Rotation, position_m: Floats, lever: Lever, camera: C
     return camera.pixels(lever.cam_from_body.apply(in_body))
 
 
+def check_map(leds: object) -> None:
+    """Raise ImageError unless a map's arrays belong together and its numbers can be used."""
+    checks.of_type("leds", leds, LedMap)
+    assert isinstance(leds, LedMap)
+    count = len(checks.rows("leds: position_m", leds.position_m, None, 3))
+    if not count:
+        raise ImageError("leds: the map is empty; allowed: 3 LEDs or more")
+    for name in ("id", "board"):
+        column = getattr(leds, name)
+        if column is not None and np.shape(column) != (count,):
+            raise ImageError(f"leds: {name} has shape {np.shape(column)}; allowed: ({count},), one an LED")
+    for name in ("center_m", "semi_axes_m"):
+        checks.floats(f"leds: {name}", getattr(leds, name), (3,))
+    checks.number("leds: sigma_m", leds.sigma_m, 0.0, 1e9, "finite, 0 or more")
+    if leds.covariance_m2 is not None:
+        checks.floats("leds: covariance_m2", leds.covariance_m2, (count, 3, 3))
+    if leds.common_m is not None:
+        checks.floats("leds: common_m", leds.common_m, (None, count, 3))
+
+
 def check_lever(leds: LedMap, lever: Lever) -> None:
-    """Raise ImageError unless the lever arm is shorter than the distance of the nearest LED."""
+    """Raise ImageError unless the lever can be used, and its arm is shorter than the distance of the nearest LED."""
+    checks.of_type("lever", lever, Lever)
+    if not np.isfinite(checks.floats("lever: camera_body_m", lever.camera_body_m, (3,))).all():
+        raise ImageError("lever: camera_body_m has a NaN or infinity; allowed: finite")
+    checks.one_rotation("lever: cam_from_body", lever.cam_from_body)
+    checks.number("lever: sigma_m", lever.sigma_m, 0.0, 1e9, "finite, 0 or more")
     nearest = np.linalg.norm(leds.position_m, axis=1).min()
     lever_m = np.linalg.norm(lever.camera_body_m)
     if lever_m >= nearest:

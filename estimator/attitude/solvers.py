@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude import wahba as kernel
+from estimator.core import checks
 from estimator.core.arrays import Floats
 from estimator.core.vectors import quaternion_xyzw
 
@@ -85,9 +86,8 @@ def _solve_profile(
 
 def _checked_arrays(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> tuple[Floats, Floats, Floats]:
     """Prepare the kernels' arguments: two (N, 3) arrays, (N,) weights in rad^-2. Raises ValueError for other shapes."""
-    cam, ref = np.ascontiguousarray(vectors_cam, dtype=float), np.ascontiguousarray(vectors_ref, dtype=float)
-    sigma = np.asarray(sigma_rad, dtype=float)
-    count = len(cam)
+    cam, ref, sigma = (checks.native("directions", one, np.float64) for one in (vectors_cam, vectors_ref, sigma_rad))
+    count = len(cam) if cam.ndim else 0
     if cam.shape != (count, 3) or ref.shape != (count, 3) or sigma.shape != (count,):
         raise ValueError(f"shapes {cam.shape}, {ref.shape}, {sigma.shape}; allowed: (N, 3), (N, 3), (N,)")
     return cam, ref, kernel.weights(sigma)
@@ -108,6 +108,8 @@ def covariance(vectors_cam: Floats, sigma_rad: Floats, solver: str = "quest") ->
     sum is over its pair. Confirmed by Monte Carlo in the tests. Raises ValueError if the roll is unobservable.
     """
     cam, _, weight = _checked_arrays(vectors_cam, vectors_cam, sigma_rad)
+    checks.unit_rows("vectors_cam", cam, None)
+    checks.known("solver", solver, SOLVERS)
     if solver == "triad" and len(cam) > 2:
         pair = list(kernel.best_pair(cam, weight))
         cam, weight = cam[pair], weight[pair]

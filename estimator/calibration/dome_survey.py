@@ -34,10 +34,11 @@ from scipy.linalg import LinAlgError
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.dome_map import LedMap, Lever
+from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Bundle, Sightings
 from estimator.calibration.gauge import Gauge, Subset
+from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
 
@@ -137,6 +138,10 @@ def survey(
         raise ValueError(f"survey: unknown loss {loss!r}; allowed: {', '.join(LOSSES)}")
     if not leds_sigma_m > 0:
         raise ValueError(f"survey: leds_sigma_m is {leds_sigma_m}; allowed: above 0, inf for a start only")
+    checks.each_of_type("survey: frames", frames, DomeFrame)
+    checks.of_type("survey: camera_start", camera_start, Camera)
+    check_map(leds_start)
+    check_lever(leds_start, lever_start)
     sightings = _collect(frames, len(leds_start.position_m))
     start = _start_bundle(frames, leds_start, lever_start, camera_start, 7 if fit_distortion else 3)
     start = replace(start, map_sigma_m=leds_sigma_m)

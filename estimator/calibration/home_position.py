@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever, on_surface
 from estimator.attitude.nearfield import thesis_points
 from estimator.catalog.catalog import unit
+from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
@@ -145,6 +146,11 @@ def calibrate(
         from the mean over all frames (the black marks of his Fig. 79), which keeps the IMU's errors at the stops
     Raises ImageError for inconsistent sightings, or if a standard deviation is undetermined.
     """
+    checks.each_of_type("sightings", sightings, Sighting)
+    checks.of_type("camera", camera, Camera)
+    checks.of_type("surface", surface, LedMap)
+    checks.of_type("lever", lever, Lever)
+    checks.known("statistic", statistic, DEVIATIONS)
     id_, samples = _lab_positions(sightings, camera, surface, lever, sine)
     deviation = DEVIATIONS[statistic]
     coordinates = [deviation(column, samples.led, samples.stop) for column in samples.lab_m.T]

@@ -1,4 +1,9 @@
-"""Photometric zero point: the offset between instrumental magnitudes and catalog magnitudes."""
+"""Photometric zero point: the offset between instrumental magnitudes and catalog magnitudes.
+
+The instrumental magnitude of a star is -2.5 log10(flux / exposure). Its difference from the catalog's V is the zero
+point plus the star's color term, which is unknown but constant. The zero point is therefore the median over stars, not
+over sightings, of each star's median difference; the scatter gives the standard deviation that an identifier needs.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimator.core import checks
 from estimator.core.arrays import Floats
+from estimator.core.errors import ImageError
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +39,12 @@ def magnitude_zero(instrumental_mag: Floats, v_mag: Floats, vectors_ref: Floats)
     of the median is sqrt(pi / 2) times the scatter over the square root of the number of stars. Leave out stars near
     the detection limit: only those with positive errors are detected, which biases the median.
     """
+    checks.unit_rows("vectors_ref", vectors_ref, None)
+    if not len(vectors_ref):
+        raise ImageError("magnitude_zero: no stars; allowed: one or more")
+    for name, values in (("instrumental_mag", instrumental_mag), ("v_mag", v_mag)):
+        if not np.isfinite(checks.floats(name, values, (len(vectors_ref),))).all():
+            raise ImageError(f"{name} has a NaN or infinity; allowed: finite")
     _, star = np.unique(vectors_ref, axis=0, return_inverse=True)
     star = np.ravel(star)
     difference = v_mag - instrumental_mag

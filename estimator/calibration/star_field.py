@@ -28,8 +28,10 @@ from estimator.calibration.bundle_adjustment import Bundle, Sightings
 from estimator.calibration.dome_survey import CAUCHY, GATE
 from estimator.calibration.magnitude_zero import MagnitudeZero, magnitude_zero
 from estimator.catalog.catalog import StarCatalog
+from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 
 LENS = 8  # focal_px, center x and y, k1, k2, p1, p2, k3
@@ -120,6 +122,9 @@ def calibrate(frames: Sequence[StarFrame], camera_start: Camera, prior: LensPrio
     then residuals beyond 5 sigma are rejected, and the rest is fitted by least squares, whose covariance is returned.
     Raises ValueError in one line if the frames are malformed or do not determine the lens.
     """
+    checks.each_of_type("calibrate: frames", frames, StarFrame)
+    checks.of_type("calibrate: camera_start", camera_start, Camera)
+    checks.of_type("calibrate: prior", prior, LensPrior)
     sightings = _collect(frames)
     row = np.concatenate([np.arange(len(frame.xy_px)) for frame in frames])
     counts = np.array([len(frame.xy_px) for frame in frames])
@@ -167,6 +172,11 @@ def self_calibrate(
     Stops when a round identifies the same stars as the one before (an equal number is not enough), or has lost too
     many (MIN_STAR_FRACTION). Raises ValueError if no frame is identified.
     """
+    checks.each_of_type("self_calibrate: frames", frames, Centroids)
+    checks.of_type("self_calibrate: camera", camera, Camera)
+    checks.number("self_calibrate: exposure_s", exposure_s, 1e-12, 1e12, "finite, above 0")
+    if not callable(tracker):
+        raise ImageError(f"self_calibrate: tracker is {checks.excerpt(tracker)}; allowed: a function that makes one")
     best, most, previous_stars, estimate = None, 0, np.empty((0, 3)), camera
     for _ in range(rounds):
         identified = _identified(frames, tracker(estimate, focal_uncertainty), exposure_s)
@@ -189,6 +199,7 @@ def disagreement_px(camera: Camera, other: Camera, nodes: int = 41) -> float:
     x = np.linspace(-0.5, camera.width_px - 0.5, nodes)
     y = np.linspace(-0.5, camera.height_px - 0.5, nodes)
     xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    checks.of_type("other", other, Camera)
     rays = camera.rays(xy)
     R_other_from_camera, _ = kernel.wahba(other.rays(xy), rays, np.ones(len(xy)))
     return float(np.sqrt(np.mean(np.sum((other.pixels(rays @ R_other_from_camera.T) - xy) ** 2, axis=1))))
@@ -222,12 +233,14 @@ def _collect(frames: Sequence[StarFrame]) -> Sightings:
     if not frames:
         raise ValueError("calibrate: no frames; allowed: 1 or more, typically tens")
     for k, frame in enumerate(frames):
-        count = frame.xy_px.shape[0] if frame.xy_px.ndim else 0
-        shapes = [frame.xy_px.shape, frame.sigma_px.shape, frame.vectors_ref.shape]
+        arrays = [np.asarray(one) for one in (frame.xy_px, frame.sigma_px, frame.vectors_ref)]
+        shapes = [one.shape for one in arrays]
+        count = shapes[0][0] if shapes[0] else 0
         if shapes != [(count, 2), (count,), (count, 3)]:
             raise ValueError(f"calibrate: frame {k} has shapes {shapes}; allowed: (K, 2), (K,), (K, 3)")
-        finite = np.isfinite(frame.xy_px).all() and np.isfinite(frame.vectors_ref).all()
-        if not (finite and np.all((frame.sigma_px > 0) & (frame.sigma_px < np.inf))):
+        checks.unit_rows(f"calibrate: frame {k}: vectors_ref", arrays[2], count)
+        finite = np.isfinite(arrays[0]).all()
+        if not (finite and np.all((arrays[1] > 0) & (arrays[1] < np.inf))):
             raise ValueError(
                 f"calibrate: frame {k} has a pixel or direction that is not finite or a sigma_px not above 0"
             )

@@ -1,7 +1,8 @@
 """On-board star catalog: read a star list and compute apparent unit vectors, independently of the simulator.
 
-`read` parses an ECSV file, `apparent` applies proper motion, parallax, light deflection and aberration for an
-`Observer`, and `merge_doubles` replaces unresolved stars by one at their center of light.
+`read` parses an ECSV file, `StarCatalog.from_radec` takes arrays; `apparent` applies proper motion, parallax, light
+deflection and aberration for an `Observer`, and `merge_doubles` replaces unresolved stars by one at their center of
+light.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import erfa
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
 from estimator.core.errors import ImageError
 
@@ -46,6 +47,47 @@ class StarCatalog:
     def __len__(self) -> int:
         return len(self.id)
 
+    @classmethod
+    def read(cls, path: str | Path) -> StarCatalog:
+        """Read an ECSV file, as `skysim catalog build` writes it; see `catalog.read`."""
+        return read(path)
+
+    @classmethod
+    def from_radec(
+        cls,
+        ra_deg: ArrayLike,
+        dec_deg: ArrayLike,
+        v_mag: ArrayLike,
+        pm_ra_mas_yr: ArrayLike = 0.0,
+        pm_dec_mas_yr: ArrayLike = 0.0,
+        parallax_mas: ArrayLike = 0.0,
+        *,
+        epoch_yr: float = 2000.0,
+        id: ArrayLike | None = None,
+    ) -> StarCatalog:
+        """A catalog from arrays of any source, (N,) each: ICRS places at a Julian year, and magnitudes.
+
+        pm_ra_mas_yr : proper motion in right ascension times cos(dec), as Hipparcos and Gaia give it
+        id           : (N,) whole numbers; None: 1 to N in the order given
+
+        The stars are sorted by brightness. Raises ImageError for arrays of other lengths, places out of range, and
+        what looks like radians.
+        """
+        count = checks.native("catalog: v_mag", v_mag, np.float64).size
+        ra, dec, magnitude = (
+            _column(name, value, count, False)
+            for name, value in (("ra_deg", ra_deg), ("dec_deg", dec_deg), ("v_mag", v_mag))
+        )
+        motion = {"pm_ra_mas_yr": pm_ra_mas_yr, "pm_dec_mas_yr": pm_dec_mas_yr, "parallax_mas": parallax_mas}
+        pm_ra, pm_dec, parallax = (_column(name, value, count, True) for name, value in motion.items())
+        epoch_yr = checks.number("catalog: epoch_yr", epoch_yr, *EPOCHS_YR, "a Julian year of 1800 to 2200")
+        _check_places(ra, dec)
+        numbers = np.arange(1, count + 1) if id is None else checks.row_numbers("catalog: id", id, 2**63 - 1)
+        if len(numbers) != count:
+            raise ImageError(f"catalog: id has {len(numbers)} numbers; allowed: {count}, one a star")
+        stars = from_columns(numbers, np.radians(ra), np.radians(dec), pm_ra, pm_dec, parallax, magnitude, epoch_yr)
+        return stars.take(np.argsort(stars.v_mag, kind="stable"))
+
     def take(self, which: NDArray[Any]) -> StarCatalog:
         """Select stars by mask or index."""
         return replace(self, **{name: getattr(self, name)[which] for name in self.__slots__ if name != "epoch_yr"})
@@ -60,8 +102,65 @@ class Observer:
     velocity_m_s: Floats
 
 
+def _column(name: str, value: ArrayLike, count: int, one_for_all: bool) -> Floats:
+    """(count,) finite floats; one number for all stars where that is allowed. Raises ImageError otherwise."""
+    array = checks.native(f"catalog: {name}", value, np.float64)
+    if one_for_all and array.ndim == 0:
+        array = np.full(count, array)
+    checks.floats(f"catalog: {name}", array, (count,))
+    if not np.isfinite(array).all():
+        raise ImageError(f"catalog: {name} has a NaN or infinity in row {checks.first_bad(np.isfinite(array))}")
+    return array
+
+
+def _check_places(ra_deg: Floats, dec_deg: Floats) -> None:
+    """Raise ImageError for places out of range, and for a whole sky in the range of radians."""
+    for name, array, low, high in (("ra_deg", ra_deg, -360.0, 360.0), ("dec_deg", dec_deg, -90.0, 90.0)):
+        good = (array >= low) & (array <= high)
+        if not good.all():
+            value = array[checks.first_bad(good)]
+            raise ImageError(f"catalog: {name} is {value:g} in a row; allowed: {low:g} to {high:g} degrees")
+    turn, pole = 2 * np.pi + 1e-6, np.pi / 2 + 1e-6
+    if len(ra_deg) >= 20 and 5 < ra_deg.max() <= turn and np.ptp(dec_deg) > 1.2 and np.abs(dec_deg).max() <= pole:
+        raise ImageError(f"catalog: all ra_deg are below {turn:.4f} and dec_deg below {pole:.4f}; radians?")
+
+
+def checked(stars: object) -> StarCatalog:
+    """The catalog, if its columns are of one length, finite, and its vectors of unit length. Raises ImageError."""
+    checks.of_type("stars", stars, StarCatalog)
+    assert isinstance(stars, StarCatalog)
+    count = len(stars)
+    if count == 0:
+        raise ImageError("stars: the catalog is empty at this limiting magnitude; allowed: 3 stars or more")
+    checks.unit_rows("stars: vectors", stars.vectors, count)
+    checks.rows("stars: drift_rad_yr", stars.drift_rad_yr, count, 3)
+    for name in ("parallax_rad", "v_mag"):
+        _column(name, getattr(stars, name), count, False)
+    return stars
+
+
+def utc(date: object) -> datetime.datetime:
+    """A UTC time from ISO 8601 or a datetime, within EPOCHS_YR. Raises ImageError for anything else."""
+    try:
+        time = datetime.datetime.fromisoformat(date) if isinstance(date, str) else date
+    except ValueError:
+        raise ImageError(f"date: {date!r} is not ISO 8601; allowed: for example 2012-06-22T21:00") from None
+    if not isinstance(time, datetime.datetime) or not EPOCHS_YR[0] <= time.year < EPOCHS_YR[1]:
+        years = "{:g} to {:g}".format(*EPOCHS_YR)
+        raise ImageError(f"date: {checks.excerpt(date)}; allowed: a UTC date or datetime of {years}")
+    return time
+
+
 def on_earth(time_utc: datetime.datetime) -> Observer:
-    """Return the observer at the Earth's center at a UTC time (naive means UTC), from the IAU ephemeris `epv00`."""
+    """Return the observer at the Earth's center at a UTC time (naive means UTC), from the IAU ephemeris `epv00`.
+
+    Raises ImageError without the package pyerfa, which nothing else of the estimator needs.
+    """
+    try:
+        import erfa
+    except ImportError:
+        message = "a date needs pyerfa (pip install pyerfa); without it: StarTracker(camera, stars, vectors)"
+        raise ImageError(message) from None
     if time_utc.tzinfo is not None:
         time_utc = time_utc.astimezone(datetime.UTC).replace(tzinfo=None)
     # epv00 takes TDB; TT is within 2 ms of it.
@@ -88,12 +187,13 @@ COLUMNS = ("hip", "ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr", "paralla
 def hipparcos() -> StarCatalog:
     """The Hipparcos-2 subset to Hp 6.5 that comes with the package.
 
-    It is in data/catalogs beside the package in a checkout, and in skysim/data/catalogs of an installed one.
-    Raises ImageError where neither has it.
+    It is in data/catalogs beside the package in a checkout, in skysim/data/catalogs where skysim is installed, and in
+    estimator/data/catalogs where the estimator is installed alone. Raises ImageError where none of them has it.
     """
     root = Path(__file__).resolve().parents[2]
     name = "data/catalogs/hipparcos_hp6.5.ecsv"
-    return read(next((path for path in (root / name, root / "skysim" / name) if path.is_file()), root / name))
+    places = root / name, root / "skysim" / name, root / "estimator" / name
+    return read(next((path for path in places if path.is_file()), root / name))
 
 
 def columns(path: str | Path, names: Sequence[str], optional: Sequence[str] = ()) -> tuple[Floats, float]:
@@ -114,7 +214,7 @@ def columns(path: str | Path, names: Sequence[str], optional: Sequence[str] = ()
         table = np.loadtxt(body[1:], delimiter=delimiter, usecols=column_numbers, ndmin=2, converters=converters)
         if not np.isfinite(table[:, : len(names)]).all():
             raise ValueError("some numbers are not finite")
-    except (OSError, ValueError, IndexError) as error:
+    except (OSError, TypeError, ValueError, IndexError) as error:
         raise ImageError(
             f"{path}: not a star catalog ({error}); allowed: ECSV with {', '.join((*names, *optional))}"
         ) from None

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 
 from estimator.centroiding import disk_fit, moments, streak_fit
 from estimator.centroiding import gaussian_fit as gaussian
+from estimator.core import checks
 from estimator.core.arrays import Floats
+from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Blobs, Centroids, FramePriors
-from estimator.detection.detect import to_native
+from estimator.detection.detect import check_pixel_type, to_native
 
 # (image, blobs, gain_e_dn, priors): the gain, in electrons per unit of the image, determines the photon noise.
 Centroider = Callable[..., Centroids]
@@ -28,6 +30,7 @@ def cog(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePrior
     x = sum(I x) / sum(I), with var(x) = sum((I / g + noise^2) (x - x_mean)^2) / sum(I)^2 for a gain of g
     electrons per unit. Pixels closer to another blob's box are excluded.
     """
+    image = prepare(image, blobs, gain_e_dn, priors)
     return _to_centroids(_gravity_rows(image, blobs, gain_e_dn))
 
 
@@ -38,8 +41,9 @@ def weighted(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: Frame
     sum(4 I^2 (x - x_mean)^2 (I / g + noise^2)) / sum(I^2)^2 plus the mean square of the S-curve (the pixel-phase error)
     of the squared profile, which is narrower by the square root of 2.
     """
+    image = prepare(image, blobs, gain_e_dn, priors)
     sky = blobs.background
-    rows = moments.squared_light(to_native(image), blobs.box_px, sky.level, sky.noise, float(gain_e_dn))
+    rows = moments.squared_light(image, blobs.box_px, sky.level, sky.noise, float(gain_e_dn))
     return _to_centroids(rows)
 
 
@@ -51,10 +55,9 @@ def gaussian_window(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors
     the S-curve. The error is an eighth above the minimum, for faint and for bright stars. A blob for which the
     iteration does not converge keeps its center of gravity.
     """
+    image = prepare(image, blobs, gain_e_dn, priors)
     sky = blobs.background
-    rows = moments.gaussian_windowed(
-        to_native(image), blobs.xy_px, blobs.box_px, sky.level, sky.noise, float(gain_e_dn)
-    )
+    rows = moments.gaussian_windowed(image, blobs.xy_px, blobs.box_px, sky.level, sky.noise, float(gain_e_dn))
     return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
 
 
@@ -67,8 +70,8 @@ def gaussian_fit(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: F
     be 4/3 of the photon-noise limit. Saturated pixels are excluded: the wings determine the position. A blob that the
     model does not fit (no convergence, larger than the window) keeps its center of gravity.
     """
-    rows = _fit_gaussians(image, blobs, gain_e_dn, priors)
-    return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
+    image = prepare(image, blobs, gain_e_dn, priors)
+    return _gaussian_centroids(image, blobs, gain_e_dn, priors)
 
 
 def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS) -> Centroids:
@@ -81,10 +84,11 @@ def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePr
     A frame that is not smeared is passed to `gaussian_fit`. In a smeared frame, blobs that are not streaks are too;
     but if the streak is longer than half a round star's window, they keep their center of gravity.
     """
+    image = prepare(image, blobs, gain_e_dn, priors)
     streaks = _fit_streaks(image, blobs, gain_e_dn, priors)
     failed = np.isnan(streaks[:, 0])
     if failed.all():
-        return gaussian_fit(image, blobs, gain_e_dn, priors)
+        return _gaussian_centroids(image, blobs, gain_e_dn, priors)
     covariance = streaks[:, [5, 7, 7, 6]].reshape(-1, 2, 2)
     rows = streaks[:, [0, 1, 5, 2]]
     rows[:, 2] = np.sqrt((streaks[:, 5] + streaks[:, 6]) / 2)
@@ -102,6 +106,7 @@ def streak_ends(
     image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS
 ) -> tuple[Floats, Floats]:
     """Return (N, 2) and (N, 2): the two ends of each streak in arbitrary order; NaN for a blob that is not a streak."""
+    image = prepare(image, blobs, gain_e_dn, priors)
     rows = _fit_streaks(image, blobs, gain_e_dn, priors)
     return rows[:, :2] - rows[:, 3:5] / 2, rows[:, :2] + rows[:, 3:5] / 2
 
@@ -113,9 +118,10 @@ def disk(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePrio
     saturated disk is measured as accurately as any other; its saturated pixels are excluded. A blob that is too small
     or not a disk keeps its center of gravity.
     """
+    image = prepare(image, blobs, gain_e_dn, priors)
     sky = blobs.background
     rows = disk_fit.fit_all(
-        to_native(image),
+        image,
         blobs.xy_px,
         blobs.flux,
         blobs.area_px,
@@ -126,6 +132,23 @@ def disk(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePrio
         priors.saturation,
     )
     return _to_centroids(_with_fallback(rows[:, :4], image, blobs, gain_e_dn))
+
+
+def prepare(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> NDArray:
+    """Check a centroider's arguments, and convert the image to a type that compiled code accepts.
+
+    Raises ImageError for another type, a gain that is not above 0, or blobs beyond the image: the loops do not look.
+    """
+    check_pixel_type(image)
+    checks.of_type("blobs", blobs, Blobs)
+    checks.of_type("priors", priors, FramePriors)
+    checks.number("gain_e_dn", gain_e_dn, 1e-300, np.inf, "above 0; inf without photon noise")
+    if image.ndim != 2:
+        raise ImageError(f"an image of shape {image.shape}; allowed: monochrome, (height, width)")
+    edge = np.array([image.shape[1], image.shape[0]] * 2)
+    if len(blobs) and not (blobs.box_px.min() >= 0 and (blobs.box_px.max(axis=0) < edge).all()):
+        raise ImageError(f"blobs reach beyond the image of {image.shape[1]}x{image.shape[0]} pixels")
+    return to_native(image)
 
 
 CENTROIDERS: dict[str, Centroider] = {
@@ -139,11 +162,17 @@ CENTROIDERS: dict[str, Centroider] = {
 }
 
 
+def _gaussian_centroids(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> Centroids:
+    """Centroids of `gaussian_fit` in an image that is prepared."""
+    rows = _fit_gaussians(image, blobs, gain_e_dn, priors)
+    return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
+
+
 def _fit_gaussians(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> Floats:
     """Return the rows of `gaussian_fit.fit_all`."""
     sky = blobs.background
     return gaussian.fit_all(
-        to_native(image),
+        image,
         blobs.xy_px,
         blobs.flux,
         blobs.box_px,
@@ -162,7 +191,7 @@ def _fit_streaks(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePr
         return np.full((len(blobs), 8), np.nan)
     sky = blobs.background
     return streak_fit.fit_all(
-        to_native(image),
+        image,
         blobs.xy_px,
         blobs.box_px,
         sky.level,
@@ -181,7 +210,7 @@ def _frame_streak(blobs: Blobs, priors: FramePriors) -> tuple[float, float]:
 def _gravity_rows(image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:
     """Return the rows of `moments.center_of_gravity`."""
     sky = blobs.background
-    return moments.center_of_gravity(to_native(image), blobs.box_px, sky.level, sky.noise, float(gain_e_dn))
+    return moments.center_of_gravity(image, blobs.box_px, sky.level, sky.noise, float(gain_e_dn))
 
 
 def _with_fallback(rows: Floats, image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:

@@ -6,15 +6,29 @@ the distortion in closed form; back-projection (`Camera.rays`) inverts it by fix
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from estimator.core import checks
 from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
 Distortion = tuple[float, float, float, float, float]
+
+# Horizontal fields of view that `Camera.from_fov` takes: a number of degrees is beyond WIDEST_RAD as radians, and a
+# number of radians is below NARROWEST_DEG as degrees.
+WIDEST_RAD, NARROWEST_DEG = 2.7, 1.6
+COLORS = (1, 2, 3, 4)  # channels of a color image, with transparency, or of one that is gray already
+
+
+_FIELDS = f"fov_deg from {NARROWEST_DEG} to {math.degrees(WIDEST_RAD):.0f}, or fov_rad above 0 to {WIDEST_RAD}"
+
+
+def _is_finite_float(value: object) -> bool:
+    return type(value) is float and math.isfinite(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +39,8 @@ class Camera:
     center_px: principal point (x, y); the center of pixel (0, 0) is (0, 0)
     distortion: k1, k2, p1, p2, k3 in OpenCV's order
     focal_sigma: relative standard deviation of the focal length: the error of a calibration, the same in every frame
+
+    Raises ImageError for numbers that no camera has.
     """
 
     width_px: int
@@ -34,6 +50,37 @@ class Camera:
     distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
     focal_sigma: float = 0.0
 
+    def __post_init__(self) -> None:
+        if self._is_plain():
+            return
+        for name in ("width_px", "height_px"):
+            size = checks.number(f"camera: {name}", getattr(self, name), 1, 1e6, "whole, 1 to 1e6", True)
+            object.__setattr__(self, name, size)
+        focal = checks.number("camera: focal_px", self.focal_px, 1e-9, 1e12, "finite, above 0: focal length over pixel")
+        object.__setattr__(self, "focal_px", focal)
+        sigma = checks.number("camera: focal_sigma", self.focal_sigma, 0.0, 0.5, "0 to 0.5, relative")
+        object.__setattr__(self, "focal_sigma", sigma)
+        # Plain floats: compiled code would be compiled again for a tuple of integers.
+        for name, count in (("center_px", 2), ("distortion", 5)):
+            array = checks.floats(f"camera: {name}", getattr(self, name), (count,))
+            if not np.isfinite(array).all():
+                raise ImageError(f"camera: {name} is {array.tolist()}; allowed: {count} finite numbers")
+            object.__setattr__(self, name, tuple(array.tolist()))
+
+    def _is_plain(self) -> bool:
+        """Whether all numbers are possible ones of the declared types; a lens fit makes a hundred cameras."""
+        size, lens = (self.width_px, self.height_px), (self.center_px, self.distortion)
+        if not (type(lens[0]) is type(lens[1]) is tuple and len(lens[0]) == 2 and len(lens[1]) == 5):
+            return False
+        numbers = (self.focal_px, self.focal_sigma, *lens[0], *lens[1])
+        return (
+            all([type(one) is int and 0 < one <= 1e6 for one in size])
+            and all([type(one) is float for one in numbers])
+            and math.isfinite(sum(numbers))
+            and 1e-9 <= self.focal_px <= 1e12
+            and 0 <= self.focal_sigma <= 0.5
+        )
+
     @classmethod
     def from_fov(
         cls, width_px: int, height_px: int, fov_rad: float | None = None, *, fov_deg: float | None = None
@@ -41,12 +88,22 @@ class Camera:
         """An undistorted camera from its horizontal field of view, in radians or in degrees.
 
         The field is the angle between the centers of the edge columns: f = (width - 1) / 2 / tan(fov / 2).
-        Raises ImageError unless exactly one of the two is given.
+        Raises ImageError unless exactly one of the two is given, and for what is in the other's range: fov_rad above
+        WIDEST_RAD, fov_deg below NARROWEST_DEG.
         """
-        if fov_deg is not None and fov_rad is None:
-            fov_rad = float(np.radians(fov_deg))
-        elif fov_rad is None or fov_deg is not None:
+        if (fov_rad is None) == (fov_deg is None):
             raise ImageError("from_fov: takes either fov_rad or fov_deg")
+        if fov_deg is None:
+            fov_rad = checks.number("from_fov: fov_rad", fov_rad, -math.inf, math.inf, _FIELDS)
+            if not 0 < fov_rad <= WIDEST_RAD:
+                raise ImageError(f"from_fov: {checks.angle_guess('fov', fov_rad)} allowed: {_FIELDS}")
+        else:
+            fov_deg = checks.number("from_fov: fov_deg", fov_deg, -math.inf, math.inf, _FIELDS)
+            if not NARROWEST_DEG <= fov_deg <= math.degrees(WIDEST_RAD):
+                guess = "; radians?" if 0 < fov_deg < NARROWEST_DEG else ";"
+                raise ImageError(f"from_fov: fov_deg is {fov_deg:g}{guess} allowed: {_FIELDS}")
+            fov_rad = math.radians(fov_deg)
+        width_px = checks.number("from_fov: width_px", width_px, 2, 1e6, "2 pixels or more", True)
         focal_px = (width_px - 1) / 2 / np.tan(fov_rad / 2)
         return cls(width_px, height_px, float(focal_px), ((width_px - 1) / 2, (height_px - 1) / 2))
 
@@ -75,13 +132,14 @@ class Camera:
 
     def tangents(self, xy_px: Floats) -> Floats:
         """Convert (N, 2) pixels to (N, 2) tangents (x / z, y / z) in camera axes, without distortion."""
-        return undistorted(np.asarray(xy_px, dtype=float), self.focal_px, *self.center_px, self.distortion)
+        return undistorted(checks.floats("xy_px", xy_px, (None, 2)), self.focal_px, *self.center_px, self.distortion)
 
     def pixels(self, vectors_cam: Floats) -> Floats:
         """Project (N, 3) vectors in camera axes to (N, 2) pixels.
 
         NaN for a vector behind the camera or beyond the angle at which the radial distortion folds back.
         """
+        vectors_cam = checks.floats("vectors_cam", vectors_cam, (None, 3))
         z = np.where(vectors_cam[:, 2] > 0, vectors_cam[:, 2], np.nan)
         tangent = vectors_cam[:, :2] / z[:, None]
         tangent[np.sum(tangent**2, axis=1) >= self._fold()] = np.nan
@@ -89,7 +147,7 @@ class Camera:
 
     def contains(self, xy_px: Floats, margin_px: float = 0.0) -> np.ndarray:
         """Return (N,) whether each pixel position is on the sensor, shrunk by the margin on every side."""
-        x, y = xy_px[:, 0], xy_px[:, 1]
+        x, y = checks.floats("xy_px", xy_px, (None, 2)).T
         low, right = margin_px - 0.5, self.width_px - 0.5 - margin_px
         bottom = self.height_px - 0.5 - margin_px
         return (x >= low) & (x <= right) & (y >= low) & (y <= bottom)
@@ -155,8 +213,21 @@ def undistorted(
     return out
 
 
-def check_shape(image_shape: tuple[int, ...], camera: Camera) -> None:
-    """Raise ImageError unless the image has the camera's width and height."""
-    if image_shape != (camera.height_px, camera.width_px):
-        size = "x".join(map(str, image_shape[1::-1])) if len(image_shape) >= 2 else image_shape
-        raise ImageError(f"the image is {size} pixels; this camera's are {camera.width_px}x{camera.height_px}")
+def check_frame(image: object, camera: Camera) -> None:
+    """Raise ImageError unless the image is a monochrome array of the camera's width and height."""
+    if not isinstance(image, np.ndarray):
+        reason = " (cv2.imread answers None for a file that it cannot read)" if image is None else ""
+        raise ImageError(f"the image is a {type(image).__name__}{reason}; allowed: a numpy array, (height, width)")
+    if isinstance(image, np.ma.MaskedArray) and np.ma.is_masked(image):
+        raise ImageError("the image has masked pixels; allowed: image.filled(...), and the mask as Settings.bad_px")
+    shape, wanted = image.shape, (camera.height_px, camera.width_px)
+    if shape == wanted:
+        return
+    if len(shape) == 3 and (shape[2] in COLORS or shape[0] in COLORS):
+        channels, axis = (shape[2], 2) if shape[2] in COLORS else (shape[0], 0)
+        raise ImageError(
+            f"the image has {channels} channels {shape}; allowed: monochrome, for example image.mean(axis={axis})"
+        )
+    size = f"{shape[1]}x{shape[0]} pixels" if len(shape) == 2 else f"of shape {shape}"
+    turned = "; transposed?" if shape == wanted[::-1] else ""
+    raise ImageError(f"the image is {size}{turned}; this camera's are {camera.width_px}x{camera.height_px}")

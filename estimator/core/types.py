@@ -9,8 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
+from estimator.core.jit import jit
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,10 +23,17 @@ class FramePriors:
     streak_px  : (dx, dy) by which stars move over the sensor during the exposure, from the gyro; None if unknown.
         The sign does not matter: a streak looks the same in either direction
     saturation : smallest value of a saturated pixel
+
+    Raises ImageError for what are no such numbers.
     """
 
     streak_px: tuple[float, float] | None = None
     saturation: float = float("inf")
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "streak_px", checks.pixel_step("streak_px", self.streak_px))
+        least = checks.number("saturation", self.saturation, -np.inf, np.inf, "a number; inf if unknown")
+        object.__setattr__(self, "saturation", least)
 
 
 NO_PRIORS = FramePriors()
@@ -76,18 +86,39 @@ class Blobs:
 
 @dataclass(frozen=True, slots=True)
 class Centroids:
-    """Measured positions of the blobs, brightest first.
+    """Measured positions of the blobs, brightest first: the search begins with the first ones.
 
-    xy_px    : (N, 2)
+    xy_px    : (N, 2) x to the right and y down; the center of the first pixel is (0, 0)
     sigma_px : (N,) standard deviation per coordinate; the root of the mean variance where x and y differ
-    flux     : (N,) above the background
+    flux     : (N,) above the background, in any unit
     covariance_px2 : (N, 2, 2) from a centroider that models x and y separately (streaks), else None
+
+    Any array of numbers is taken; it is kept as C-contiguous float64. Raises ImageError for other shapes, or for arrays
+    of different lengths; the numbers are checked by whoever solves them (`check_values`).
     """
 
     xy_px: Floats
     sigma_px: Floats
     flux: Floats
     covariance_px2: Floats | None = None
+
+    def __post_init__(self) -> None:
+        xy_px = checks.floats("centroids: xy_px", self.xy_px, (None, 2))
+        object.__setattr__(self, "xy_px", xy_px)
+        for name in ("sigma_px", "flux"):
+            object.__setattr__(self, name, checks.floats(f"centroids: {name}", getattr(self, name), (len(xy_px),)))
+        if self.covariance_px2 is not None:
+            spread = checks.floats("centroids: covariance_px2", self.covariance_px2, (len(xy_px), 2, 2))
+            object.__setattr__(self, "covariance_px2", spread)
+
+    def check_values(self) -> None:
+        """Raise ImageError unless positions are finite, sigmas in their range and fluxes above 0; in a microsecond."""
+        spread = self.covariance_px2
+        row, fault = _first_fault(self.xy_px, self.sigma_px, self.flux, NO_SPREAD if spread is None else spread)
+        if fault:
+            name, allowed = FAULTS[fault]
+            value = np.asarray(getattr(self, name)[row]).tolist()
+            raise ImageError(f"centroids: {name} of row {row} is {value}; allowed: {allowed}")
 
     def __len__(self) -> int:
         return len(self.flux)
@@ -112,6 +143,33 @@ class Centroids:
         excess = sigma_px**2 - self.sigma_px**2
         xx, yy, xy = (self.covariance_px2[:, i, j] + excess * (i == j) for i, j in ((0, 0), (1, 1), (0, 1)))
         return np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None]
+
+
+NO_SPREAD = np.empty((0, 2, 2))
+MAX_SIGMA_PX = 20.0  # with less accurate lights every star is a candidate for each: a search would take minutes
+FAULTS = {  # by the number that `_first_fault` returns
+    1: ("xy_px", "finite numbers"),
+    2: ("sigma_px", f"above 0, up to {MAX_SIGMA_PX:g}"),
+    3: ("flux", "finite, above 0"),
+    4: ("covariance_px2", "symmetric and positive definite"),
+}
+
+
+@jit
+def _first_fault(xy_px: Floats, sigma_px: Floats, flux: Floats, spread_px2: Floats) -> tuple[int, int]:
+    """Row and number of the first fault of centroids, as in FAULTS; (0, 0) without one."""
+    for n in range(len(xy_px)):
+        if not (abs(xy_px[n, 0]) < np.inf and abs(xy_px[n, 1]) < np.inf):
+            return n, 1
+        if not 0 < sigma_px[n] <= MAX_SIGMA_PX:
+            return n, 2
+        if not 0 < flux[n] < np.inf:
+            return n, 3
+    for n in range(len(spread_px2)):
+        xx, xy, yx, yy = spread_px2[n, 0, 0], spread_px2[n, 0, 1], spread_px2[n, 1, 0], spread_px2[n, 1, 1]
+        if not (0 < xx < np.inf and 0 < yy < np.inf and xx * yy > xy * xy and abs(xy - yx) <= 1e-6 * abs(xy)):
+            return n, 4
+    return 0, 0
 
 
 @dataclass(frozen=True, slots=True)

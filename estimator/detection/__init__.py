@@ -1,11 +1,11 @@
 """Frame to blobs: background, thresholding, connected components, and blob classification."""
 
-import lazy_loader
+from estimator.core.lazy import attach
 
 # Loaded on first use: importing one module of the package does not import the others.
-__getattr__, __dir__, __all__ = lazy_loader.attach(
+__getattr__, __dir__, __all__ = attach(
     __name__,
-    submod_attrs={
+    {
         "classify": ["Flag"],
         "detect": ["DETECTORS"],
     },

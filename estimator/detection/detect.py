@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.core.arrays import Floats, Ints
+from estimator.core.checks import native, number, of_type
 from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Background, Blobs, FramePriors
 from estimator.detection import classify
@@ -54,7 +55,8 @@ def default(
     brightest blobs share; otherwise, if few stars were found, the direction in which most streaks are found. Streaks
     longer than MAX_STREAK_PX are detected with the filter for round stars.
     """
-    image = prepare_image(image)
+    image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
+    of_type("priors", priors, FramePriors)
     background = estimate_background(image)
     if priors.streak_px is None or not 2 <= max(map(abs, priors.streak_px)) <= MAX_STREAK_PX:
         blobs = detect_blobs(image, background, threshold_sigma * background.noise, min_area_px, max_blobs, GROW_SIGMA)
@@ -82,7 +84,7 @@ def local(
     priors: FramePriors = NO_PRIORS,
 ) -> Blobs:
     """Detect blobs `threshold_sigma` above the local sky after a 3x3 binomial filter."""
-    image = prepare_image(image)
+    image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
     background = estimate_background(image)
     return detect_blobs(image, background, threshold_sigma * background.noise, min_area_px, max_blobs)
 
@@ -95,7 +97,7 @@ def components(
     priors: FramePriors = NO_PRIORS,
 ) -> Blobs:
     """Detect blobs above a global threshold: the frame's median sky plus `threshold_sigma` times its noise."""
-    image = prepare_image(image)
+    image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
     flat = flat_background(estimate_background(image), image.shape)
     return detect_blobs(image, flat, threshold_sigma * flat.noise, min_area_px, max_blobs)
 
@@ -112,7 +114,9 @@ def thesis(
     Full scale is the saturation in the priors, otherwise the maximum of the integer type. `threshold_sigma` and
     `min_area_px` are ignored: the thesis has two fixed thresholds. Raises ImageError for floats of unknown scale.
     """
-    pixel, image = image.dtype, prepare_image(image)
+    check_pixel_type(image)
+    pixel, image = image.dtype, prepare_image(image, threshold_sigma, min_area_px, max_blobs)
+    of_type("priors", priors, FramePriors)
     full_scale = priors.saturation
     if not np.isfinite(full_scale):
         if pixel.kind != "u":
@@ -163,16 +167,18 @@ DETECTORS: dict[str, Detector] = {
 }
 
 
-def prepare_image(image: NDArray) -> NDArray:
-    """Check the image and convert it to a type that compiled code accepts."""
+def prepare_image(image: NDArray, threshold_sigma: float = 5.0, min_area_px: int = 3, max_blobs: int = 200) -> NDArray:
+    """Check a detector's image and parameters, and convert the image to a type that compiled code accepts."""
+    number("detector: threshold_sigma", threshold_sigma, 1e-9, 1e9, "finite, above 0")
+    number("detector: min_area_px", min_area_px, 1, 1e9, "whole, 1 or more", True)
+    number("detector: max_blobs", max_blobs, 1, 1e9, "whole, 1 or more", True)
     check_image(image)
     return to_native(image)
 
 
 def check_image(image: NDArray) -> None:
     """Raise ImageError with one line unless the image is a finite, non-constant (H, W) array of real numbers."""
-    if image.dtype.kind not in "buif":
-        raise ImageError(f"pixels of type {image.dtype} are not real numbers; allowed: integers and floats")
+    check_pixel_type(image)
     if image.ndim != 2:
         raise ImageError(f"an image of shape {image.shape}; allowed: monochrome, (height, width)")
     check_size(image)
@@ -186,17 +192,39 @@ def check_image(image: NDArray) -> None:
         raise ImageError(f"the frame is empty: every pixel is {low}")
 
 
+def check_pixel_type(image: object) -> None:
+    """Raise ImageError unless the image is an array of real numbers."""
+    if not isinstance(image, np.ndarray):
+        raise ImageError(f"the image is a {type(image).__name__}; allowed: a numpy array, (height, width)")
+    if image.dtype.kind not in "buif":
+        raise ImageError(f"pixels of type {image.dtype} are not real numbers; allowed: integers and floats")
+
+
 def to_native(image: NDArray) -> NDArray:
     """Convert the image, without loss, to one of the three types for which the loops are compiled.
 
     uint16 stays as it is; uint8 and masks become uint16, other integers int32 if their values fit, all else float64.
-    Each further type would cost its user half a minute of compilation. FITS files are big-endian, loops are native.
+    Each further type, order of the axes or protection would cost its user half a minute of compilation. FITS files are
+    big-endian, loops are native.
     """
-    if image.dtype.kind in "bu" and image.itemsize <= 2:
-        return image.astype(np.uint16, copy=False)
+    kind, size = image.dtype.kind, image.itemsize
+    if kind in "bu" and size <= 2:
+        return native("the image", image, np.uint16)
     limits = np.iinfo(np.int32)
-    fits_int32 = image.dtype.kind in "iu" and limits.min <= image.min() and image.max() <= limits.max
-    return image.astype(np.int32 if fits_int32 else np.float64, copy=False)
+    fits_int32 = kind == "i" and size <= 4
+    if kind in "iu" and not fits_int32:
+        fits_int32 = bool(limits.min <= image.min() and image.max() <= limits.max)
+    return native("the image", image, np.int32 if fits_int32 else np.float64)
+
+
+def in_row_order(image: NDArray) -> NDArray:
+    """The image as compiled loops take it, row by row in native bytes, with its own type; a copy only if needed.
+
+    A frame is put in order once, before the stages of which each would do it again. Raises ImageError for what holds no
+    real numbers.
+    """
+    check_pixel_type(image)
+    return native("the image", image, image.dtype.newbyteorder("="))
 
 
 def check_size(image: NDArray) -> None:
@@ -329,7 +357,7 @@ def _scan(
     max_blobs: int,
 ) -> Blobs:
     """Run one of SHEFEX's scans and convert its table to Blobs."""
-    image = prepare_image(image)
+    image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
     flat = flat_background(estimate_background(image), image.shape)
     level, noise = float(flat.level[0, 0]), float(flat.noise[0, 0]) / FILTERED_NOISE
     boxes, sums = scan(image, level, level + threshold_sigma * noise, min_area_px, max_blobs)

@@ -1,4 +1,10 @@
-"""SHEFEX-2's two scans of a frame: one sequential pass with a sorted table, or a repeated search for the maximum."""
+"""SHEFEX-2's two scans of a frame: one sequential pass with a sorted table, or a repeated search for the maximum.
+
+Both scans threshold the raw pixels at one level for the frame and collect each object by flood fill. The sequential
+scan passes over the frame once and inserts each object into a table sorted by brightness, which keeps the brightest.
+The maximum scan looks for the greatest pixel of the whole frame, takes its object away, and begins again: one pass for
+each object.
+"""
 
 from __future__ import annotations
 

@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc, chdtri
 
+from estimator.core import checks
 from estimator.core.arrays import Floats
 from estimator.core.types import FilterState
 from estimator.filter.checks import checked_covariances, checked_samples, not_negative
@@ -145,6 +146,9 @@ class AttitudeFilter:
         jumps: JumpModel | None = None,
         considered: tuple[str, ...] = CONSIDERED,
     ) -> None:
+        checks.of_type("filter: gyro", gyro, GyroModel)
+        checks.one_rotation("filter: body_from_ref", body_from_ref)
+        t_s = checks.number("filter: t_s", t_s, -1e300, 1e300, "a finite time in seconds")
         self._gyro, self._tracker, self._jumps = gyro, tracker or TrackerModel(), jumps or JumpModel()
         self._floor_rad2 = not_negative("floor_rad", floor_rad) ** 2
         # The chi-square of 3 degrees of freedom with the tail probability of gate_sigma for a scalar Gaussian.
@@ -234,6 +238,8 @@ class AttitudeFilter:
         Raises ValueError for a covariance that is not symmetric and positive definite, a systematic part that is not
         less, or a time after the last sample.
         """
+        checks.one_rotation("update: body_from_ref_measured", body_from_ref_measured)
+        t_s = checks.number("update: t_s", t_s, -math.inf, math.inf, "a time in seconds")
         now_s = self._current.t_s
         solution = self._solution(body_from_ref_measured, covariance_rad2, systematic_rad2)
         if not t_s <= now_s + ROUNDING_S:

@@ -9,6 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 
+import numpy as np
+
+from estimator.core import checks
+
 STATES = ("bias", "scale", "misalignment", "mounting", "systematic")
 CONSIDERED = ("mounting", "systematic")
 
@@ -94,6 +98,7 @@ def _check(model: GyroModel | TrackerModel, what: str, above_0: tuple[str, ...])
     """Raise ValueError unless the named fields are above 0 (inf too) and the others finite and 0 or more."""
     for field in fields(model):
         value = getattr(model, field.name)
+        checks.of_type(f"{what}: {field.name}", value, float, int, np.floating, np.integer)
         if field.name in above_0 and not value > 0:
             raise ValueError(f"{what}: {field.name} is {value}; allowed: above 0, also inf")
         if field.name not in above_0 and not 0 <= value < math.inf:

@@ -1,4 +1,8 @@
-"""Optional parameters common to all identification methods."""
+"""Optional parameters common to all identification methods.
+
+The published methods differ in what they need: a magnitude, a prior direction, a tolerance. All are called with the
+same keywords, of which each method uses its own, so that one can be put in the place of another.
+"""
 
 from __future__ import annotations
 

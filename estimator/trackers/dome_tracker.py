@@ -10,13 +10,14 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude import systematic
-from estimator.attitude.dome_map import LedMap, Lever, check_lever, on_sphere, project
+from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, on_sphere, project
 from estimator.attitude.nearfield import SOLVERS, fitted_sigma_rad
 from estimator.catalog import pair_index
+from estimator.core import checks
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids, StarMatch
@@ -25,7 +26,16 @@ from estimator.identification.leds import search
 from estimator.identification.leds.index import build_dome_index, corner_rays, inner_field
 from estimator.identification.leds.search import NO_MATCH
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
-from estimator.trackers.pipeline import Clock, Report, Settings, brightest, direction_sigma_rad, process_frame
+from estimator.trackers import warm_up
+from estimator.trackers.pipeline import (
+    Clock,
+    Report,
+    Settings,
+    brightest,
+    check_algorithms,
+    direction_sigma_rad,
+    process_frame,
+)
 from estimator.trackers.refinement import mutual_nearest
 from estimator.trackers.star_tracker import NO_STARS
 
@@ -103,7 +113,7 @@ class DomeTracker:
     """Lost-in-space tracker under an LED dome, with the camera on a lever arm about the bearing center.
 
     cam_from_ref of the result is cam_from_lab; `lever` converts it to the vehicle's attitude. Raises ImageError if
-    the lever is longer than the dome is wide, or if there are too few LEDs.
+    the lever is longer than the dome is wide, if there are too few LEDs, or for anything that is not as described.
     """
 
     def __init__(
@@ -113,6 +123,9 @@ class DomeTracker:
         lever: Lever,
         settings: Settings = SETTINGS,
     ) -> None:
+        checks.of_type("camera", camera, Camera)
+        check_algorithms(settings, IDENTIFIERS, SOLVERS)
+        check_map(leds)
         check_lever(leds, lever)
         self.camera, self.leds, self.lever, self.settings = camera, leds, lever, settings
         self.identify = IDENTIFIERS[settings.identifier](camera, leds, lever, settings)
@@ -125,8 +138,27 @@ class DomeTracker:
         """
         return process_frame(image, self.camera, self.settings, self.solve_centroids, streak_px)
 
+    def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
+        """Compile all that `solve` and `solve_centroids` use: call it before the experiment.
+
+        It takes up to a minute once, and a second where numba finds its code on disk.
+        dtype : of the frames' pixels
+        """
+        fields = []
+        for toward_m in self.leds.position_m[:: max(len(self.leds.position_m) // 40, 1)]:
+            cam_from_lab, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [toward_m])
+            xy_px = project(
+                self.lever.cam_from_body.inv() * cam_from_lab, self.leds.position_m, self.lever, self.camera
+            )
+            fields.append(xy_px[self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), 2.0)])
+        xy_px = max(fields, key=len)
+        warm_up.run(self.camera, xy_px, np.ones(len(xy_px)), dtype, self.solve)
+        self.solve_centroids(Centroids(xy_px, np.full(len(xy_px), 0.1), np.ones(len(xy_px))))
+
     def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
         """Identify and solve centroids from any source (the truth included)."""
+        checks.of_type("centroids", centroids, Centroids)
+        centroids.check_values()
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
             return Attitude(NO_STARS)

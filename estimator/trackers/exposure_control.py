@@ -19,9 +19,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.core import checks
 from estimator.core.arrays import Ints
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
+from estimator.detection.detect import check_pixel_type, to_native
 
 # The camera's own range and increment (table 1).
 CAMERA_SHORTEST_S, CAMERA_LONGEST_S = 10e-6, 10.0
@@ -50,6 +52,10 @@ class Control:
     saturated_px: int = 1
 
     def __post_init__(self) -> None:
+        for name in ("mean_dn", "shortest_s", "longest_s", "step_s"):
+            checks.of_type(f"exposure: {name}", getattr(self, name), float, int, np.floating, np.integer)
+        for name in ("min_stars", "overexposed_objects", "saturated_px"):
+            checks.number(f"exposure: {name}", getattr(self, name), 0, 1e9, "whole, 0 or more", True)
         if not CAMERA_SHORTEST_S <= self.shortest_s <= self.longest_s <= CAMERA_LONGEST_S:
             raise ValueError(
                 f"exposure: limits of {self.shortest_s:g} s and {self.longest_s:g} s; allowed: "
@@ -102,12 +108,20 @@ def observe(image: NDArray, box_px: Ints, saturation_dn: float, control: Control
 
     Raises ImageError for boxes outside of the image.
     """
-    boxes = np.asarray(box_px, dtype=np.int64).reshape(-1, 4)
+    checks.of_type("exposure: control", control, Control)
+    check_pixel_type(image)
+    if image.ndim != 2:
+        raise ImageError(f"exposure: an image of shape {image.shape}; allowed: monochrome, (height, width)")
+    saturation_dn = checks.number("exposure: saturation_dn", saturation_dn, -math.inf, math.inf, "a number")
+    boxes = checks.native("exposure: box_px", box_px, np.int64)
+    if boxes.size % 4:
+        raise ImageError(f"exposure: box_px has shape {boxes.shape}; allowed: (N, 4)")
+    boxes = boxes.reshape(-1, 4)
     height, width = image.shape
     x0, y0, x1, y1 = boxes.T
     if not ((x0 >= 0) & (y0 >= 0) & (x1 < width) & (y1 < height)).all():
         raise ImageError(f"exposure: an object's box reaches beyond the image of {width}x{height} pixels")
-    mean, overexposed = _measure(image, boxes, float(saturation_dn), control.saturated_px)
+    mean, overexposed = _measure(to_native(image), boxes, saturation_dn, control.saturated_px)
     return Observation(mean, len(boxes), overexposed)
 
 

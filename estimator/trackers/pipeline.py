@@ -1,21 +1,30 @@
-"""Settings and processing stages common to all trackers: detection, centroiding, timing."""
+"""Settings and processing stages common to all trackers: detection, centroiding, timing.
+
+A frame passes through four stages, each a function named in `Settings`: detect (frame to blobs), centroid (blobs to
+positions with errors), identify (positions to stars or LEDs) and solve (matches to an attitude). Here are the first
+two. Blobs that cannot be stars (hot pixels, tracks, the Moon, texture) or touch the border are dropped, saturated ones
+get a greater error, and centroids that are too inaccurate to tell one star from another are left out.
+"""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.centroiding.centroid import CENTROIDERS
+from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
-from estimator.core.camera import Camera, check_shape
+from estimator.core.camera import Camera, check_frame
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Blobs, Centroids, FramePriors
 from estimator.detection.classify import NO_STAR, Flag
-from estimator.detection.detect import DETECTORS, replace_bad_pixels
+from estimator.detection.detect import DETECTORS, in_row_order, replace_bad_pixels
 
 SATURATED = "the frame is saturated"
 # Extra centroid error of a saturated blob, whose plateau has edges at whole pixels. Monte Carlo: 0.01 to 0.07 px, more
@@ -23,6 +32,36 @@ SATURATED = "the frame is saturated"
 SATURATED_SIGMA_PX = 0.05
 MAX_CENTROID_SIGMA_PX = 5.0  # less accurate centroids are dropped: they could match any star
 BAD_PIXEL_SIGMA_PX = 0.06  # extra error of a centroid on an interpolated bad pixel, from Monte Carlo
+
+
+class Allowed(NamedTuple):
+    """The allowed values of a setting: low to high, in words, and whether they are whole numbers."""
+
+    low: float
+    high: float
+    words: str
+    whole: bool = False
+
+
+TINY, GREATEST = 1e-300, 1e300
+POSITIVE = Allowed(TINY, GREATEST, "finite, above 0")
+NOT_NEGATIVE = Allowed(0.0, GREATEST, "finite, 0 or more")
+COUNT = Allowed(1, 1e9, "whole, 1 or more", True)
+ALLOWED = {
+    "threshold_sigma": POSITIVE,
+    "min_area_px": COUNT,
+    "max_blobs": COUNT,
+    "gain_e_dn": Allowed(TINY, math.inf, "above 0; inf without photon noise"),
+    "saturation": Allowed(TINY, math.inf, "above 0; inf if unknown"),
+    "centroid_sigma_px": NOT_NEGATIVE,
+    "base_stars": COUNT,
+    "searched_stars": COUNT,
+    "field_stars": POSITIVE,
+    "merge_px": NOT_NEGATIVE,
+    "magnitude_sigma": POSITIVE,
+    "missed_dex": NOT_NEGATIVE,
+    "reject": Allowed(0, int(max(Flag)) * 2 - 1, "bits of detection.classify.Flag", True),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +78,9 @@ class Settings:
     missed_dex        : see `identification.options.Options`
     reject            : flags of `detection.classify.Flag` that exclude a blob
     bad_px            : (K, 2) x and y of the sensor's bad pixels; None without a map
+
+    Raises ImageError for a number that cannot be used, and for an unknown keyword. The algorithms' names are checked by
+    the tracker (`check_algorithms`): a dome has others than the sky.
     """
 
     detector: str = "default"
@@ -60,6 +102,39 @@ class Settings:
     missed_dex: float = 0.5
     reject: int = int(NO_STAR)
     bad_px: Ints | None = field(default=None, compare=False)
+
+    def __new__(cls, *args: Any, **named: Any) -> Settings:
+        for name in named:
+            checks.known("settings", name, cls.__slots__)
+        return object.__new__(cls)
+
+    def __post_init__(self) -> None:
+        for name, allowed in ALLOWED.items():
+            value = getattr(self, name)
+            value = checks.number(f"settings: {name}", value, allowed.low, allowed.high, allowed.words, allowed.whole)
+            object.__setattr__(self, name, value)  # a plain float or int, which compiled code knows
+        if self.zero_point_mag is not None:
+            zero = checks.number("settings: zero_point_mag", self.zero_point_mag, -100, 100, "-100 to 100, or None")
+            object.__setattr__(self, "zero_point_mag", zero)
+        if self.bad_px is not None:
+            bad = np.asarray(self.bad_px)
+            if bad.ndim != 2 or bad.shape[1] != 2 or (bad.size and bad.dtype.kind not in "iu"):
+                raise ImageError(
+                    f"settings: bad_px has shape {bad.shape} of {bad.dtype}; allowed: (K, 2) whole numbers"
+                )
+
+
+def check_algorithms(settings: Settings, identifiers: Iterable[str], solvers: Iterable[str]) -> None:
+    """Raise ImageError unless each stage's algorithm is there; identifiers and solvers are those of the tracker."""
+    checks.of_type("settings", settings, Settings)
+    stages: dict[str, Iterable[str]] = {
+        "detector": DETECTORS,
+        "centroider": CENTROIDERS,
+        "identifier": identifiers,
+        "solver": solvers,
+    }
+    for stage, names in stages.items():
+        checks.known(f"settings: {stage}", getattr(settings, stage), names)
 
 
 @dataclass(slots=True)
@@ -96,7 +171,8 @@ def detect_and_centroid(
     streak_px : (dx, dy) that stars move during the exposure, from the gyro; None if unknown
     Raises ImageError for a frame of another shape than the camera's, or a saturated one.
     """
-    check_shape(image.shape, camera)
+    check_frame(image, camera)
+    image, streak_px = in_row_order(image), checks.pixel_step("streak_px", streak_px)
     if np.isfinite(settings.saturation):
         sample = image[::37]  # every 37th row is enough to estimate the saturated fraction
         if np.count_nonzero(sample >= settings.saturation) > 0.5 * sample.size:
@@ -114,7 +190,9 @@ def detect_and_centroid(
     centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, priors)
     centroids = inflate_uncertainty(centroids, blobs, settings)
     clock.lap("centroid")
-    valid = camera.contains(centroids.xy_px) & (centroids.sigma_px < MAX_CENTROID_SIGMA_PX) & (centroids.flux > 0)
+    sigma_px = centroids.sigma_px
+    valid = camera.contains(centroids.xy_px) & (sigma_px > 0) & (sigma_px < MAX_CENTROID_SIGMA_PX)
+    valid &= (centroids.flux > 0) & (centroids.flux < np.inf)
     return centroids if valid.all() else centroids.take(valid)
 
 

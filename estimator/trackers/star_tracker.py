@@ -12,27 +12,28 @@ from __future__ import annotations
 
 import datetime
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.attitude.systematic import with_focal_error
 from estimator.catalog import catalog, pair_index, quad_index, sky_index
+from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
-from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.chance import (
     MIN_EVIDENCE_MATCHES,
 )
 from estimator.identification.stars import quads, search
 from estimator.identification.stars.evidence import Detections, Solution
-from estimator.trackers.pipeline import Clock, Report, Settings, brightest, process_frame
+from estimator.trackers import warm_up
+from estimator.trackers.pipeline import Clock, Report, Settings, brightest, check_algorithms, process_frame
 from estimator.trackers.refinement import NO_MATCH, FieldMatcher
 
 NO_STARS = "too few stars detected"
@@ -86,6 +87,8 @@ class StarTracker:
     focal_uncertainty : relative; 0 for a calibrated camera, 0.05 if the field of view is only known to 5 %.
         Unless it is 0, the focal length and, with enough stars, the radial distortion are fitted in each frame.
     searches : of the default identifier; empty for those that suit the focal uncertainty
+
+    Raises ImageError for anything that is not as described here, an unknown algorithm of the settings included.
     """
 
     def __init__(
@@ -97,6 +100,11 @@ class StarTracker:
         focal_uncertainty: float = 0.0,
         searches: tuple[SearchModel, ...] = (),
     ) -> None:
+        checks.of_type("camera", camera, Camera)
+        default = getattr(settings, "identifier", "default") == "default"
+        check_algorithms(settings, ["default"] if default else _published(), SOLVERS)
+        focal_uncertainty = checks.number("focal_uncertainty", focal_uncertainty, 0.0, 0.5, "0 to 0.5, relative")
+        stars, vectors = catalog.checked(stars), checks.unit_rows("vectors", vectors, len(stars))
         self.camera, self.settings = camera, settings
         self.focal_uncertainty = focal_uncertainty
         self.searches = searches or (UNCALIBRATED_SEARCHES if focal_uncertainty else CALIBRATED_SEARCHES)
@@ -137,7 +145,7 @@ class StarTracker:
     def for_sky(
         cls,
         camera: Camera,
-        limit_mag: float = 6.0,
+        limit_mag: float | None = None,
         date: str | datetime.datetime = "2000-01-01T12:00",
         *,
         stars: catalog.StarCatalog | None = None,
@@ -146,19 +154,18 @@ class StarTracker:
     ) -> StarTracker:
         """A tracker for the sky as seen from the Earth at a date.
 
-        limit_mag : faintest V magnitude of the on-board catalog
+        limit_mag : faintest V magnitude of the on-board catalog; None: 6 without `stars`, else all of them
         date      : UTC, ISO 8601 or datetime: fixes proper motion, parallax and aberration
-        stars     : another catalog than the Hipparcos subset that comes with the package
+        stars     : another catalog than the Hipparcos subset that comes with the package, which ends at Hp 6.5
 
-        Raises ImageError for a date that cannot be read.
+        Raises ImageError for a date that cannot be read, or a catalog without a star as bright as limit_mag.
         """
-        if isinstance(date, str):
-            try:
-                date = datetime.datetime.fromisoformat(date)
-            except ValueError:
-                raise ImageError(f"date: {date!r} is not ISO 8601; allowed: for example 2012-06-22T21:00") from None
-        stars = catalog.brighter_than(stars or catalog.hipparcos(), limit_mag)
-        vectors = catalog.apparent(stars, catalog.on_earth(date))
+        if limit_mag is not None or stars is None:
+            limit_mag = checks.number("limit_mag", 6.0 if limit_mag is None else limit_mag, -30, 30, "-30 to 30")
+        stars = catalog.hipparcos() if stars is None else catalog.checked(stars)
+        if limit_mag is not None:
+            stars = catalog.brighter_than(stars, limit_mag)
+        vectors = catalog.apparent(stars, catalog.on_earth(catalog.utc(date)))
         return cls(camera, stars, vectors, settings, focal_uncertainty)
 
     def solve(self, image: NDArray, streak_px: tuple[float, float] | None = None) -> Report:
@@ -167,6 +174,30 @@ class StarTracker:
         streak_px : (dx, dy) that stars move during the exposure, from the gyro; None if unknown
         """
         return process_frame(image, self.camera, self.settings, self.solve_centroids, streak_px)
+
+    def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
+        """Compile all that `solve` and `solve_centroids` use, and build the quads: call it before the flight.
+
+        It takes up to a minute once, and a second where numba finds its code on disk. Without it the first frames
+        take that time.
+        dtype : of the frames' pixels
+        """
+        cam_from_ref, xy_px, light = self.rich_field()
+        warm_up.run(self.camera, xy_px, light, dtype, self.solve)
+        # As many false lights as stars: whether the camera model fits the field is tested then.
+        xy_px = np.concatenate([xy_px, xy_px[:, ::-1]])
+        centroids = Centroids(xy_px, np.full(len(xy_px), 0.1), np.concatenate([light, light / 2]))
+        self.solve_centroids(centroids)
+        rows, _ = self.field_matcher.in_field(self.camera, cam_from_ref)
+        self.solve_matches(centroids, np.arange(min(len(rows), 3)), rows[:3])
+
+    def rich_field(self) -> tuple[Rotation, Floats, Floats]:
+        """An attitude with many stars on the sensor, of forty; their (N, 2) pixels and (N,) light, brightest first."""
+        fields = []
+        for cam_from_ref in Rotation.random(40, np.random.Generator(np.random.PCG64(1))):
+            rows, xy_px = self.field_matcher.in_field(self.camera, cam_from_ref)
+            fields.append((cam_from_ref, xy_px, 10 ** (-0.4 * self.stars.v_mag[rows])))
+        return max(fields, key=lambda one: len(one[1]))
 
     @property
     def efforts(self) -> int:
@@ -178,6 +209,10 @@ class StarTracker:
 
         effort : run only this one of the `efforts` searches, from 0; None: all of them in turn
         """
+        checks.of_type("centroids", centroids, Centroids)
+        centroids.check_values()
+        if effort is not None:
+            effort = checks.number("effort", effort, 0, self.efforts - 1, f"0 to {self.efforts - 1}, or None", True)
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
             return Attitude(NO_STARS)
@@ -197,8 +232,11 @@ class StarTracker:
         """Solve the attitude for given matches from any source (the truth included), without identification.
 
         observed, star : (K,) rows of the centroids and of `self.stars`, K >= 2
-        The match is not tested against chance: its log10_chance is NaN.
+        The match is not tested against chance: its log10_chance is NaN. Raises ImageError for rows that there are not.
         """
+        checks.of_type("centroids", centroids, Centroids)
+        centroids.check_values()
+        observed, star = checks.row_pairs(("observed", observed, len(centroids)), ("star", star, len(self.stars)))
         sigma_px = self.sigma_px(centroids)[observed]
         rays, vectors = self.camera.rays(centroids.xy_px[observed]), self.stars.vectors[star]
         sigma_rad = sigma_px / self.camera.focal_px
@@ -324,14 +362,12 @@ class StarTracker:
         If the focal length is uncertain, its interval is searched in steps of 2 %, first with little effort at all
         steps, then with more.
         """
-        from estimator.identification.registry import IDENTIFIERS  # several compiled modules, needed here only
-
-        identify = IDENTIFIERS[self.settings.identifier]
+        identify = _published()[self.settings.identifier]
         step, stretch = 0.02, 0.011 if self.focal_uncertainty else 5e-4
         steps = int(np.ceil(self.focal_uncertainty / step - 0.5))
         zooms = sorted((n * step for n in range(-steps, steps + 1)), key=abs)
         bright_centroids = brightest(centroids, self.settings)
-        for triangles, checks in ((60, 1_500_000), (600, 3_000_000), (3000, 4_000_000)):
+        for triangles, most_checks in ((60, 1_500_000), (600, 3_000_000), (3000, 4_000_000)):
             for zoom in zooms:
                 camera = self.camera.zoomed(1 + zoom)
                 tolerance_rad = max(1.5 if steps else 1.0, 4 * self.settings.centroid_sigma_px) / camera.focal_px
@@ -342,7 +378,7 @@ class StarTracker:
                     stretch=stretch,
                     focal_unknown=steps > 0,
                     max_triangles=triangles,
-                    max_checks=checks,
+                    max_checks=most_checks,
                     base_stars=self.settings.base_stars,
                 )
                 if match:
@@ -352,3 +388,10 @@ class StarTracker:
 def _residuals_too_great(solution: Solution) -> bool:
     """Whether the residuals of a solution exceed their errors by more than three standard deviations of chi-square."""
     return bool(solution.chi2 > 1 + 3 / np.sqrt(max(len(solution.star), 1)))
+
+
+def _published() -> Mapping[str, Callable[..., StarMatch | None]]:
+    """The identifiers by name: several compiled modules, which the default does without."""
+    from estimator.identification.registry import IDENTIFIERS
+
+    return IDENTIFIERS

@@ -13,18 +13,22 @@ from enum import IntFlag
 from math import log10, pi
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.centroiding.centroid import CENTROIDERS
+from estimator.core import checks
 from estimator.core.arrays import Floats
-from estimator.core.camera import check_shape
+from estimator.core.camera import check_frame
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, FramePriors, StarMatch
 from estimator.detection.classify import Flag
+from estimator.detection.detect import in_row_order
 from estimator.detection.windows import in_windows
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.stars import evidence
 from estimator.identification.stars.search import ACCEPT_DEX
+from estimator.trackers import warm_up
 from estimator.trackers.pipeline import Clock, Report, detect_and_centroid, inflate_uncertainty
 from estimator.trackers.star_tracker import StarTracker
 
@@ -74,19 +78,25 @@ class LastSolution:
 class TrackingMode:
     """Star tracker with memory: tracks the predicted stars, and solves lost in space if that fails.
 
-    tracker  : lost-in-space tracker with a calibrated camera; ValueError if its focal length is uncertain
+    tracker  : lost-in-space tracker with a calibrated camera and the default identifier
     reach_px : half the side of a window: greatest error of the prediction
     max_windows : greatest number of windows, for the brightest stars
     max_age_s   : greatest age of the last attitude for a prediction
+
+    Raises ImageError for another tracker or for unusable numbers.
     """
 
     def __init__(
         self, tracker: StarTracker, reach_px: float = 8.0, max_windows: int = 25, max_age_s: float = 5.0
     ) -> None:
+        checks.of_type("TrackingMode: tracker", tracker, StarTracker)
         if tracker.focal_uncertainty:
-            raise ValueError(f"TrackingMode: focal_uncertainty is {tracker.focal_uncertainty}; allowed: 0")
-        self.tracker, self.reach_px = tracker, reach_px
-        self.max_windows, self.max_age_s = max_windows, max_age_s
+            raise ImageError(f"TrackingMode: focal_uncertainty is {tracker.focal_uncertainty}; allowed: 0")
+        self.tracker = tracker
+        self.reach_px = checks.number("TrackingMode: reach_px", reach_px, 1.0, 1e4, "1 to 10,000 pixels")
+        least = MIN_EVIDENCE_MATCHES
+        self.max_windows = checks.number("TrackingMode: max_windows", max_windows, least, 1e6, f"{least} or more", True)
+        self.max_age_s = checks.number("TrackingMode: max_age_s", max_age_s, 0.0, np.inf, "0 or more")
         self.last: LastSolution | None = None
 
     def solve(
@@ -101,6 +111,11 @@ class TrackingMode:
         now_from_then : cam(t_s) from cam at the last solved frame, from the gyros; None: the last rate is extrapolated
         streak_px     : (dx, dy) that stars move during the exposure, from the gyros
         """
+        check_frame(image, self.tracker.camera)
+        image, streak_px = in_row_order(image), checks.pixel_step("streak_px", streak_px)
+        t_s = checks.number("t_s", t_s, -1e300, 1e300, "a finite time in seconds")
+        if now_from_then is not None:
+            checks.one_rotation("now_from_then", now_from_then)
         predicted = self._predict(t_s, now_from_then)
         clock = Clock()
         report = self._track(image, predicted, streak_px, clock) if predicted is not None else None
@@ -108,6 +123,21 @@ class TrackingMode:
             report = self._search(image, streak_px, clock)
         self._store(t_s, report.attitude.cam_from_ref)
         return report
+
+    def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
+        """Compile all that `solve` uses, in windows and in whole frames: `StarTracker.warm_up`; the memory is kept.
+
+        dtype : of the frames' pixels
+        """
+        self.tracker.warm_up(dtype)
+        cam_from_ref, xy_px, light = self.tracker.rich_field()
+        follower = TrackingMode(self.tracker, self.reach_px, self.max_windows, self.max_age_s)
+
+        def look(image: NDArray, streak_px: tuple[float, float] | None) -> None:
+            follower.last = LastSolution(0.0, cam_from_ref, np.zeros(3))
+            follower.solve(image, 0.0, None, streak_px)
+
+        warm_up.run(self.tracker.camera, xy_px, light, dtype, look)
 
     def _predict(self, t_s: float, now_from_then: Rotation | None) -> Rotation | None:
         """Predicted cam_from_ref, or None without a recent attitude."""
@@ -132,7 +162,6 @@ class TrackingMode:
     ) -> TrackedReport | None:
         """Solve from the detections in windows; None if the evidence is below ACCEPT_DEX."""
         tracker = self.tracker
-        check_shape(image.shape, tracker.camera)
         window_centers_px = self.window_centers_px(predicted)
         if len(window_centers_px) < MIN_EVIDENCE_MATCHES:
             return None

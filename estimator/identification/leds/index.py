@@ -1,4 +1,10 @@
-"""Index of a dome's LEDs for identification: pairs by the angle between them, and LEDs by direction."""
+"""Index of a dome's LEDs for identification: pairs by the angle between them, and LEDs by direction.
+
+Angles are measured about the bearing center, from which they do not change with the attitude, and are scaled to those
+that LEDs at the median radius would have; the search allows for the error of that scaling. Pairs are sorted by angle,
+with a k-vector to find a range of angles. Directions are binned in a square grid around the dome's middle, so that the
+question "is an LED near this direction" reads a few cells.
+"""
 
 from __future__ import annotations
 

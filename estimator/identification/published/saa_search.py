@@ -1,4 +1,10 @@
-"""SAA's steps 3 to 7, compiled: every assumption of a primary pair, and the direct match of each. See `saa`."""
+"""SAA's steps 3 to 7, compiled: every assumption of a primary pair, and the direct match of each. See `saa`.
+
+An assumption says that the two stars of the primary pair are a certain catalog pair, in a certain order. It determines
+an attitude (`triad`), which predicts the place of every other observed star. Of the catalog stars within the gates of
+the two corner angles, the place and the magnitude, the one of the least squared deviations is that star's partner. The
+sum of these, with UNMATCHED_COST for a star without a partner, is the cost by which assumptions are compared.
+"""
 
 from __future__ import annotations
 

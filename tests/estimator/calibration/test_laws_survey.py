@@ -290,7 +290,7 @@ class Namer:
         self.seen = seen
 
     def solve_centroids(self, centroids: Centroids) -> Attitude:
-        star = centroids.flux.astype(np.int64)
+        star = centroids.flux.astype(np.int64) - 1
         match = StarMatch(np.arange(len(star)), star, Rotation.identity(), -9.0)
         return Attitude("solved", Rotation.identity(), match=match) if self.seen else Attitude("no")
 
@@ -299,7 +299,7 @@ class Namer:
 @given(rng=SEEDS, seen=some.booleans())
 def test_a_camera_calibrates_itself_by_the_stars_that_are_named(rng: np.random.Generator, seen: bool) -> None:
     frames, _ = filmed(rng, 5)
-    lights = [Centroids(one.xy_px, one.sigma_px, np.arange(25.0) + 25 * k) for k, one in enumerate(frames)]
+    lights = [Centroids(one.xy_px, one.sigma_px, np.arange(1.0, 26.0) + 25 * k) for k, one in enumerate(frames)]
     namer = Namer(frames, seen)
     told = answered(lambda: star_field.self_calibrate(lights, lambda *_: namer, CAMERA.zoomed(1.01)))
     assert (told is not None) == seen

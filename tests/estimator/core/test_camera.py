@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from estimator.core.camera import Camera, check_shape, distorted, undistorted
+from estimator.core.camera import Camera, check_frame, distorted, undistorted
 from estimator.core.errors import ImageError
 
 LENS = (-0.12, 0.05, 0.001, -0.002, -0.01)
@@ -128,8 +128,8 @@ def test_a_sensor_ends_half_a_pixel_beyond_its_outermost_middles() -> None:
 
 def test_an_image_of_another_size_is_refused_with_both_sizes() -> None:
     with pytest.raises(ImageError, match="the image is 20x10 pixels; this camera's are 1600x1200"):
-        check_shape((10, 20), DISTORTED)
-    check_shape((1200, 1600), DISTORTED)
+        check_frame(np.zeros((10, 20)), DISTORTED)
+    check_frame(np.zeros((1200, 1600)), DISTORTED)
 
 
 @pytest.mark.parametrize("given", [{}, {"fov_rad": 0.3, "fov_deg": 17.0}])

@@ -275,7 +275,7 @@ def test_weights_are_the_inverse_of_all_the_errors(
     np.testing.assert_allclose(whole, np.broadcast_to(np.eye(2), whole.shape), rtol=0, atol=1e-9)
 
 
-@law(pipeline.detect_and_centroid, pipeline.process_frame, Clock.lap, camera.check_shape)
+@law(pipeline.detect_and_centroid, pipeline.process_frame, Clock.lap, camera.check_frame)
 @given(
     rng=SEEDS,
     hostile=FRAMES | arrays("f8", array_shapes(max_dims=3, max_side=90), fill=some.just(1)),
@@ -284,7 +284,7 @@ def test_weights_are_the_inverse_of_all_the_errors(
 def test_a_look_gives_lights_on_the_chip_and_the_time_it_took(
     rng: np.random.Generator, hostile: NDArray, streak_px: tuple[float, float] | None
 ) -> None:
-    fits = answered(lambda: camera.check_shape(hostile.shape, CAMERA) or True, ImageError)
+    fits = answered(lambda: camera.check_frame(hostile, CAMERA) or True, ImageError)
     assert bool(fits) == (hostile.shape == (HEIGHT, WIDTH))
     nothing = Attitude("nobody asked")
     answered(lambda: pipeline.process_frame(hostile, CAMERA, Settings(), lambda *_: nothing, streak_px), ImageError)

@@ -79,7 +79,10 @@ def test_no_image_of_noise_has_an_attitude(tracker: StarTracker, image: NDArray)
 @given(xy_px=PIXELS, data=some.data())
 def test_no_lights_of_noise_have_an_attitude(tracker: StarTracker, xy_px: NDArray, data: some.DataObject) -> None:
     sigma_px, flux = (data.draw(arrays("f8", len(xy_px), elements=ANY)) for _ in range(2))
-    assert not tracker.solve_centroids(Centroids(xy_px, sigma_px, flux)).solved
+    try:
+        assert not tracker.solve_centroids(Centroids(xy_px, sigma_px, flux)).solved
+    except ImageError as error:
+        one_line(error)
 
 
 @pytest.mark.slow

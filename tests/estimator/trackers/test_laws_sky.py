@@ -226,8 +226,12 @@ def test_any_lights_are_told_apart_from_a_sky(
     eye: StarTracker, xy_px: NDArray, sigma_px: NDArray, flux: NDArray
 ) -> None:
     lights = Centroids(xy_px, sigma_px, flux)
-    assert not eye.solve_centroids(lights).solved
-    assert not any(eye.solve_centroids(lights, effort=n).solved for n in range(eye.efforts))
+    found = [
+        answered(lambda n=n: eye.solve_centroids(lights, effort=n), ImageError) for n in (None, *range(eye.efforts))
+    ]  # type: ignore[misc]
+    usable = np.isfinite(xy_px).all() and ((sigma_px > 0) & (sigma_px <= 20) & (flux > 0) & (flux < np.inf)).all()
+    assert all((one is not None) == usable for one in found)
+    assert not any(one is not None and one.solved for one in found)
     sigma = eye.sigma_px(lights, 0.5, 0.01)
     assert (sigma >= np.abs(sigma_px))[np.isfinite(sigma)].all()
     assert eye.detections(lights, sigma).tangent.shape == (9, 2)
@@ -244,11 +248,29 @@ def test_no_picture_of_noise_has_an_attitude_at_any_time(
     follower = TrackingMode(eye)
     assert not eye.solve(frame).attitude.solved
     for when_s in t_s:
-        assert not follower.solve(frame, when_s).attitude.solved
+        report = answered(lambda when_s=when_s: follower.solve(frame, when_s), ImageError)  # type: ignore[misc]
+        assert report is None or not report.attitude.solved
     expected = follower.window_centers_px(turn(rng))
     assert CAMERA.contains(expected, follower.reach_px).all()
     off = np.abs(expected[:, None] - expected).max(axis=2)[np.triu_indices(len(expected), 1)]
     assert (off >= follower.reach_px).all()
+
+
+@law(StarTracker.warm_up, StarTracker.rich_field, TrackingMode.warm_up, slow=True)
+@given(rng=SEEDS)
+def test_a_warm_up_changes_no_answer_and_no_memory(eye: StarTracker, rng: np.random.Generator) -> None:
+    cam_from_ref, xy_px, light = eye.rich_field()
+    assert CAMERA.contains(xy_px, -2.0).all()
+    assert len(xy_px) == len(light) > 20
+    assert (np.diff(light) <= 0).all()
+    seen = CAMERA.pixels(cam_from_ref.apply(eye.stars.vectors))
+    assert set(map(tuple, xy_px)) <= set(map(tuple, seen))
+    centroids, _ = seen_by(eye, rng, turn(rng))
+    before, follower = eye.solve_centroids(centroids), TrackingMode(eye)
+    follower.warm_up()
+    after = eye.solve_centroids(centroids)
+    assert follower.last is None
+    assert (before.status, before.rms_px) == (after.status, after.rms_px)
 
 
 @law(refinement.mutual_nearest)

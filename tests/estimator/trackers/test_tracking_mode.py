@@ -150,6 +150,37 @@ def test_a_memory_that_is_stale_is_none(tracker: StarTracker) -> None:
     assert follower.solve(photograph(tracker, START, 2), 1.0).health & Health.SEARCHED  # time ran backwards
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_no_gap_makes_a_wrong_answer(tracker: StarTracker, seed: int) -> None:
+    """Dark frames, frames that never come, knocks unseen by the gyros and stale predictions, one after the other.
+
+    Every frame with stars is solved, right; after a gap shorter than the memory the gyros' turn leads on.
+    """
+    rng, follower, t_s, truth = np.random.default_rng(seed), TrackingMode(tracker), 0.0, START
+    then, solved, followed, lost = START, 0, 0, 0
+    for n in range(60):
+        gap = rng.choice(["none", "dark", "missing", "knock", "stale"], p=[0.5, 0.2, 0.15, 0.1, 0.05])
+        step_s = {"missing": rng.uniform(0.3, 3.0), "stale": 6.0}.get(gap, STEP_S)
+        t_s, turn = t_s + step_s, Rotation.from_rotvec(RATE_RAD_S * step_s)
+        truth = turn * truth
+        if gap == "knock":
+            truth = Rotation.from_rotvec(rng.normal(0, 0.3, 3)) * truth
+        told = truth * then.inv() if gap != "knock" else Rotation.identity()
+        report = follower.solve(photograph(tracker, truth, n, light=0.0 if gap == "dark" else 3e5), t_s, told)
+        if gap == "dark":
+            assert report.health == Health.LOST
+            lost += 1
+            continue
+        enough = len(tracker.field_matcher.in_field(CAMERA, truth)[0]) >= 8
+        assert report.attitude.solved or not enough
+        if report.attitude.solved:
+            assert off_rad(report, truth) < 1e-3, (n, gap)
+            then, solved, followed = truth, solved + 1, followed + (report.expected > 0)
+    assert solved >= 40
+    assert followed >= 0.6 * solved
+    assert lost >= 5
+
+
 def test_half_a_sky_is_called_missing_and_few_stars_few(tracker: StarTracker) -> None:
     """A cloud over all but a corner."""
     follower = TrackingMode(tracker)

@@ -1,0 +1,164 @@
+"""Checks of what a caller passes: each raises ImageError in one line that says what, where, and what is allowed.
+
+The checks run at the public entries, before compiled code, which would read beyond a short array. They also turn arrays
+and numbers into the one type for which the loops are compiled: a Fortran-ordered, flipped, read-only or big-endian
+array, or an int in place of a float, would cost a compilation of seconds.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.core.arrays import Floats
+from estimator.core.errors import ImageError
+
+
+def known(what: str, name: object, allowed: Iterable[str]) -> None:
+    """Raise ImageError unless a name is one of the allowed ones; it lists them, and the nearest one."""
+    names = sorted(allowed)
+    if name not in names:
+        close = difflib.get_close_matches(str(name), names, 1)
+        guess = f"; did you mean {close[0]}?" if close else ""
+        raise ImageError(f"{what}: {name!r} is unknown{guess}; allowed: {', '.join(names)}")
+
+
+def number(what: str, value: object, low: float, high: float, allowed: str, integer: bool = False) -> Any:
+    """A number as a plain float (or int) within [low, high]. Raises ImageError for anything else, NaN included."""
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value[()]
+    if isinstance(value, Integral if integer else Real) and not isinstance(value, bool | np.bool_):
+        plain = int(value) if integer else float(value)  # type: ignore[call-overload]
+        if low <= plain <= high:
+            return plain
+    raise ImageError(f"{what} is {excerpt(value)}; allowed: {allowed}")
+
+
+def of_type(what: str, value: object, *kinds: type) -> None:
+    """Raise ImageError unless a value is of one of the types."""
+    if not isinstance(value, kinds):
+        names = " or ".join(kind.__name__ for kind in kinds)
+        raise ImageError(f"{what} is {excerpt(value)} of type {type(value).__name__}; allowed: {names}")
+
+
+def each_of_type(what: str, values: object, kind: type) -> None:
+    """Raise ImageError unless a value is a list or tuple of things of one type."""
+    of_type(what, values, list, tuple)
+    for k, one in enumerate(values):  # type: ignore[arg-type,var-annotated]
+        of_type(f"{what}: number {k}", one, kind)
+
+
+def one_rotation(what: str, value: object) -> None:
+    """Raise ImageError unless a value is a single Rotation."""
+    of_type(what, value, Rotation)
+    if not value.single:  # type: ignore[attr-defined]
+        raise ImageError(f"{what} is a stack of {len(value)} rotations; allowed: one")  # type: ignore[arg-type]
+    if not np.isfinite(value.as_quat()).all():  # type: ignore[attr-defined]
+        raise ImageError(f"{what} is NaN; allowed: a rotation")
+
+
+def pixel_step(what: str, value: object) -> tuple[float, float] | None:
+    """(dx, dy) as two finite floats, or None. Raises ImageError for anything else."""
+    if value is None:
+        return None
+    pair = floats(what, value, (2,))
+    if not np.isfinite(pair).all():
+        raise ImageError(f"{what} is {pair.tolist()}; allowed: two finite numbers, or None")
+    return float(pair[0]), float(pair[1])
+
+
+def floats(what: str, value: object, shape: tuple[int | None, ...]) -> Floats:
+    """An array as C-contiguous, aligned, writable float64; `shape` has None where any length is allowed.
+
+    A copy only if it is needed. Raises ImageError for another shape, or what is no array of real numbers.
+    """
+    array = native(what, value, np.float64)
+    if array.ndim != len(shape) or any(
+        want is not None and want != got for want, got in zip(shape, array.shape, strict=True)
+    ):
+        raise ImageError(f"{what} has shape {array.shape}; allowed: {_shape_text(shape)}")
+    return array
+
+
+def native(what: str, value: object, dtype: DTypeLike) -> NDArray[Any]:
+    """An array of a dtype, as compiled code takes it: C-contiguous, aligned, writable. A copy only if it is needed."""
+    if type(value) is np.ndarray and value.dtype == dtype:
+        if not value.flags.c_contiguous:
+            return np.ascontiguousarray(value)
+        return value if value.flags.behaved else value.copy()
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in "buif":
+            raise ValueError(f"its type is {array.dtype}")
+        return np.require(array, dtype, ["C", "A", "W", "E"])
+    except (ValueError, TypeError) as error:
+        raise ImageError(f"{what}: not an array of real numbers ({excerpt(error)})") from None
+
+
+def rows(what: str, value: object, count: int | None, width: int) -> Floats:
+    """(count, width) finite floats. Raises ImageError for another shape, and for NaN or infinity."""
+    array = floats(what, value, (count, width))
+    if not np.isfinite(array).all():
+        finite = np.asarray(np.isfinite(array).all(axis=1))
+        raise ImageError(f"{what} has a NaN or infinity in row {first_bad(finite)}")
+    return array
+
+
+def unit_rows(what: str, value: object, count: int | None) -> Floats:
+    """(count, 3) unit vectors, to 1e-6. Raises ImageError otherwise."""
+    array = rows(what, value, count, 3)
+    length = np.sqrt(np.einsum("ij,ij->i", array, array))
+    good = np.abs(length - 1) < 1e-6
+    if not good.all():
+        n = first_bad(good)
+        raise ImageError(f"{what}: row {n} has length {length[n]:.6g}; allowed: unit vectors")
+    return array
+
+
+def row_numbers(what: str, value: object, below: int) -> NDArray[np.int64]:
+    """(K,) whole numbers from 0 to below - 1, as int64. Raises ImageError otherwise."""
+    array = np.asarray(value)
+    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
+        raise ImageError(f"{what} has shape {array.shape} of {array.dtype}; allowed: (K,) whole numbers")
+    good = (array >= 0) & (array < below)
+    if not good.all():
+        raise ImageError(f"{what}: {array[first_bad(good)]} is no row of {below}; allowed: 0 to {below - 1}")
+    return array.astype(np.int64, copy=False)
+
+
+def row_pairs(*columns: tuple[str, object, int]) -> list[NDArray[np.int64]]:
+    """Columns of rows that belong together, each as (name, rows, number of rows there are): see `row_numbers`."""
+    arrays = [row_numbers(*column) for column in columns]
+    if len({len(array) for array in arrays}) > 1:
+        lengths = ", ".join(f"{len(array)} of {name}" for (name, *_), array in zip(columns, arrays, strict=True))
+        raise ImageError(f"{lengths}; allowed: equal numbers of both")
+    return arrays
+
+
+def first_bad(good: NDArray[np.bool_]) -> int:
+    """Number of the first False."""
+    return int(np.argmin(good))
+
+
+def angle_guess(what: str, value_rad: float) -> str:
+    """What an angle too great for radians is in degrees, for a message."""
+    guess = "; degrees?" if 0 < value_rad < math.inf else ";"
+    return f"{what} {value_rad:g} rad is {math.degrees(value_rad):.0f}°{guess}"
+
+
+def excerpt(value: object, most: int = 60) -> str:
+    """A value in one line of at most `most` characters."""
+    text = " ".join((str(value) if isinstance(value, Exception) else repr(value)).split())
+    return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+def _shape_text(shape: tuple[int | None, ...]) -> str:
+    words = ["N" if length is None else str(length) for length in shape]
+    return f"({', '.join(words)}{',' * (len(words) == 1)})"
