@@ -1,6 +1,6 @@
 """Compiled propagation of the filter: gyro samples advance attitude, other states and covariance between solutions.
 
-Each gyro sample is a rotation vector. After the bias is subtracted, the quaternion is multiplied by its exponential; the
+Each gyro sample is a rotation vector. Less its bias, its exponential multiplies the quaternion; the
 covariance is multiplied by the discrete transition of the error state, with the right Jacobian of the rotation, and the
 process noise is added. While the gyro is saturated the attitude's covariance grows as the square of the time, by the
 measured rate.

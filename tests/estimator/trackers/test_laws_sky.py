@@ -29,6 +29,7 @@ from estimator.identification.published.master_star import master_star
 from estimator.identification.published.pyramid import pyramid
 from estimator.identification.published.saa import AssumptionPool, saa
 from estimator.identification.registry import IDENTIFIERS
+from estimator.identification.stars.evidence import Solution
 from estimator.trackers import refinement
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.refinement import FieldMatcher
@@ -187,6 +188,27 @@ def test_a_field_is_matched_from_a_near_attitude(eye: StarTracker, rng: np.rando
     near = Rotation.from_rotvec(1.0 / CAMERA.focal_px * units(rng, 1)[0]) * truth
     found = eye.field_matcher.refine(centroids, CAMERA, near)
     assert not found.solved or (found.cam_from_ref * truth.inv()).magnitude() < 0.02
+
+
+@law(FieldMatcher.misfits, FieldMatcher.near_misses, FieldMatcher.fits, FieldMatcher.lens_radii_px)
+@given(rng=SEEDS, aside=some.booleans())
+def test_stars_beside_detections_tell_a_wrong_camera(eye: StarTracker, rng: np.random.Generator, aside: bool) -> None:
+    truth = turn(rng)
+    centroids, rows = seen_by(eye, rng, truth)
+    matcher, count = eye.field_matcher, len(rows)
+    assert list(matcher.lens_radii_px) == sorted(matcher.lens_radii_px, reverse=True)
+    assert min(matcher.lens_radii_px) > 1
+    moved = np.arange(count) % 2 == 1  # every second star: by more than its error, by less than the gate
+    centroids.xy_px[moved] += 3.0 * aside
+    matched = np.flatnonzero(~moved if aside else moved | ~moved)
+    nothing = np.zeros((3, 3))
+    solution = Solution(matched, rows[matched], truth.as_quat(), nothing, 1.0, 0.1 / CAMERA.focal_px, 1.0, 20.0)
+    near, by_chance = matcher.near_misses(solution, centroids)
+    assert near >= moved.sum() * aside
+    assert by_chance < 0.2 * max(count, 1)
+    if count >= 8:
+        assert matcher.misfits(solution, centroids) is aside
+        assert not (aside and matcher.fits(solution, centroids, np.full(count, 0.1)))
 
 
 @law(
