@@ -95,7 +95,8 @@ def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePr
             rows[failed] = _fit_gaussians(image, blobs.take(failed), gain_e_dn, priors)
         rows = _with_fallback(rows, image, blobs, gain_e_dn)
         covariance[failed] = rows[failed, 2, None, None] ** 2 * np.eye(2)
-    return Centroids(rows[:, :2], rows[:, 2], rows[:, 3], covariance)
+    own = streaks[:, [10, 12, 12, 11]].reshape(-1, 2, 2)
+    return Centroids(rows[:, :2], rows[:, 2], rows[:, 3], covariance, streaks[:, 8:10], own)
 
 
 def streak_ends(
@@ -159,7 +160,7 @@ def _fit_streaks(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePr
     """Return the rows of `streak_fit.fit_all`; all NaN for a frame that is not smeared."""
     streak_px = _frame_streak(blobs, priors)
     if np.hypot(*streak_px) < streak_fit.MIN_STREAK_PX:
-        return np.full((len(blobs), 8), np.nan)
+        return np.full((len(blobs), streak_fit.OUTPUTS), np.nan)
     sky = blobs.background
     return streak_fit.fit_all(
         to_native(image),

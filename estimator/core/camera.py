@@ -25,6 +25,8 @@ class Camera:
     center_px: principal point (x, y); the center of pixel (0, 0) is (0, 0)
     distortion: k1, k2, p1, p2, k3 in OpenCV's order
     focal_sigma: relative standard deviation of the focal length: the error of a calibration, the same in every frame
+    row_time_s : rolling shutter: each row is exposed this long after the one above it, negative if the lower one is
+        first; 0 for a global shutter
     """
 
     width_px: int
@@ -33,6 +35,7 @@ class Camera:
     center_px: tuple[float, float]
     distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
     focal_sigma: float = 0.0
+    row_time_s: float = 0.0
 
     @classmethod
     def from_fov(
@@ -93,6 +96,10 @@ class Camera:
         low, right = margin_px - 0.5, self.width_px - 0.5 - margin_px
         bottom = self.height_px - 0.5 - margin_px
         return (x >= low) & (x <= right) & (y >= low) & (y <= bottom)
+
+    def row_delays_s(self, xy_px: Floats) -> Floats:
+        """(N,) time of each light's mid-exposure after that of the middle row, to which an attitude refers."""
+        return np.asarray(self.row_time_s * (xy_px[:, 1] - (self.height_px - 1) / 2))
 
     def _fold(self) -> float:
         """Squared tangent at which the radial distortion folds back; infinite if it does not.
