@@ -89,6 +89,12 @@ def fit_all(
 
 
 @jit
+def length_sigma_px(length_px: float) -> float:
+    """Standard deviation of the prior on a streak's length."""
+    return LENGTH_FRACTION * length_px + LENGTH_PX
+
+
+@jit
 def _distance_to_line(p: Floats, x: float, y: float) -> float:
     """Distance of a pixel from the line segment."""
     along_x, along_y = cos(p[ANGLE]), sin(p[ANGLE])
@@ -108,7 +114,7 @@ def _fit(pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: F
     count = pixels.shape[1]
     start_x, start_y = p[X], p[Y]
     start_length, start_angle, start_width = p[LENGTH], p[ANGLE], p[WIDTH]
-    length_sigma = LENGTH_FRACTION * start_length + LENGTH_PX
+    length_sigma = length_sigma_px(start_length)
     normal, step = np.empty((8, 8)), np.empty(7)
     for _ in range(MAX_ITERATIONS):
         _rows(pixels, noise, gain_e_dn, p, rows, weight)
@@ -169,7 +175,7 @@ def _own_vector(
         column[LENGTH + i] = 1.0
         least_squares.cholesky_solve(factor, column)
         cov[i, 0], cov[i, 1] = column[LENGTH], column[ANGLE]
-    prior_l, prior_a = 1 / (LENGTH_FRACTION * prior_length + LENGTH_PX) ** 2, 1 / ANGLE_RAD**2
+    prior_l, prior_a = 1 / length_sigma_px(prior_length) ** 2, 1 / ANGLE_RAD**2
     det = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
     ll, aa, la = cov[1, 1] / det - prior_l, cov[0, 0] / det - prior_a, -cov[0, 1] / det
     det = ll * aa - la**2
