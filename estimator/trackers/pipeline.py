@@ -14,8 +14,9 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera, check_shape
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Blobs, Centroids, FramePriors
+from estimator.detection import classify
 from estimator.detection.classify import NO_STAR, Flag
-from estimator.detection.detect import DETECTORS, replace_bad_pixels
+from estimator.detection.detect import DETECTORS, replace_bad_pixels, to_native
 
 SATURATED = "the frame is saturated"
 # Extra centroid error of a saturated blob, whose plateau has edges at whole pixels. Monte Carlo: 0.01 to 0.07 px, more
@@ -113,6 +114,11 @@ def detect_and_centroid(
     clock.lap("detect")
     centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, priors)
     centroids = inflate_uncertainty(centroids, blobs, settings)
+    if camera.row_time_s and streak_px is None and centroids.streak_px is None:
+        # The rows of a frame are far apart in time, so that even a rough rate is needed to identify its lights.
+        streaks = classify.streaks(to_native(image), blobs)
+        if streaks is not None:
+            centroids = replace(centroids, streak_px=streaks[0], streak_covariance_px2=streaks[1])
     clock.lap("centroid")
     valid = camera.contains(centroids.xy_px) & (centroids.sigma_px < MAX_CENTROID_SIGMA_PX) & (centroids.flux > 0)
     return centroids if valid.all() else centroids.take(valid)

@@ -23,7 +23,7 @@ from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids, RateEstimate
 
-SHORT_STREAK_PX = 1.0  # standard deviation of a streak that is too short to be seen
+SHORT_STREAK_PX = 1.5  # standard deviation of a streak that is too short to be seen
 SLOW_RAD_S = np.radians(0.5)  # that of a rate without streaks, if the exposure is unknown
 SMALL_SHEAR_PX = 1.0  # at the first and last row: tried before the full range of slow rates
 ROUNDS = 3  # of the fit: the lights change with the rate
