@@ -115,6 +115,7 @@ class Centroids:
     covariance_px2 : (N, 2, 2) from a centroider that models x and y separately (streaks), else None
     streak_px      : (N, 2) vector of each light's streak, sign arbitrary, NaN where it is not measured; None if none is
     streak_covariance_px2 : (N, 2, 2) of streak_px
+    moments_px2    : (N, 3) second moments xx - yy, 2 xy, xx + yy of lights that are disks; None if not measured
     """
 
     xy_px: Floats
@@ -123,6 +124,7 @@ class Centroids:
     covariance_px2: Floats | None = None
     streak_px: Floats | None = None
     streak_covariance_px2: Floats | None = None
+    moments_px2: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.flux)
@@ -133,7 +135,7 @@ class Centroids:
 
     def take(self, which: NDArray[Any]) -> Centroids:
         """Select centroids by mask or index."""
-        optional = (self.covariance_px2, self.streak_px, self.streak_covariance_px2)
+        optional = (self.covariance_px2, self.streak_px, self.streak_covariance_px2, self.moments_px2)
         taken = (None if array is None else array[which] for array in optional)
         return Centroids(self.xy_px[which], self.sigma_px[which], self.flux[which], *taken)
 

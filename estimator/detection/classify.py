@@ -29,8 +29,6 @@ VOTING_BLOBS = 15  # number of brightest blobs that decide whether the frame is 
 # Shortest streak that most of the brightest blobs share, and shortest line of one blob: shorter ones are explained by
 # noise or, of one blob, by a pair of stars or defocus.
 MIN_STREAK_PX, MIN_TRACK_PX = 2.0, 6.0
-# Streaks by moments: the shortest, the relative error of a length, and the error of its square.
-MIN_MOMENT_STREAK_PX, LENGTH_ERROR, MOMENT_ERROR_PX2 = 4.0, 0.1, 4.0
 
 
 class Flag(IntFlag):
@@ -85,24 +83,11 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
     return replace(blobs, flag=flag, streak_px=streak_px)
 
 
-def streaks(image: NDArray, blobs: Blobs) -> tuple[Floats, Floats] | None:
-    """Return the (N, 2) streak of each blob by its second moments, and (N, 2, 2) covariances; None without streaks.
-
-    It is for lights that are not points, and for a first guess. The sign is arbitrary. A common error of the lengths,
-    LENGTH_ERROR, as the ends are below the threshold, and one of the moments, MOMENT_ERROR_PX2, as no light is round,
-    do not average out: the covariances are as large as if N independent errors had these means.
-    """
-    lines = _shapes(image, blobs.box_px, blobs.background.level, blobs.background.noise)[:, 3:]
-    common_line = np.array(_common_line(lines))
-    length2 = float(np.hypot(*common_line))
-    if len(blobs) < 3 or length2 <= MIN_MOMENT_STREAK_PX**2:
-        return None
-    # A change s of the squared length changes the length by s / 2 L, and the ends across it as much.
-    across2 = (MOMENT_ERROR_PX2 / 2) ** 2 / length2
-    along = np.array(_half_angle(common_line)) / np.sqrt(length2)
-    covariance_px2 = across2 * np.eye(2) + LENGTH_ERROR**2 * length2 * np.outer(along, along)
-    vectors_px = np.array([_half_angle(line) for line in lines])
-    return vectors_px, np.tile(len(lines) * covariance_px2, (len(lines), 1, 1))
+def moments(image: NDArray, blobs: Blobs) -> Floats:
+    """Return the (N, 3) second moments of each blob, px^2: xx - yy, 2 xy and xx + yy."""
+    background = blobs.background
+    _, _, across, x, y = _shapes(image, blobs.box_px, background.level, background.noise).T
+    return np.column_stack([x / 12, y / 12, 2 * across + np.hypot(x, y) / 12])
 
 
 @jit
@@ -164,9 +149,9 @@ def _double_angle(streak_px: tuple[float, float]) -> tuple[float, float]:
     return float(x * x - y * y), float(2 * x * y)
 
 
-def _half_angle(line: tuple[float, float] | Floats) -> tuple[float, float]:
+def _half_angle(line: tuple[float, float]) -> tuple[float, float]:
     # L^2 (cos 2a, sin 2a) to (dx, dy).
-    length, angle = sqrt(hypot(line[0], line[1])), atan2(line[1], line[0]) / 2
+    length, angle = sqrt(hypot(*line)), atan2(line[1], line[0]) / 2
     return length * cos(angle), length * sin(angle)
 
 

@@ -116,9 +116,7 @@ def detect_and_centroid(
     centroids = inflate_uncertainty(centroids, blobs, settings)
     if camera.row_time_s and streak_px is None and centroids.streak_px is None:
         # The rows of a frame are far apart in time, so that even a rough rate is needed to identify its lights.
-        streaks = classify.streaks(to_native(image), blobs)
-        if streaks is not None:
-            centroids = replace(centroids, streak_px=streaks[0], streak_covariance_px2=streaks[1])
+        centroids = replace(centroids, moments_px2=classify.moments(to_native(image), blobs))
     clock.lap("centroid")
     valid = camera.contains(centroids.xy_px) & (centroids.sigma_px < MAX_CENTROID_SIGMA_PX) & (centroids.flux > 0)
     return centroids if valid.all() else centroids.take(valid)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.attitude import rolling
+from estimator.attitude.disk_rate import from_moments
 from estimator.attitude.motion import STARS, Sight, at_middle_row
 from estimator.attitude.nearfield import tangent_jacobian
 from estimator.attitude.rate import MAX_RATE_RAD_S, from_streaks
@@ -91,7 +92,11 @@ def candidates(
         yield from ((signed, signed) for signed in _signs(rate))
         return
     anything = RateEstimate(np.zeros(3), MAX_RATE_RAD_S**2 * np.eye(3))
-    streaks = from_streaks(camera, centroids, exposure_s, sight) if exposure_s is not None else []
+    streaks = []
+    if exposure_s is not None:
+        streaks = from_streaks(camera, centroids, exposure_s, sight) or from_moments(
+            camera, centroids, exposure_s, sight
+        )
     yield from ((streak, anything) for streak in streaks)
     slow_rad_s = SHORT_STREAK_PX / camera.focal_px / exposure_s if exposure_s is not None else SLOW_RAD_S
     shear_px = slow_rad_s * camera.focal_px * abs(camera.row_time_s) * camera.height_px / 2
