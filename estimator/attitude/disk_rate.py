@@ -22,12 +22,15 @@ from estimator.core.camera import Camera
 from estimator.core.types import Centroids, RateEstimate
 
 MIN_LIGHTS, ROUNDS = 3, 30
+MIN_MOMENT_PX2 = 8.0  # xx + yy of a disk of 4 px: those of smaller images are of pixels and noise
 MOMENT_ERROR = 0.01  # of moments, as a fraction of xx + yy: common to all lights, as no light is round
 
 
 def from_moments(camera: Camera, centroids: Centroids, exposure_s: float, sight: Sight = STARS) -> list[RateEstimate]:
-    """The two rates that explain the moments of the lights; none without measured moments or a rolling shutter."""
+    """The two rates that explain the moments of the lights; none without a rolling shutter, or if they are points."""
     if centroids.moments_px2 is None or len(centroids) < MIN_LIGHTS or not camera.row_time_s:
+        return []
+    if np.median(centroids.moments_px2[:, 2]) < MIN_MOMENT_PX2:
         return []
     moments, rows = centroids.moments_px2, exposure_s / camera.row_time_s
     roots = np.stack([_roots(moments, rows, side) for side in (1, -1)])

@@ -2,7 +2,7 @@
 
 Light i, at P_i in the reference frame, is seen at the delay t_i of its row along q_i = exp(-[w] t_i) A P_i - r: the
 attitude A is that at mid-exposure of the middle row, w the camera's rate and r its lever arm. Gauss-Newton fits both to
-the tangents of all lights, to the chords of their streaks (`rate`) and to a prior of the rate. The residual of a
+the tangents of all lights but outliers, to the chords of their streaks (`rate`) and to a prior of the rate. The residual of a
 tangent has the Jacobian J_i exp(-[w] t_i) by a small rotation of A, and -t_i J_i by the rate; its error is that of
 `motion.at_middle_row`.
 """
@@ -91,7 +91,8 @@ def _place_rows(
     delay_s, gain = camera.row_delays_s(centroids.xy_px), error_gain(camera, -jacobian @ rate)
     error_rad2 = gain @ covariance_of(centroids) @ np.swapaxes(gain, 1, 2) / camera.focal_px**2
     slopes = np.concatenate([jacobian @ turn.as_matrix(), -delay_s[:, None, None] * jacobian], axis=2)
-    return _Rows(camera.tangents(centroids.xy_px) - ray[:, :2] / ray[:, 2:], slopes, inverses(error_rad2))
+    residual, information = camera.tangents(centroids.xy_px) - ray[:, :2] / ray[:, 2:], inverses(error_rad2)
+    return _Rows(residual, slopes, information * inliers(residual, information)[:, None, None])
 
 
 def _streak_rows(camera: Camera, centroids: Centroids, jacobian: Floats, rate: Floats, exposure_s: float) -> _Rows:

@@ -27,7 +27,8 @@ from estimator.core.types import Attitude, Centroids, RateEstimate
 SHORT_STREAK_PX = 1.5  # standard deviation of a streak that is too short to be seen
 SLOW_RAD_S = np.radians(0.5)  # that of a rate without streaks, if the exposure is unknown
 SMALL_SHEAR_PX = 1.0  # at the first and last row: tried before the full range of slow rates
-ROUNDS = 3  # of the fit: the lights change with the rate
+SAME_FOCAL = 2e-3  # relative difference of focal lengths that a rate not yet fitted causes
+ROUNDS = 5  # of the fit: the lights change with the rate
 
 
 class Lights(NamedTuple):
@@ -64,11 +65,11 @@ def solve_rolling(
     """
     for candidate, prior in candidates(camera, lights.sight, centroids, rate, exposure_s):
         attitude = solve_global(at_middle_row(camera, centroids, candidate, lights.sight))
-        fitted, matched = candidate, np.empty(0, int)
+        fitted, matched = candidate, np.empty((2, 0), int)
         for _ in range(ROUNDS):
-            if attitude.match is None or np.array_equal(attitude.match.observed, matched):
+            if attitude.match is None or np.array_equal((attitude.match.observed, attitude.match.star), matched):
                 break
-            matched = attitude.match.observed
+            matched = np.stack([attitude.match.observed, attitude.match.star])
             try:
                 fitted = _fit(camera, lights, centroids, attitude, (candidate, prior), exposure_s)
             except ValueError as error:
@@ -122,7 +123,7 @@ def _fit(
 
     The rows alone tell the rate with its sign. The streaks are used if the rows tell their sign beyond doubt.
     """
-    match, (candidate, prior), lens = attitude.match, start, attitude.camera or camera
+    match, (candidate, prior), lens = attitude.match, start, _lens(attitude, camera)
     assert match is not None
     seen = lights.with_errors(centroids.take(match.observed), match.star)
     places = lights.place_ref[match.star]
@@ -135,6 +136,12 @@ def _fit(
         return by_rows.rate
     first = by_rows.cam_from_ref, signed.rate_rad_s
     return rolling.fit(lens, seen, places, lights.lever_cam_m, first, prior, exposure_s).rate
+
+
+def _lens(attitude: Attitude, camera: Camera) -> Camera:
+    """The camera of a solution; the calibration where both agree, as a search that fits the focal length fits shear."""
+    fitted = attitude.camera or camera
+    return fitted if abs(fitted.focal_px / camera.focal_px - 1) > SAME_FOCAL else camera
 
 
 def _apart(one: RateEstimate, other: RateEstimate) -> float:
@@ -164,7 +171,7 @@ def _with_rate(
     assert match is not None
     assert cam_from_ref is not None
     assert attitude.covariance_rad2 is not None
-    lens, seen = attitude.camera or camera, lights.with_errors(centroids.take(match.observed), match.star)
+    lens, seen = _lens(attitude, camera), lights.with_errors(centroids.take(match.observed), match.star)
     place = cam_from_ref.apply(lights.place_ref[match.star])
     jacobian = tangent_jacobian(place, place - lights.lever_cam_m).reshape(-1, 2, 3)
     by_rate = rolling.rate_covariance_rad2(lens, seen, jacobian, rate.covariance_rad2_s2)
