@@ -27,6 +27,7 @@ from estimator.core.types import Attitude, Centroids, RateEstimate
 SHORT_STREAK_PX = 1.5  # standard deviation of a streak that is too short to be seen
 SLOW_RAD_S = np.radians(0.5)  # that of a rate without streaks, if the exposure is unknown
 SMALL_SHEAR_PX = 1.0  # at the first and last row: tried before the full range of slow rates
+PRIOR_FACTOR = 4.0  # of slow rates, in the fit: streaks that differ over the field are not seen either
 SAME_FOCAL = 2e-3  # relative difference of focal lengths that a rate not yet fitted causes
 ROUNDS = 5  # of the fit: the lights change with the rate
 
@@ -101,10 +102,12 @@ def candidates(
     yield from ((streak, anything) for streak in streaks)
     slow_rad_s = SHORT_STREAK_PX / camera.focal_px / exposure_s if exposure_s is not None else SLOW_RAD_S
     shear_px = slow_rad_s * camera.focal_px * abs(camera.row_time_s) * camera.height_px / 2
-    slow = RateEstimate(np.zeros(3), slow_rad_s**2 * np.eye(3))
+    # About the boresight a streak is short near the center: at half the height it is as long for a greater rate.
+    sigma = slow_rad_s * np.array([1.0, 1.0, 2 * camera.focal_px / camera.height_px])
+    slow, prior = (RateEstimate(np.zeros(3), np.diag((factor * sigma) ** 2)) for factor in (1, PRIOR_FACTOR))
     if shear_px > SMALL_SHEAR_PX:
-        yield replace(slow, covariance_rad2_s2=slow.covariance_rad2_s2 * (SMALL_SHEAR_PX / shear_px) ** 2), slow
-    yield slow, slow
+        yield replace(slow, covariance_rad2_s2=slow.covariance_rad2_s2 * (SMALL_SHEAR_PX / shear_px) ** 2), prior
+    yield slow, prior
 
 
 def _signs(rate: RateEstimate) -> list[RateEstimate]:
