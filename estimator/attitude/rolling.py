@@ -2,8 +2,8 @@
 
 Light i, at P_i in the reference frame, is seen at the delay t_i of its row along q_i = exp(-[w] t_i) A P_i - r: the
 attitude A is that at mid-exposure of the middle row, w the camera's rate and r its lever arm. Gauss-Newton fits both to
-the tangents of all lights but outliers, to the chords of their streaks (`rate`) and to a prior of the rate. The residual
-of a tangent has the Jacobian J_i exp(-[w] t_i) by a small rotation of A, and -t_i J_i by the rate; its error is that of
+the tangents of all lights but outliers, to the chords of their streaks (`rate`) and to a prior of the rate. A tangent's
+residual has the Jacobian J_i exp(-[w] t_i) by a small rotation of A, and -t_i J_i by the rate; its error is that of
 `motion.at_middle_row`.
 """
 
