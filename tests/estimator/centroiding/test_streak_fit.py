@@ -235,12 +235,12 @@ def test_round_stars_get_the_round_fit() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stretch", [1.0, 1.15])
+@pytest.mark.parametrize("stretch", [1.0, 1.5])
 def test_a_star_s_own_streak_errs_as_it_says_whatever_the_frame_s(stretch: float) -> None:
-    """The vector without priors has no bias and an honest covariance, also if the frame's streak is 15 % too long."""
+    """The vector without priors has no bias and an honest covariance, also if the frame's streak is half too long."""
     true, nees, errors = np.array([6.0, 3.5]), [], []
     for seed in range(8):
-        image, _ = field(np.random.default_rng([69, seed]), *true, np.full(36, 20_000.0))
+        image, _ = field(np.random.default_rng([69, seed]), *true, np.full(36, 3_000.0))
         found = streak(image, detect.default(image), 1.0, FramePriors(tuple(stretch * true)))
         assert found.streak_px is not None
         assert found.streak_covariance_px2 is not None
@@ -251,7 +251,7 @@ def test_a_star_s_own_streak_errs_as_it_says_whatever_the_frame_s(stretch: float
         ]
     assert np.mean(nees) == pytest.approx(2, abs=4 * 2 / np.sqrt(len(nees)))
     offset, spread = np.mean(np.concatenate(errors), axis=0), np.std(np.concatenate(errors), axis=0)
-    np.testing.assert_allclose(offset, 0, rtol=0, atol=4 * spread.max() / np.sqrt(len(nees)) + 0.01)
+    np.testing.assert_allclose(offset, 0, rtol=0, atol=4 * spread.max() / np.sqrt(len(nees)))
 
 
 def test_a_frame_s_short_streak_is_corrected_by_its_stars() -> None:
