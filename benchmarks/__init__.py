@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from benchmarks import attitude, detect, dynamics, identify, instrument, start
+from benchmarks import attitude, detect, dynamics, identify, instrument, rate, rolling, start
 
 AREAS: dict[str, Callable[[], list[dict[str, Any]]]] = {
     "instrument": instrument.measure,
@@ -17,6 +17,8 @@ AREAS: dict[str, Callable[[], list[dict[str, Any]]]] = {
     "attitude": attitude.measure,
     "dynamics": dynamics.measure,
     "start": start.measure,
+    "rolling": rolling.measure,
+    "rate": rate.measure,
 }
 
 

@@ -55,17 +55,19 @@ class Lever:
     sigma_m: float = 0.0
 
 
-def on_sphere(rays_body: Floats, camera_body_m: Floats, radius_m: float) -> Floats:
+def on_sphere(rays_body: Floats, camera_body_m: Floats, radius_m: Floats | float) -> Floats:
     """Return (N, 3) intersections of rays from the camera with a sphere about the bearing center, in the body frame.
 
+    radius_m : of one sphere, or (N,) of one for each ray
     |c + s u| = R gives s = -c.u + sqrt((c.u)^2 - c.c + R^2). No attitude is needed: the sphere is the same in every
     attitude. Raises ValueError if the camera is outside the sphere.
     """
     along = rays_body @ camera_body_m
     discriminant = along**2 - camera_body_m @ camera_body_m + radius_m**2
-    if radius_m <= np.linalg.norm(camera_body_m):
+    least_m = np.min(radius_m)
+    if least_m <= np.linalg.norm(camera_body_m):
         raise ValueError(
-            f"camera {np.linalg.norm(camera_body_m)} m from the bearing; allowed: inside the sphere of {radius_m} m"
+            f"camera {np.linalg.norm(camera_body_m)} m from the bearing; allowed: inside the sphere of {least_m} m"
         )
     return camera_body_m + (-along + np.sqrt(discriminant))[:, None] * rays_body
 

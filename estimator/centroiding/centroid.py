@@ -99,7 +99,8 @@ def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePr
             rows[failed] = _fit_gaussians(image, blobs.take(failed), gain_e_dn, priors)
         rows = _with_fallback(rows, image, blobs, gain_e_dn)
         covariance[failed] = rows[failed, 2, None, None] ** 2 * np.eye(2)
-    return Centroids(rows[:, :2], rows[:, 2], rows[:, 3], covariance)
+    own = streaks[:, [10, 12, 12, 11]].reshape(-1, 2, 2)
+    return Centroids(rows[:, :2], rows[:, 2], rows[:, 3], covariance, streaks[:, 8:10], own)
 
 
 def streak_ends(
@@ -151,6 +152,8 @@ def prepare(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors)
     return to_native(image)
 
 
+STREAK_ROUNDS, MIN_STREAKS = 4, 3  # fits of a frame's streaks; measured ones that replace the frame's
+
 CENTROIDERS: dict[str, Centroider] = {
     "default": streak,
     "cog": cog,
@@ -185,21 +188,32 @@ def _fit_gaussians(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: Frame
 
 
 def _fit_streaks(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> Floats:
-    """Return the rows of `streak_fit.fit_all`; all NaN for a frame that is not smeared."""
-    streak_px = _frame_streak(blobs, priors)
-    if np.hypot(*streak_px) < streak_fit.MIN_STREAK_PX:
-        return np.full((len(blobs), 8), np.nan)
-    sky = blobs.background
-    return streak_fit.fit_all(
-        image,
-        blobs.xy_px,
-        blobs.box_px,
-        sky.level,
-        sky.noise,
-        streak_px,
-        float(gain_e_dn),
-        priors.saturation,
-    )
+    """Return the rows of `streak_fit.fit_all`; all NaN for a frame that is not smeared.
+
+    Where no gyro tells the frame's streak, the fit is repeated with the median of the fitted ones if that is another:
+    the moments of faint streaks, of which the ends are below the threshold, make them too short.
+    """
+    streak_px, sky = _frame_streak(blobs, priors), blobs.background
+    rows = np.full((len(blobs), streak_fit.OUTPUTS), np.nan)
+    for _ in range(1 if priors.streak_px else STREAK_ROUNDS):
+        if np.hypot(*streak_px) < streak_fit.MIN_STREAK_PX:
+            break
+        scene = image, blobs.xy_px, blobs.box_px, sky.level, sky.noise
+        rows = streak_fit.fit_all(*scene, streak_px, float(gain_e_dn), priors.saturation)
+        fitted_px = _median_streak(rows[:, 8:10], streak_px)
+        if np.hypot(*np.subtract(fitted_px, streak_px)) < streak_fit.length_sigma_px(np.hypot(*streak_px)) / 4:
+            break
+        streak_px = fitted_px
+    return rows
+
+
+def _median_streak(vectors_px: Floats, streak_px: tuple[float, float]) -> tuple[float, float]:
+    """Median of the streaks (N, 2) that were measured, with signs as that of the frame; the frame's with too few."""
+    measured = vectors_px[np.isfinite(vectors_px[:, 0])]
+    if len(measured) < MIN_STREAKS:
+        return streak_px
+    dx, dy = np.median(measured * np.where(measured @ np.array(streak_px) < 0, -1.0, 1.0)[:, None], axis=0)
+    return float(dx), float(dy)
 
 
 def _frame_streak(blobs: Blobs, priors: FramePriors) -> tuple[float, float]:

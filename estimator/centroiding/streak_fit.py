@@ -5,6 +5,9 @@ equation). Gauss-Newton solves for center, flux, length, direction, width and sk
 Gaussian priors around the streak shared by the frame: without them, the fit of a faint streak would settle on its
 brightest piece. The covariance is the Cramer-Rao bound of the center, inflated by the reduced chi-square where the
 model does not fit, plus the error along the streak of misplacing its ends in noise (`_end_variance_px2`).
+
+For the angular rate, the streak's vector is also given without its priors (`_own_vector`): all stars share the mean of
+the priors, so that its error would not average out.
 """
 
 from __future__ import annotations
@@ -30,6 +33,8 @@ LENGTH_FRACTION, LENGTH_PX, ANGLE_RAD, WIDTH_FRACTION = 0.15, 0.5, 0.15, 0.15
 FAR_SIGMA = 5.0  # from an end of the line: 3e-7 of the light is beyond
 # Parameters: center, flux, length, direction, width, sky.
 X, Y, FLUX, LENGTH, ANGLE, WIDTH, SKY = range(7)
+OUTPUTS = 13
+MAX_OWN_ERROR = 0.3  # largest relative error of a length without priors: the fit is linear for smaller ones
 
 
 @jit
@@ -43,9 +48,13 @@ def fit_all(
     gain_e_dn: float,
     saturation: float,
 ) -> Floats:
-    """Fit every blob: (N, 8) x, y, flux, dx, dy, and xx, yy, xy of the center's covariance; NaN if not a streak."""
+    """Fit every blob: (N, 13); NaN if not a streak.
+
+    Columns: x, y, flux, dx, dy, and xx, yy, xy of the center's covariance; then dx, dy without the priors and their
+    xx, yy, xy, NaN if the star alone does not tell its streak.
+    """
     height, width = image.shape
-    out = np.full((len(xy), 8), np.nan)
+    out = np.full((len(xy), OUTPUTS), np.nan)
     buffer, p = np.empty(len(xy), np.int64), np.empty(7)
     # The window covers the frame's streak, with a margin, about the blob's center.
     half_x, half_y = int(abs(streak[0]) / 2) + MARGIN_PX, int(abs(streak[1]) / 2) + MARGIN_PX
@@ -80,6 +89,12 @@ def fit_all(
 
 
 @jit
+def length_sigma_px(length_px: float) -> float:
+    """Standard deviation of the prior on a streak's length."""
+    return LENGTH_FRACTION * length_px + LENGTH_PX
+
+
+@jit
 def _distance_to_line(p: Floats, x: float, y: float) -> float:
     """Distance of a pixel from the line segment."""
     along_x, along_y = cos(p[ANGLE]), sin(p[ANGLE])
@@ -99,7 +114,7 @@ def _fit(pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: F
     count = pixels.shape[1]
     start_x, start_y = p[X], p[Y]
     start_length, start_angle, start_width = p[LENGTH], p[ANGLE], p[WIDTH]
-    length_sigma = LENGTH_FRACTION * start_length + LENGTH_PX
+    length_sigma = length_sigma_px(start_length)
     normal, step = np.empty((8, 8)), np.empty(7)
     for _ in range(MAX_ITERATIONS):
         _rows(pixels, noise, gain_e_dn, p, rows, weight)
@@ -124,14 +139,60 @@ def _fit(pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: F
             out[3], out[4] = p[LENGTH] * cos(p[ANGLE]), p[LENGTH] * sin(p[ANGLE])
             out[5], out[6], out[7] = least_squares.position_covariance(normal, step)
             # Degrees of freedom: seven parameters, three priors.
-            out[5:] *= least_squares.misfit_factor(normal[7, 7], count - 4)
+            misfit = least_squares.misfit_factor(normal[7, 7], count - 4)
+            out[5:8] *= misfit
             # A scalar variance along the streak becomes a covariance in x and y.
-            end_variance = _end_variance_px2(p, noise, gain_e_dn) / p[LENGTH] ** 2
+            end_variance_px2 = _end_variance_px2(p, noise, gain_e_dn)
+            _own_vector(normal, p, start_length, start_angle, misfit, 8 * end_variance_px2, step, out[8:])
+            end_variance = end_variance_px2 / p[LENGTH] ** 2
             out[5] += end_variance * out[3] ** 2
             out[6] += end_variance * out[4] ** 2
             out[7] += end_variance * out[3] * out[4]
             return True
     return False
+
+
+@jit
+def _own_vector(
+    factor: Floats,
+    p: Floats,
+    prior_length: float,
+    prior_angle: float,
+    misfit: float,
+    ends_px2: float,
+    column: Floats,
+    out: Floats,
+) -> None:
+    """Write dx, dy of a streak without the priors on length and angle, and xx, yy, xy of their covariance.
+
+    With the prior's information P and the posterior's covariance S and mean m, the data alone have the information
+    D = S^-1 - P and the mean m + D^-1 P (m - prior), as all are Gaussian near the solution. `ends_px2` is the variance
+    of the length by ends misplaced in noise: eight times that of the center.
+    """
+    cov = np.empty((2, 2))
+    for i in range(2):
+        column[:] = 0.0
+        column[LENGTH + i] = 1.0
+        least_squares.cholesky_solve(factor, column)
+        cov[i, 0], cov[i, 1] = column[LENGTH], column[ANGLE]
+    prior_l, prior_a = 1 / length_sigma_px(prior_length) ** 2, 1 / ANGLE_RAD**2
+    det = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
+    ll, aa, la = cov[1, 1] / det - prior_l, cov[0, 0] / det - prior_a, -cov[0, 1] / det
+    det = ll * aa - la**2
+    if not (ll > 0 and aa > 0 and det > 0):
+        return
+    ll, aa, la = aa / det, ll / det, -la / det
+    pull_l, pull_a = prior_l * (p[LENGTH] - prior_length), prior_a * (p[ANGLE] - prior_angle)
+    length, angle = p[LENGTH] + ll * pull_l + la * pull_a, p[ANGLE] + la * pull_l + aa * pull_a
+    ll, aa, la = misfit * ll + ends_px2, misfit * aa, misfit * la
+    if not (ll < (MAX_OWN_ERROR * length) ** 2 and aa < MAX_OWN_ERROR**2 and length > 0):
+        return
+    c, s = cos(angle), sin(angle)
+    across, both = length**2 * aa, length * la
+    out[0], out[1] = length * c, length * s
+    out[2] = ll * c * c + across * s * s - 2 * both * c * s
+    out[3] = ll * s * s + across * c * c + 2 * both * c * s
+    out[4] = (ll - across) * c * s + both * (c * c - s * s)
 
 
 @jit

@@ -39,6 +39,8 @@ class Camera:
     center_px: principal point (x, y); the center of pixel (0, 0) is (0, 0)
     distortion: k1, k2, p1, p2, k3 in OpenCV's order
     focal_sigma: relative standard deviation of the focal length: the error of a calibration, the same in every frame
+    row_time_s : rolling shutter: each row is exposed this long after the one above it, negative if the lower one is
+        first; 0 for a global shutter
 
     Raises ImageError for numbers that no camera has.
     """
@@ -49,6 +51,7 @@ class Camera:
     center_px: tuple[float, float]
     distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
     focal_sigma: float = 0.0
+    row_time_s: float = 0.0
 
     def __post_init__(self) -> None:
         if self._is_plain():
@@ -60,6 +63,8 @@ class Camera:
         object.__setattr__(self, "focal_px", focal)
         sigma = checks.number("camera: focal_sigma", self.focal_sigma, 0.0, 0.5, "0 to 0.5, relative")
         object.__setattr__(self, "focal_sigma", sigma)
+        row_time = checks.number("camera: row_time_s", self.row_time_s, -1.0, 1.0, "-1 to 1: seconds from row to row")
+        object.__setattr__(self, "row_time_s", row_time)
         # Plain floats: compiled code would be compiled again for a tuple of integers.
         for name, count in (("center_px", 2), ("distortion", 5)):
             array = checks.floats(f"camera: {name}", getattr(self, name), (count,))
@@ -72,13 +77,14 @@ class Camera:
         size, lens = (self.width_px, self.height_px), (self.center_px, self.distortion)
         if not (type(lens[0]) is type(lens[1]) is tuple and len(lens[0]) == 2 and len(lens[1]) == 5):
             return False
-        numbers = (self.focal_px, self.focal_sigma, *lens[0], *lens[1])
+        numbers = (self.focal_px, self.focal_sigma, self.row_time_s, *lens[0], *lens[1])
         return (
             all([type(one) is int and 0 < one <= 1e6 for one in size])
             and all([type(one) is float for one in numbers])
             and math.isfinite(sum(numbers))
             and 1e-9 <= self.focal_px <= 1e12
             and 0 <= self.focal_sigma <= 0.5
+            and abs(self.row_time_s) <= 1
         )
 
     @classmethod
@@ -151,6 +157,10 @@ class Camera:
         low, right = margin_px - 0.5, self.width_px - 0.5 - margin_px
         bottom = self.height_px - 0.5 - margin_px
         return (x >= low) & (x <= right) & (y >= low) & (y <= bottom)
+
+    def row_delays_s(self, xy_px: Floats) -> Floats:
+        """(N,) time of each light's mid-exposure after that of the middle row, to which an attitude refers."""
+        return np.asarray(self.row_time_s * (xy_px[:, 1] - (self.height_px - 1) / 2))
 
     def _fold(self) -> float:
         """Squared tangent at which the radial distortion folds back; infinite if it does not.

@@ -40,6 +40,37 @@ NO_PRIORS = FramePriors()
 
 
 @dataclass(frozen=True, slots=True)
+class RateEstimate:
+    """Angular rate of the camera, with its error.
+
+    rate_rad_s : (3,) in camera axes: cam_from_ref changes by exp(-[rate] t) in the time t
+    covariance_rad2_s2 : (3, 3)
+    sign_known : False if the frame cannot tell the rate from its negative, as one frame of a global shutter
+    """
+
+    rate_rad_s: Floats
+    covariance_rad2_s2: Floats
+    sign_known: bool = True
+
+    def resolved(self, other: RateEstimate) -> RateEstimate:
+        """The one of the two signs that is nearer to another rate, by both covariances; itself if the sign is known.
+
+        The sign stays unknown where the other rate fits both: unless the squared Mahalanobis distances differ by
+        SIGN_CHI2, or the sign of the other rate is unknown too.
+        """
+        if self.sign_known or not other.sign_known:
+            return self
+        information = np.linalg.inv(self.covariance_rad2_s2 + other.covariance_rad2_s2)
+        apart = [sign * self.rate_rad_s - other.rate_rad_s for sign in (1, -1)]
+        plus, minus = (float(difference @ information @ difference) for difference in apart)
+        rate_rad_s = self.rate_rad_s if plus <= minus else -self.rate_rad_s
+        return RateEstimate(rate_rad_s, self.covariance_rad2_s2, abs(plus - minus) > SIGN_CHI2)
+
+
+SIGN_CHI2 = 16.0  # by which the chi-squares of both signs of a rate differ if the sign is known
+
+
+@dataclass(frozen=True, slots=True)
 class Background:
     """Sky level and noise of an image, on a coarse grid of tile centers.
 
@@ -84,6 +115,9 @@ class Blobs:
         return replace(self, **{name: getattr(self, name)[which] for name in names})
 
 
+OPTIONAL_SHAPES = {"covariance_px2": (2, 2), "streak_px": (2,), "streak_covariance_px2": (2, 2), "moments_px2": (3,)}
+
+
 @dataclass(frozen=True, slots=True)
 class Centroids:
     """Measured positions of the blobs, brightest first: the search begins with the first ones.
@@ -92,6 +126,9 @@ class Centroids:
     sigma_px : (N,) standard deviation per coordinate; the root of the mean variance where x and y differ
     flux     : (N,) above the background, in any unit
     covariance_px2 : (N, 2, 2) from a centroider that models x and y separately (streaks), else None
+    streak_px      : (N, 2) vector of each light's streak, sign arbitrary, NaN where it is not measured; None if none is
+    streak_covariance_px2 : (N, 2, 2) of streak_px
+    moments_px2    : (N, 3) second moments xx - yy, 2 xy, xx + yy of lights that are disks; None if not measured
 
     Any array of numbers is taken; it is kept as C-contiguous float64. Raises ImageError for other shapes, or for arrays
     of different lengths; the numbers are checked by whoever solves them (`check_values`).
@@ -101,15 +138,19 @@ class Centroids:
     sigma_px: Floats
     flux: Floats
     covariance_px2: Floats | None = None
+    streak_px: Floats | None = None
+    streak_covariance_px2: Floats | None = None
+    moments_px2: Floats | None = None
 
     def __post_init__(self) -> None:
         xy_px = checks.floats("centroids: xy_px", self.xy_px, (None, 2))
         object.__setattr__(self, "xy_px", xy_px)
         for name in ("sigma_px", "flux"):
             object.__setattr__(self, name, checks.floats(f"centroids: {name}", getattr(self, name), (len(xy_px),)))
-        if self.covariance_px2 is not None:
-            spread = checks.floats("centroids: covariance_px2", self.covariance_px2, (len(xy_px), 2, 2))
-            object.__setattr__(self, "covariance_px2", spread)
+        for name, shape in OPTIONAL_SHAPES.items():
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, checks.floats(f"centroids: {name}", value, (len(xy_px), *shape)))
 
     def check_values(self) -> None:
         """Raise ImageError unless positions are finite, sigmas in their range and fluxes above 0; in a microsecond."""
@@ -129,8 +170,9 @@ class Centroids:
 
     def take(self, which: NDArray[Any]) -> Centroids:
         """Select centroids by mask or index."""
-        spread = None if self.covariance_px2 is None else self.covariance_px2[which]
-        return Centroids(self.xy_px[which], self.sigma_px[which], self.flux[which], spread)
+        optional = (self.covariance_px2, self.streak_px, self.streak_covariance_px2, self.moments_px2)
+        taken = (None if array is None else array[which] for array in optional)
+        return Centroids(self.xy_px[which], self.sigma_px[which], self.flux[which], *taken)
 
     def weights_per_px2(self, sigma_px: Floats) -> Floats:
         """Return (N, 3) xx, yy, xy of the inverse covariances for total errors sigma_px (N,).
@@ -193,12 +235,14 @@ class Attitude:
     """The tracker's solution, or the reason why there is none.
 
     status          : "solved", or the reason why there is no attitude
-    cam_from_ref    : reference (ICRS for stars, lab for the dome) to camera; None unless solved
+    cam_from_ref    : reference (ICRS for stars, lab for the dome) to camera, at mid-exposure (of the middle row with a
+        rolling shutter); None unless solved
     covariance_rad2 : (3, 3) of the small rotation in camera axes; None unless solved
     match           : the stars used; None unless solved
     rms_px          : RMS residual of the matched centroids; NaN unless solved
     camera          : the calibration used, fitted where it was uncertain; None unless solved
     systematic_rad2 : (3, 3) the part of covariance_rad2 that is common to successive frames; None if there is none
+    rate            : of the camera at the attitude's time; None where neither streaks nor rows tell it
     """
 
     status: str
@@ -208,6 +252,7 @@ class Attitude:
     rms_px: float = float("nan")
     camera: Camera | None = None
     systematic_rad2: Floats | None = None
+    rate: RateEstimate | None = None
 
     @property
     def solved(self) -> bool:

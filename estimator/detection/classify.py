@@ -83,6 +83,13 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
     return replace(blobs, flag=flag, streak_px=streak_px)
 
 
+def moments(image: NDArray, blobs: Blobs) -> Floats:
+    """Return the (N, 3) second moments of each blob, px^2: xx - yy, 2 xy and xx + yy."""
+    background = blobs.background
+    _, _, across, x, y = _shapes(image, blobs.box_px, background.level, background.noise).T
+    return np.column_stack([x / 12, y / 12, 2 * across + np.hypot(x, y) / 12])
+
+
 @jit
 def _flags(
     shape: Floats,

@@ -7,6 +7,7 @@ reject blended LEDs, and solve.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -15,12 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude import systematic
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, on_sphere, project
+from estimator.attitude.motion import center_streak_px
 from estimator.attitude.nearfield import SOLVERS, fitted_sigma_rad
 from estimator.catalog import pair_index
 from estimator.core import checks
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
-from estimator.core.types import Attitude, Centroids, StarMatch
+from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.leds import search
 from estimator.identification.leds.index import build_dome_index, corner_rays, inner_field
@@ -37,6 +39,7 @@ from estimator.trackers.pipeline import (
     process_frame,
 )
 from estimator.trackers.refinement import mutual_nearest
+from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
 from estimator.trackers.star_tracker import NO_STARS
 
 MIN_ERROR_PX = 0.3  # least centroid error of an LED, for effects outside of survey and calibration
@@ -131,12 +134,23 @@ class DomeTracker:
         self.identify = IDENTIFIERS[settings.identifier](camera, leds, lever, settings)
         self.led_sigma_rad = led_sigma_rad(leds, lever)
 
-    def solve(self, image: NDArray, streak_px: tuple[float, float] | None = None) -> Report:
+    def solve(
+        self,
+        image: NDArray,
+        streak_px: tuple[float, float] | None = None,
+        rate: RateEstimate | None = None,
+        exposure_s: float | None = None,
+    ) -> Report:
         """Solve one frame. Raises ImageError for bad input; any other failure is reported in the status.
 
-        streak_px : (dx, dy) that lights move during the exposure, from the gyro; None if unknown
+        streak_px : (dx, dy) that lights move during the exposure, from the gyro; None if unknown, or if `rate` tells it
+        rate      : of the camera, from the gyro; None: a rolling shutter's rate is told by the frame
+        exposure_s: tells the rate from streaks; None if unknown
         """
-        return process_frame(image, self.camera, self.settings, self.solve_centroids, streak_px)
+        if streak_px is None and rate is not None and rate.sign_known and exposure_s is not None:
+            streak_px = center_streak_px(self.camera, rate, exposure_s)
+        solve = partial(self.solve_centroids, rate=rate, exposure_s=exposure_s)
+        return process_frame(image, self.camera, self.settings, solve, streak_px)
 
     def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
         """Compile all that `solve` and `solve_centroids` use: call it before the experiment.
@@ -155,13 +169,37 @@ class DomeTracker:
         warm_up.run(self.camera, xy_px, np.ones(len(xy_px)), dtype, self.solve)
         self.solve_centroids(Centroids(xy_px, np.full(len(xy_px), 0.1), np.ones(len(xy_px))))
 
-    def solve_centroids(self, centroids: Centroids, clock: Clock | None = None) -> Attitude:
-        """Identify and solve centroids from any source (the truth included)."""
+    def solve_centroids(
+        self,
+        centroids: Centroids,
+        clock: Clock | None = None,
+        rate: RateEstimate | None = None,
+        exposure_s: float | None = None,
+    ) -> Attitude:
+        """Identify and solve centroids from any source (the truth included); rate, exposure_s : as in `solve`."""
         checks.of_type("centroids", centroids, Centroids)
         centroids.check_values()
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
             return Attitude(NO_STARS)
+        lever_cam_m = self.lever.cam_from_body.apply(self.lever.camera_body_m)
+        lights = Lights(self.leds.position_m, lever_cam_m, self._with_errors)
+        if self.camera.row_time_s:
+            solve = partial(self._solve_global, clock=clock)
+            return solve_rolling(self.camera, lights, centroids, solve, rate, exposure_s)
+        return with_streak_rate(self._solve_global(centroids, clock), centroids, exposure_s, rate, lights)
+
+    def _with_errors(self, centroids: Centroids, star: NDArray) -> Centroids:
+        """K centroids with their total errors: the LEDs' places and the focal length too."""
+        rays = self.camera.rays(centroids.xy_px)
+        pixel_rad = np.hypot(
+            direction_sigma_rad(centroids, self.camera, self.settings), focal_error_rad(rays, self.camera)
+        )
+        sigma_px = self.camera.focal_px * np.hypot(pixel_rad, self.led_sigma_rad[star])
+        return replace(centroids, sigma_px=sigma_px, covariance_px2=None)
+
+    def _solve_global(self, centroids: Centroids, clock: Clock) -> Attitude:
+        """Identify and solve centroids of one time."""
         bright = brightest(centroids, self.settings)
         rays = self.camera.rays(bright.xy_px)
         focal_rad = focal_error_rad(rays, self.camera)

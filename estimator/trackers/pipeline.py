@@ -23,8 +23,9 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera, check_frame
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Blobs, Centroids, FramePriors
+from estimator.detection import classify
 from estimator.detection.classify import NO_STAR, Flag
-from estimator.detection.detect import DETECTORS, in_row_order, replace_bad_pixels
+from estimator.detection.detect import DETECTORS, in_row_order, replace_bad_pixels, to_native
 
 SATURATED = "the frame is saturated"
 # Extra centroid error of a saturated blob, whose plateau has edges at whole pixels. Monte Carlo: 0.01 to 0.07 px, more
@@ -189,6 +190,9 @@ def detect_and_centroid(
     clock.lap("detect")
     centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, priors)
     centroids = inflate_uncertainty(centroids, blobs, settings)
+    if camera.row_time_s and streak_px is None and centroids.streak_px is None:
+        # The rows of a frame are far apart in time, so that even a rough rate is needed to identify its lights.
+        centroids = replace(centroids, moments_px2=classify.moments(to_native(image), blobs))
     clock.lap("centroid")
     sigma_px = centroids.sigma_px
     valid = camera.contains(centroids.xy_px) & (sigma_px > 0) & (sigma_px < MAX_CENTROID_SIGMA_PX)

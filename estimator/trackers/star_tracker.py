@@ -20,13 +20,14 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from estimator.attitude.motion import center_streak_px, covariance_of
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.attitude.systematic import with_focal_error
 from estimator.catalog import catalog, pair_index, quad_index, sky_index
 from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
-from estimator.core.types import Attitude, Centroids, StarMatch
+from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification.chance import (
     MIN_EVIDENCE_MATCHES,
 )
@@ -35,6 +36,7 @@ from estimator.identification.stars.evidence import Detections, Solution
 from estimator.trackers import warm_up
 from estimator.trackers.pipeline import Clock, Report, Settings, brightest, check_algorithms, process_frame
 from estimator.trackers.refinement import NO_MATCH, FieldMatcher
+from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
 
 NO_STARS = "too few stars detected"
 MIN_ERROR_PX = 0.005  # least centroid error of a star: a calibrated lens, a catalog's places
@@ -168,12 +170,23 @@ class StarTracker:
         vectors = catalog.apparent(stars, catalog.on_earth(catalog.utc(date)))
         return cls(camera, stars, vectors, settings, focal_uncertainty)
 
-    def solve(self, image: NDArray, streak_px: tuple[float, float] | None = None) -> Report:
+    def solve(
+        self,
+        image: NDArray,
+        streak_px: tuple[float, float] | None = None,
+        rate: RateEstimate | None = None,
+        exposure_s: float | None = None,
+    ) -> Report:
         """Solve one frame. Raises ImageError for bad input; any other failure is reported in the status.
 
-        streak_px : (dx, dy) that stars move during the exposure, from the gyro; None if unknown
+        streak_px : (dx, dy) that stars move during the exposure, from the gyro; None if unknown, or if `rate` tells it
+        rate      : of the camera, from the gyro; None: a rolling shutter's rate is told by the frame
+        exposure_s: tells the rate from streaks; None if unknown
         """
-        return process_frame(image, self.camera, self.settings, self.solve_centroids, streak_px)
+        if streak_px is None and rate is not None and rate.sign_known and exposure_s is not None:
+            streak_px = center_streak_px(self.camera, rate, exposure_s)
+        solve = functools.partial(self.solve_centroids, rate=rate, exposure_s=exposure_s)
+        return process_frame(image, self.camera, self.settings, solve, streak_px)
 
     def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
         """Compile all that `solve` and `solve_centroids` use, and build the quads: call it before the flight.
@@ -204,10 +217,18 @@ class StarTracker:
         """Number of searches, with different error models and efforts, that are made before a frame is given up."""
         return len(self.searches) if self.patterns is not None else 1
 
-    def solve_centroids(self, centroids: Centroids, clock: Clock | None = None, effort: int | None = None) -> Attitude:
+    def solve_centroids(
+        self,
+        centroids: Centroids,
+        clock: Clock | None = None,
+        effort: int | None = None,
+        rate: RateEstimate | None = None,
+        exposure_s: float | None = None,
+    ) -> Attitude:
         """Identify and solve centroids from any source (the truth included).
 
         effort : run only this one of the `efforts` searches, from 0; None: all of them in turn
+        rate, exposure_s : as in `solve`
         """
         checks.of_type("centroids", centroids, Centroids)
         centroids.check_values()
@@ -216,6 +237,20 @@ class StarTracker:
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
             return Attitude(NO_STARS)
+        if self.camera.row_time_s:
+            lights = Lights(self.stars.vectors, np.zeros(3), lambda seen, _: self.with_errors(seen))
+            solve = functools.partial(self._solve_global, clock=clock, effort=effort)
+            return solve_rolling(self.camera, lights, centroids, solve, rate, exposure_s)
+        return with_streak_rate(self._solve_global(centroids, clock, effort), centroids, exposure_s, rate)
+
+    def with_errors(self, centroids: Centroids) -> Centroids:
+        """The centroids with their total errors as covariances."""
+        sigma_px = self.sigma_px(centroids)
+        excess_px2 = (sigma_px**2 - centroids.sigma_px**2)[:, None, None] * np.eye(2)
+        return replace(centroids, sigma_px=sigma_px, covariance_px2=covariance_of(centroids) + excess_px2)
+
+    def _solve_global(self, centroids: Centroids, clock: Clock, effort: int | None) -> Attitude:
+        """Identify and solve centroids of one time."""
         if self.patterns is not None:
             searches = self.searches if effort is None else self.searches[effort : effort + 1]
             return self._identify_by_evidence(centroids, self.patterns, searches, clock)

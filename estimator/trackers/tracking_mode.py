@@ -8,7 +8,7 @@ last attitude is too old, the whole frame is solved lost in space.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
 from math import log10, pi
 
@@ -21,7 +21,7 @@ from estimator.core import checks
 from estimator.core.arrays import Floats
 from estimator.core.camera import check_frame
 from estimator.core.errors import ImageError
-from estimator.core.types import Attitude, Centroids, FramePriors, StarMatch
+from estimator.core.types import Attitude, Centroids, FramePriors, RateEstimate, StarMatch
 from estimator.detection.classify import Flag
 from estimator.detection.detect import in_row_order
 from estimator.detection.windows import in_windows
@@ -30,10 +30,12 @@ from estimator.identification.stars import evidence
 from estimator.identification.stars.search import ACCEPT_DEX
 from estimator.trackers import warm_up
 from estimator.trackers.pipeline import Clock, Report, detect_and_centroid, inflate_uncertainty
+from estimator.trackers.rolling_shutter import with_streak_rate
 from estimator.trackers.star_tracker import StarTracker
 
 WINDOW_SIGMA = 4.0  # detection threshold in windows: lower than in a frame, as fewer pixels are searched
 LONGEST_STREAK_PX = 4.0  # longer streaks are detected with the streak filter in the whole frame
+RATE_CHANGE = 0.3  # relative difference of a rate from its mean since the last attitude
 ROUGH = 3.0  # reduced chi-square above which a solution is flagged
 
 
@@ -68,7 +70,7 @@ class TrackedReport(Report):
 
 @dataclass(frozen=True, slots=True)
 class LastSolution:
-    """The last attitude, with its time and angular rate (camera axes at that time)."""
+    """The last attitude, with its time and the angular rate of the stars in camera axes, minus that of the camera."""
 
     t_s: float
     cam_from_ref: Rotation
@@ -105,23 +107,29 @@ class TrackingMode:
         t_s: float,
         now_from_then: Rotation | None = None,
         streak_px: tuple[float, float] | None = None,
+        exposure_s: float | None = None,
     ) -> TrackedReport:
         """Solve the frame at t_s. Raises ImageError for bad input; any other failure is reported in the status.
 
+        A rate by streaks gets its sign from the last attitude. The frames of a rolling shutter are solved lost in
+        space, with that rate.
+
         now_from_then : cam(t_s) from cam at the last solved frame, from the gyros; None: the last rate is extrapolated
         streak_px     : (dx, dy) that stars move during the exposure, from the gyros
+        exposure_s    : tells the rate from streaks
         """
         check_frame(image, self.tracker.camera)
         image, streak_px = in_row_order(image), checks.pixel_step("streak_px", streak_px)
         t_s = checks.number("t_s", t_s, -1e300, 1e300, "a finite time in seconds")
         if now_from_then is not None:
             checks.one_rotation("now_from_then", now_from_then)
-        predicted = self._predict(t_s, now_from_then)
+        predicted = None if self.tracker.camera.row_time_s else self._predict(t_s, now_from_then)
         clock = Clock()
         report = self._track(image, predicted, streak_px, clock) if predicted is not None else None
         if report is None:
-            report = self._search(image, streak_px, clock)
-        self._store(t_s, report.attitude.cam_from_ref)
+            report = self._search(image, streak_px, clock, exposure_s)
+        report.attitude = self._with_rate(t_s, report.attitude, report.centroids, exposure_s)
+        self._store(t_s, report.attitude)
         return report
 
     def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
@@ -148,11 +156,26 @@ class TrackingMode:
             now_from_then = Rotation.from_rotvec(last.rate_rad_s * (t_s - last.t_s))
         return now_from_then * last.cam_from_ref
 
-    def _store(self, t_s: float, cam_from_ref: Rotation | None) -> None:
+    def _with_rate(self, t_s: float, attitude: Attitude, centroids: Centroids, exposure_s: float | None) -> Attitude:
+        """The attitude with the rate of its streaks, whose sign the last attitude tells."""
+        if attitude.rate is None:
+            attitude = with_streak_rate(attitude, centroids, exposure_s)
+        last, cam_from_ref = self.last, attitude.cam_from_ref
+        if attitude.rate is None or cam_from_ref is None or last is None or not 0 < t_s - last.t_s <= self.max_age_s:
+            return attitude
+        between_rad_s = -(cam_from_ref * last.cam_from_ref.inv()).as_rotvec() / (t_s - last.t_s)
+        sigma_rad_s = RATE_CHANGE * float(np.linalg.norm(between_rad_s))
+        between = RateEstimate(between_rad_s, sigma_rad_s**2 * np.eye(3))
+        return replace(attitude, rate=attitude.rate.resolved(between))
+
+    def _store(self, t_s: float, attitude: Attitude) -> None:
         """Store the attitude and its rate. A frame without an attitude leaves the memory unchanged."""
+        cam_from_ref = attitude.cam_from_ref
         if cam_from_ref is None:
             return
         last, rate_rad_s = self.last, np.zeros(3)
+        if attitude.rate is not None and attitude.rate.sign_known:
+            rate_rad_s = -attitude.rate.rate_rad_s
         if last is not None and 0 < t_s - last.t_s <= self.max_age_s:
             rate_rad_s = (cam_from_ref * last.cam_from_ref.inv()).as_rotvec() / (t_s - last.t_s)
         self.last = LastSolution(t_s, cam_from_ref, rate_rad_s)
@@ -184,11 +207,13 @@ class TrackingMode:
         clock.lap("solve")
         return self._report(attitude, centroids, sigma_px, clock, len(window_centers_px), saturated, streak_px)
 
-    def _search(self, image: NDArray, streak_px: tuple[float, float] | None, clock: Clock) -> TrackedReport:
+    def _search(
+        self, image: NDArray, streak_px: tuple[float, float] | None, clock: Clock, exposure_s: float | None
+    ) -> TrackedReport:
         """Solve the whole frame lost in space."""
         tracker = self.tracker
         centroids = detect_and_centroid(image, tracker.camera, tracker.settings, clock, streak_px)
-        attitude = tracker.solve_centroids(centroids, clock)
+        attitude = tracker.solve_centroids(centroids, clock, exposure_s=exposure_s)
         return self._report(attitude, centroids, tracker.sigma_px(centroids), clock, 0, False, streak_px)
 
     def window_centers_px(self, cam_from_ref: Rotation) -> Floats:

@@ -222,6 +222,8 @@ class FrameRow:
     wrong : solved, but off by more than ten arcminutes and by more than the tracker claims (`metrics.is_wrong`)
     cross_sigma_arcsec, roll_sigma_arcsec : standard deviations that the tracker claims;  log10_chance : of its
         matches
+    rate_error_deg_s : angular rate of the camera by the tracker minus the truth, length of the vector; of the two signs
+        the nearer one if the tracker does not know the sign;  rate_sigma_deg_s : that it claims
     filter : verdict of the attitude filter on the solution; empty without a filter
     """
 
@@ -243,3 +245,5 @@ class FrameRow:
     roll_sigma_arcsec: float = float("nan")
     log10_chance: float = float("nan")
     exposure_s: float = float("nan")
+    rate_error_deg_s: float = float("nan")
+    rate_sigma_deg_s: float = float("nan")

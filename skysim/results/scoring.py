@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.core.types import ra_dec_roll_rad
+from estimator.core.types import RateEstimate, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Frame, FrameRow, Mount, Truth
@@ -53,6 +53,7 @@ def row(result: FrameResult, scene: Scene, mount: Mount, verdict: str = "") -> F
         variance = np.diag(covariance)
         cross_sigma, roll_sigma = float(np.sqrt(variance[:2].sum())), float(np.sqrt(variance[2]))
         chance = attitude.match.log10_chance if attitude.match else chance
+    rate_error, rate_sigma = rate_errors_deg_s(attitude.rate, truth)
     return FrameRow(
         frame=result.frame.index,
         t_s=truth.t_s,
@@ -72,7 +73,21 @@ def row(result: FrameResult, scene: Scene, mount: Mount, verdict: str = "") -> F
         wrong=wrong,
         filter=verdict,
         exposure_s=result.frame.exposure_s,
+        rate_error_deg_s=rate_error,
+        rate_sigma_deg_s=rate_sigma,
     )
+
+
+def rate_errors_deg_s(rate: RateEstimate | None, truth: Truth) -> tuple[float, float]:
+    """Error of a rate, with the sign that is nearer to the truth if its own is unknown, and the error that it claims.
+
+    Both are lengths of vectors, NaN without a rate.
+    """
+    if rate is None:
+        return float("nan"), float("nan")
+    signs = (1,) if rate.sign_known else (1, -1)
+    error = min(np.linalg.norm(sign * rate.rate_rad_s - truth.rate_cam_rad_s) for sign in signs)
+    return float(np.degrees(error)), float(np.degrees(np.sqrt(np.trace(rate.covariance_rad2_s2))))
 
 
 def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
@@ -97,6 +112,8 @@ def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
         "rms_px",
         "time_ms",
         "exposure_s",
+        "rate_error_deg_s",
+        "rate_sigma_deg_s",
         "wrong",
         "filter",
     ):

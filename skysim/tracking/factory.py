@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 from estimator.catalog import catalog
 from estimator.core.errors import ImageError
-from estimator.core.types import Attitude, Centroids
+from estimator.core.types import Attitude, Centroids, RateEstimate
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
@@ -61,14 +61,20 @@ def build_tracker(scene: Scene, mount: Mount, sources: Sources, programs: Mappin
     return StarTracker(camera, stars, directions, settings)
 
 
-def solve_frame(estimator: Estimator, frame: Frame, streak_px: tuple[float, float] | None = None) -> Report:
+def solve_frame(
+    estimator: Estimator,
+    frame: Frame,
+    streak_px: tuple[float, float] | None = None,
+    rate: RateEstimate | None = None,
+) -> Report:
     """The tracker's report on a frame; an image that it refuses (empty, saturated) gives a report with that status.
 
     streak_px : (dx, dy) that lights move in the exposure, if a gyro measures it
+    rate      : of the camera, if a gyro measures it; external trackers get streak_px only
     """
     if isinstance(estimator, UserTracker):
         return estimator.solve_frame(frame, streak_px)
     try:
-        return estimator.solve(frame.image_dn, streak_px)
+        return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s)
     except ImageError as error:
         return Report(Attitude(str(error)), Centroids.empty())

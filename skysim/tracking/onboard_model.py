@@ -14,7 +14,7 @@ from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
 from skysim.core.types import Mount, Sources
 from skysim.scene.scene import Scene
-from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig, RollingShutterConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources.catalog import require_catalog
 from skysim.sources.dome.layouts import registry
@@ -92,6 +92,8 @@ def assumed_camera(scene: Scene) -> Camera:
     config, camera = scene.tracker, calibration(scene.camera)
     if config.assumed_distortion is not None:
         camera = replace(camera, distortion=config.assumed_distortion)
+    if config.assumed_row_time_s is not None:
+        camera = replace(camera, row_time_s=config.assumed_row_time_s)
     focal_m = scene.camera.focal_length_m
     assumed_m = config.assumed_focal_length_m or survey_errors.assumed_focal_length_m(focal_m, config.survey)
     return replace(camera.zoomed(assumed_m / focal_m), focal_sigma=float(config.survey.focal_length_sigma_m) / focal_m)
@@ -99,7 +101,9 @@ def assumed_camera(scene: Scene) -> Camera:
 
 def calibration(camera: CameraConfig) -> Camera:
     """The exact calibration of a camera, as the estimator's Camera."""
-    return Camera(camera.width_px, camera.height_px, camera.focal_px, camera.center_px, camera.distortion)
+    row_time_s = camera.shutter.row_time_s if isinstance(camera.shutter, RollingShutterConfig) else 0.0
+    size_px = camera.width_px, camera.height_px
+    return Camera(*size_px, camera.focal_px, camera.center_px, camera.distortion, row_time_s=row_time_s)
 
 
 def onboard_catalog(key: str, name: str) -> catalog.StarCatalog:

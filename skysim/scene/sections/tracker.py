@@ -97,6 +97,7 @@ class TrackerConfig(ConfigModel):
     detector, centroider, identifier, solver : if left out, under a dome local, cog, led_pairs and rotation_only, and
         under the stars all of them `default`
     assumed_distortion : k1, k2, p1, p2, k3 of the lens; as it is if left out
+    assumed_row_time : of a rolling shutter; 0 for a tracker that takes all rows as exposed at once
     brightest : only this many of the brightest detections of a frame are used
     exposure_control : every frame is exposed for `exposure.time` if left out
     """
@@ -115,6 +116,7 @@ class TrackerConfig(ConfigModel):
     centroid_sigma_px: Annotated[Number, Field(gt=0)] = 0.2
     assumed_focal_length_m: Annotated[Length, Field(gt=0)] | None = None
     assumed_distortion: tuple[Number, Number, Number, Number, Number] | None = None
+    assumed_row_time_s: Annotated[Time, Field(ge=0)] | None = None
     brightest: Annotated[int, Field(ge=3, le=1000)] | None = None
     assumed_camera_body_m: tuple[Length, Length, Length] | None = None
     survey: SurveyErrorsConfig = SurveyErrorsConfig()

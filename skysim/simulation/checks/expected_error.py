@@ -18,7 +18,7 @@ A known error is one of the second kind with p = 1. With G_i the derivative of x
     LED survey     : S_i = sigma^2 G_i G_i'                  lever survey : E_i = -sigma G_i
     surface survey : E_i = sigma G_i R n_i, n_i the normal   focal length : E_i = relative error (x_i - center)
     survey rotation r : E_i = G_i R (r x P_i)                distortion, star places : difference of the image positions
-    rolling shutter : E_i = velocity times the row's delay from the middle row
+    rolling shutter : E_i = velocity times the row's delay from the middle row, less the delay that the tracker assumes
     angular acceleration a : E_i = -J_i a T^2 / 24 against the attitude at mid-exposure: the images are rotated by
         rate t + a t^2 / 2 at the time t from it, and the mean of t^2 / 2 over an exposure T is T^2 / 24
 
@@ -163,7 +163,11 @@ def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Com
     camera = context.camera.optics.camera
     if not isinstance(camera.shutter, RollingShutterConfig):
         return None
-    delay_s = camera.shutter.row_time_s * (view.xy_px[:, 1] - (camera.height_px - 1) / 2)
+    assumed_s = context.testbed.scene.tracker.assumed_row_time_s
+    error_s = 0.0 if assumed_s is None else camera.shutter.row_time_s - assumed_s
+    if not error_s:
+        return None
+    delay_s = error_s * (view.xy_px[:, 1] - (camera.height_px - 1) / 2)
     return Common((view.streak_px / context.testbed.scene.exposure.time_s * delay_s[:, None])[:, :, None])
 
 

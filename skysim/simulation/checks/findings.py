@@ -237,7 +237,7 @@ MISMATCH_KEYS = {
     "focal length": "tracker.assumed_focal_length",
     "distortion": "tracker.assumed_distortion",
     "assumed lever": "tracker.assumed_camera_body",
-    "rolling shutter": "camera.shutter",
+    "rolling shutter": "tracker.assumed_row_time",
     "survey set-up": "tracker.survey.instrument",
     "surface survey": "light.surface.error",
 }
@@ -247,9 +247,8 @@ CHANGES: dict[str, Callable[[Scene, float], str]] = {
     "distortion": lambda scene, excess: f"change it to {list(scene.camera.distortion)}, the lens's",
     "assumed lever": lambda scene, excess: "leave it out, or fit the place with tracker.solver: pnp",
     "rolling shutter": lambda scene, excess: (
-        f"turn {short(excess, 2)} times slower, or change row_time to {short(row_time_us(scene) / excess, 2)} us if the"
-        " chip can: rows are read one after another, and the tracker does not correct for it (a gyro changes nothing);"
-        " a camera with shutter {kind: global} has no such error"
+        f"leave it out, so that the tracker corrects the rows for {short(row_time_us(scene), 3)} us each, or turn"
+        f" {short(excess, 2)} times slower"
     ),
     "survey set-up": lambda scene, excess: (
         f"change it to one of smaller errors of the set-up, by a factor of {short(excess, 2)}"

@@ -1,5 +1,7 @@
 """Smeared stars: found by a line filter, placed by a line fit, against frames drawn here and the Cramér-Rao bound."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from interpreted import interpreted
@@ -232,6 +234,37 @@ def test_round_stars_get_the_round_fit() -> None:
     assert lines.covariance_px2 is None  # x and y are alike
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("stretch", [1.0, 1.5])
+def test_a_star_s_own_streak_errs_as_it_says_whatever_the_frame_s(stretch: float) -> None:
+    """The vector without priors has no bias and an honest covariance, also if the frame's streak is half too long."""
+    true, nees, errors = np.array([6.0, 3.5]), [], []
+    for seed in range(8):
+        image, _ = field(np.random.default_rng([69, seed]), *true, np.full(36, 3_000.0))
+        found = streak(image, detect.default(image), 1.0, FramePriors(tuple(stretch * true)))
+        assert found.streak_px is not None
+        assert found.streak_covariance_px2 is not None
+        own = found.streak_px * np.sign(found.streak_px @ true)[:, None]
+        errors.append(own - true)
+        nees += [
+            error @ np.linalg.solve(P, error) for error, P in zip(own - true, found.streak_covariance_px2, strict=True)
+        ]
+    assert np.mean(nees) == pytest.approx(2, abs=4 * 2 / np.sqrt(len(nees)))
+    offset, spread = np.mean(np.concatenate(errors), axis=0), np.std(np.concatenate(errors), axis=0)
+    np.testing.assert_allclose(offset, 0, rtol=0, atol=4 * spread.max() / np.sqrt(len(nees)))
+
+
+def test_a_frame_s_short_streak_is_corrected_by_its_stars() -> None:
+    """Stars of a faint frame look too short by their moments; the median of the fits replaces it."""
+    image, _ = field(np.random.default_rng(70), 12.0, 4.0, np.full(30, 20_000.0))
+    blobs = replace(detect.default(image), streak_px=(7.0, 2.3))
+    found = streak(image, blobs)
+    assert found.streak_px is not None
+    length = np.linalg.norm(found.streak_px, axis=1)
+    assert np.nanmedian(length) == pytest.approx(np.hypot(12, 4), rel=0.02)
+    assert np.isfinite(length).sum() >= 25
+
+
 def test_false_streaks_of_white_noise_are_rare() -> None:
     # The line's mean over 12 pixels has some 2^20 / 40 independent values a frame; five of their sigmas leave 3e-7.
     rng = np.random.default_rng(68)
@@ -305,7 +338,7 @@ def test_a_fit_that_begins_some_pixels_off_comes_to_the_truth(start: tuple[float
     plain = interpreted("estimator.centroiding.streak_fit")
     y, x = (grid.ravel().astype(float) for grid in np.mgrid[:31, :41])
     truth = np.array([20.3, 14.8, 50000.0, 9.0, 0.4, 0.8, 7.0])
-    rows, weight, out = np.ones((8, x.size)), np.empty(x.size), np.empty(8)
+    rows, weight, out = np.ones((8, x.size)), np.empty(x.size), np.empty(13)
     plain._rows(np.vstack([x, y, np.zeros(x.size)]), 1.0, 1e9, truth, rows, weight)
     p = np.add(truth, [start[0], start[1], 0, start[2], start[3], 0.1, 0])
     assert plain._fit(np.vstack([x, y, -rows[7]]), 1.0, 1e9, rows, weight, p, out)
@@ -330,7 +363,7 @@ def test_a_fit_uses_every_pixel_near_its_line_and_no_other() -> None:
     # The window ends 4 px beyond the line's ends in x and y.
     near = (far_px <= 4.5) & (np.abs(x - 20) <= 8) & (np.abs(y - 20) <= 7)
     plain_fit, used = fit(), np.argwhere(near)
-    assert plain_fit.shape == (1, 8)
+    assert plain_fit.shape == (1, 13)
     np.testing.assert_allclose(plain_fit[0, :2], [20.3, 19.8], rtol=0, atol=0.01)
     for at in (used[0], used[-1]):
         assert np.abs(fit(tuple(at)) - plain_fit).max() > 1e-3
@@ -355,7 +388,7 @@ def test_a_streak_s_length_direction_and_width_are_weighed_with_the_frame_s() ->
     def residuals(p: np.ndarray) -> np.ndarray:
         return np.append((light - model(p)) / noise, (start - p)[3:6] / [0.15 * 9 + 0.5, 0.15, 0.15 * 0.8])
 
-    p, rows, weight, out = start.copy(), np.ones((8, x.size)), np.empty(x.size), np.empty(8)
+    p, rows, weight, out = start.copy(), np.ones((8, x.size)), np.empty(x.size), np.empty(13)
     assert plain._fit(np.vstack([x, y, light]), noise, 1e9, rows, weight, p, out)
     wanted = optimize.least_squares(residuals, start, x_scale=[1, 1, 100, 1, 0.1, 0.1, 1], xtol=1e-12).x
     assert 10 < wanted[3] < 11.5  # between the frame's and its own

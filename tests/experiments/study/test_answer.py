@@ -299,16 +299,18 @@ def test_findings_of_many_levels_are_few(tmp_path: Path) -> None:
 
 def test_a_rolling_shutter_is_checked_at_the_rates_of_the_trials(tmp_path: Path) -> None:
     """The scene turns by 0.5 deg/s and its trials by up to 20: the warning is of 20, and none is given at rest."""
-    shutter = {"camera.shutter": {"kind": "rolling", "row_time": "80 us"}}
+    shutter = {"camera.shutter": {"kind": "rolling", "row_time": "80 us"}, "tracker.assumed_row_time": "0 s"}
     rates = {"key": "trial.rate_deg_s", "values": [0, 20, 5]}
     keys: dict[str, Any] = {"scene": "shefex2", "set": shutter, "trial": {"kind": "frames"}}
     found = overview.overview(loaded(tmp_path, factors={"rate": rates}, **keys)).findings
-    (text,) = [one for one in found if one.startswith("camera.shutter: ")]
-    assert "at up to 20 deg/s; turn " in text
-    assert "the tracker does not correct for it (a gyro changes nothing)" in text
+    (text,) = [one for one in found if one.startswith("tracker.assumed_row_time: ")]
+    assert "at up to 20 deg/s; leave it out, so that the tracker corrects the rows for 80 us each, or turn " in text
     assert text.endswith("[rate = 20]")
     still = overview.overview(loaded(tmp_path, factors={"rate": rates | {"values": [0]}}, **keys)).findings
-    assert [one for one in still if one.startswith("camera.shutter: ")] == []
+    assert [one for one in still if one.startswith("tracker.assumed_row_time: ")] == []
+    keys["set"] = {"camera.shutter": shutter["camera.shutter"]}
+    known = overview.overview(loaded(tmp_path, factors={"rate": rates}, **keys)).findings
+    assert [one for one in known if "row_time" in one] == []
 
 
 def test_a_report_begins_with_scene_findings_and_answers(tmp_path: Path) -> None:

@@ -45,6 +45,7 @@ STATED_IMAGING = {
 }
 FITTED_IMAGING = {  # rolling shutter, exposure of a non-integer number of LED cycles, early saturation
     "camera.shutter": '{kind: rolling, row_time: "83 us"}',
+    "tracker.assumed_row_time": "0 s",  # the thesis's tracker does not know its rows' times
     "camera.detector.full_well_e": "30500",
     "exposure.time": "16.667 ms",
     "light.led.intensity": "73.5 mcd",

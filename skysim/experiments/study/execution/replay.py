@@ -94,7 +94,13 @@ def replayed_frames(setup: Setup, seed: int) -> Iterator[tuple[Frame, Truth, Rep
             yield result.frame, result.truth, result.report
     else:
         frame, truth, streak_px = trials.render_trial_frame(setup, seed)
-        yield frame, truth, solve_or_failed(lambda: factory.solve_frame(setup.estimator, frame, streak_px))
+        yield (
+            frame,
+            truth,
+            solve_or_failed(
+                lambda: factory.solve_frame(setup.estimator, frame, streak_px, trials.gyro_rate(setup, truth))
+            ),
+        )
 
 
 def solve_or_failed(solve: Callable[[], Report]) -> Report:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.core.types import Centroids
+from estimator.core.types import Centroids, RateEstimate
 from estimator.trackers.pipeline import Report
 from skysim.camera import render
 from skysim.camera.render import Poses, image_tracks, in_view
@@ -48,6 +48,7 @@ from skysim.simulation import exposure, run
 from skysim.simulation.testbed import MARGIN_S, Testbed, exposure_window
 from skysim.tracking import factory
 
+GYRO_RAD_S = 1e-5  # standard deviation that a frame trial's gyro claims, 2 arcseconds a second
 KNOTS = 9  # samples of a frame trial's trajectory
 STREAK_POSES = 9  # poses along the streak of a frame that is not rendered
 ANY_TIME_S = np.array([0.0, 1.0])  # the pose does not change, so the times are arbitrary
@@ -128,7 +129,7 @@ def streams(setup: Setup, seed: int) -> tuple[np.random.Generator, np.random.Gen
 def run_frame_trial(setup: Setup, seed: int) -> Outcome:
     """Frame trial: random attitude, one rendered frame, solved."""
     frame, truth, streak_px = render_trial_frame(setup, seed)
-    report = factory.solve_frame(setup.estimator, frame, streak_px)
+    report = factory.solve_frame(setup.estimator, frame, streak_px, gyro_rate(setup, truth))
     return score(setup.testbed, setup.estimator, report, true_lights(truth))
 
 
@@ -281,6 +282,12 @@ def render_trial_frame(setup: Setup, seed: int) -> tuple[Frame, Truth, tuple[flo
     streak_px = exposure_window(testbed.scene, 0).exposure_s * testbed.scene.camera.focal_px
     # For a star on the boresight: d(x / z)/dt = -w_y, d(y / z)/dt = w_x.
     return frame, truth, (-rate_cam[1] * streak_px, rate_cam[0] * streak_px) if trial.gyro else None
+
+
+def gyro_rate(setup: Setup, truth: Truth) -> RateEstimate | None:
+    """The rate in camera axes that the trial's gyro measures, without an error; None without a gyro."""
+    assert isinstance(setup.trial, FrameTrial)
+    return RateEstimate(truth.rate_cam_rad_s, GYRO_RAD_S**2 * np.eye(3)) if setup.trial.gyro else None
 
 
 def rate_axis(axis: str | AxisConfig, azimuth_rad: float, mount: Mount) -> Floats:

@@ -1,0 +1,199 @@
+"""Frames of a rolling shutter: put every light at the time of the middle row, and solve as a global shutter's frame.
+
+The rate of the camera moves the lights (`attitude.motion`). It is given by a gyro, or taken from the streaks, in both
+signs, or assumed to be slow, with an error that covers the streaks that are too short to be seen. The identified lights
+then tell attitude and rate together (`attitude.rolling`), and the frame is solved once more with that rate. Every stage
+of the tracker therefore works on lights of one time, and its tests against a wrong camera model stay as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.attitude import rolling
+from estimator.attitude.disk_rate import from_moments
+from estimator.attitude.motion import STARS, Sight, at_middle_row
+from estimator.attitude.nearfield import tangent_jacobian
+from estimator.attitude.rate import MAX_RATE_RAD_S, from_streaks
+from estimator.core.arrays import Floats
+from estimator.core.camera import Camera
+from estimator.core.types import Attitude, Centroids, RateEstimate
+
+SHORT_STREAK_PX = 1.5  # standard deviation of a streak that is too short to be seen
+SLOW_RAD_S = np.radians(0.5)  # that of a rate without streaks, if the exposure is unknown
+SMALL_SHEAR_PX = 1.0  # at the first and last row: tried before the full range of slow rates
+PRIOR_FACTOR = 4.0  # of slow rates, in the fit: streaks that differ over the field are not seen either
+SAME_FOCAL = 2e-3  # relative difference of focal lengths that a rate not yet fitted causes
+ROUNDS = 5  # of the fit: the lights change with the rate
+
+
+class Lights(NamedTuple):
+    """The lights of a tracker.
+
+    place_ref   : (N, 3) unit vectors of stars, or LEDs from the bearing, m
+    lever_cam_m : (3,) the camera from the bearing, in camera axes; zeros for stars
+    with_errors : returns K centroids of given lights (K,) with their total errors
+    """
+
+    place_ref: Floats
+    lever_cam_m: Floats
+    with_errors: Callable[[Centroids, NDArray], Centroids]
+
+    @property
+    def sight(self) -> Sight:
+        """All lights at the median distance."""
+        return Sight(self.lever_cam_m, float(np.median(np.linalg.norm(self.place_ref, axis=1))))
+
+
+def solve_rolling(
+    camera: Camera,
+    lights: Lights,
+    centroids: Centroids,
+    solve_global: Callable[[Centroids], Attitude],
+    rate: RateEstimate | None = None,
+    exposure_s: float | None = None,
+) -> Attitude:
+    """Attitude and rate at the middle row of a rolling shutter; the last refusal if no candidate of the rate solves.
+
+    solve_global : solves centroids of one time
+    rate         : from a gyro; None: from the frame
+    exposure_s   : None: streaks tell nothing of the rate
+    """
+    for candidate, prior in candidates(camera, lights.sight, centroids, rate, exposure_s):
+        attitude = solve_global(at_middle_row(camera, centroids, candidate, lights.sight))
+        fitted, matched = candidate, np.empty((2, 0), int)
+        for _ in range(ROUNDS):
+            if attitude.match is None or np.array_equal((attitude.match.observed, attitude.match.star), matched):
+                break
+            matched = np.stack([attitude.match.observed, attitude.match.star])
+            try:
+                fitted = _fit(camera, lights, centroids, attitude, (candidate, prior), exposure_s)
+            except ValueError as error:
+                attitude = Attitude(f"no attitude: {error}")
+                break
+            exact = replace(fitted, covariance_rad2_s2=np.zeros((3, 3)))
+            attitude = solve_global(at_middle_row(camera, centroids, exact, _sight_of(lights, attitude, centroids)))
+        if attitude.solved:
+            return _with_rate(camera, lights, centroids, attitude, fitted)
+    return attitude
+
+
+def candidates(
+    camera: Camera, sight: Sight, centroids: Centroids, rate: RateEstimate | None, exposure_s: float | None
+) -> Iterator[tuple[RateEstimate, RateEstimate]]:
+    """Rates with which a frame is identified, and the prior with which attitude and rate are then fitted.
+
+    The gyro's alone, if it is given; else those of the streaks, in both signs; at last slow ones.
+    """
+    if rate is not None:
+        yield from ((signed, signed) for signed in _signs(rate))
+        return
+    anything = RateEstimate(np.zeros(3), MAX_RATE_RAD_S**2 * np.eye(3))
+    streaks = []
+    if exposure_s is not None:
+        streaks = from_streaks(camera, centroids, exposure_s, sight) or from_moments(
+            camera, centroids, exposure_s, sight
+        )
+    yield from ((streak, anything) for streak in streaks)
+    slow_rad_s = SHORT_STREAK_PX / camera.focal_px / exposure_s if exposure_s is not None else SLOW_RAD_S
+    shear_px = slow_rad_s * camera.focal_px * abs(camera.row_time_s) * camera.height_px / 2
+    # About the boresight a streak is short near the center: at half the height it is as long for a greater rate.
+    sigma = slow_rad_s * np.array([1.0, 1.0, 2 * camera.focal_px / camera.height_px])
+    slow, prior = (RateEstimate(np.zeros(3), np.diag((factor * sigma) ** 2)) for factor in (1, PRIOR_FACTOR))
+    if shear_px > SMALL_SHEAR_PX:
+        yield replace(slow, covariance_rad2_s2=slow.covariance_rad2_s2 * (SMALL_SHEAR_PX / shear_px) ** 2), prior
+    yield slow, prior
+
+
+def _signs(rate: RateEstimate) -> list[RateEstimate]:
+    return [rate] if rate.sign_known else [rate, replace(rate, rate_rad_s=-rate.rate_rad_s)]
+
+
+def _fit(
+    camera: Camera,
+    lights: Lights,
+    centroids: Centroids,
+    attitude: Attitude,
+    start: tuple[RateEstimate, RateEstimate],
+    exposure_s: float | None,
+) -> RateEstimate:
+    """The rate from the matched lights of a frame, `start` being a candidate and its prior.
+
+    The rows alone tell the rate with its sign. The streaks are used if the rows tell their sign beyond doubt.
+    """
+    match, (candidate, prior), lens = attitude.match, start, _lens(attitude, camera)
+    assert match is not None
+    seen = lights.with_errors(centroids.take(match.observed), match.star)
+    places = lights.place_ref[match.star]
+    by_rows = rolling.fit(lens, seen, places, lights.lever_cam_m, (match.cam_from_ref, candidate.rate_rad_s), prior)
+    streaks = from_streaks(lens, seen, exposure_s, _radii(lights, places)) if exposure_s is not None else []
+    if not streaks:
+        return by_rows.rate
+    signed = min((streak.resolved(by_rows.rate) for streak in streaks), key=lambda one: _apart(one, by_rows.rate))
+    if not signed.sign_known:
+        return by_rows.rate
+    first = by_rows.cam_from_ref, signed.rate_rad_s
+    return rolling.fit(lens, seen, places, lights.lever_cam_m, first, prior, exposure_s).rate
+
+
+def _lens(attitude: Attitude, camera: Camera) -> Camera:
+    """The camera of a solution; the calibration where both agree, as a search that fits the focal length fits shear."""
+    fitted = attitude.camera or camera
+    return fitted if abs(fitted.focal_px / camera.focal_px - 1) > SAME_FOCAL else camera
+
+
+def _apart(one: RateEstimate, other: RateEstimate) -> float:
+    """Squared Mahalanobis distance of two rates."""
+    difference = one.rate_rad_s - other.rate_rad_s
+    return float(difference @ np.linalg.solve(one.covariance_rad2_s2 + other.covariance_rad2_s2, difference))
+
+
+def _radii(lights: Lights, places: Floats) -> Sight:
+    """The sight of identified lights: each at its own distance from the bearing, which no attitude changes."""
+    return Sight(lights.lever_cam_m, np.linalg.norm(places, axis=1))
+
+
+def _sight_of(lights: Lights, attitude: Attitude, centroids: Centroids) -> Sight:
+    """The sight of all centroids, those at their own distance that are identified."""
+    assert attitude.match is not None
+    radius_m = np.full(len(centroids), lights.sight.radius_m)
+    radius_m[attitude.match.observed] = np.linalg.norm(lights.place_ref[attitude.match.star], axis=1)
+    return Sight(lights.lever_cam_m, radius_m)
+
+
+def _with_rate(
+    camera: Camera, lights: Lights, centroids: Centroids, attitude: Attitude, rate: RateEstimate
+) -> Attitude:
+    """The attitude with its rate, whose error is added to the covariance."""
+    match, cam_from_ref = attitude.match, attitude.cam_from_ref
+    assert match is not None
+    assert cam_from_ref is not None
+    assert attitude.covariance_rad2 is not None
+    lens, seen = _lens(attitude, camera), lights.with_errors(centroids.take(match.observed), match.star)
+    place = cam_from_ref.apply(lights.place_ref[match.star])
+    jacobian = tangent_jacobian(place, place - lights.lever_cam_m).reshape(-1, 2, 3)
+    by_rate = rolling.rate_covariance_rad2(lens, seen, jacobian, rate.covariance_rad2_s2)
+    return replace(attitude, covariance_rad2=attitude.covariance_rad2 + by_rate, rate=rate)
+
+
+def with_streak_rate(
+    attitude: Attitude,
+    centroids: Centroids,
+    exposure_s: float | None,
+    gyro: RateEstimate | None = None,
+    lights: Lights | None = None,
+) -> Attitude:
+    """The attitude of a global shutter with the rate that the streaks of its lights tell; a gyro tells their sign."""
+    match, camera = attitude.match, attitude.camera
+    if match is None or camera is None or exposure_s is None:
+        return attitude
+    sight = STARS if lights is None else _radii(lights, lights.place_ref[match.star])
+    streaks = from_streaks(camera, centroids.take(match.observed), exposure_s, sight)
+    if not streaks:
+        return attitude
+    return replace(attitude, rate=streaks[0] if gyro is None else streaks[0].resolved(gyro))

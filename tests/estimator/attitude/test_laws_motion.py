@@ -1,0 +1,235 @@
+"""Laws of a turning camera: velocities, frames at one time, rates from streaks, disks and rows, and their errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from laws import SEEDS, answered, assert_covariance, law, units
+from moving_lights import CAMERA, EXPOSURE_S, STREAK_SIGMA_PX, Moving, moving
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude import disk_rate, motion, nearfield, rate, rolling
+from estimator.attitude.motion import STARS, Sight
+from estimator.core.arrays import Floats
+from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
+from estimator.core.types import Centroids, RateEstimate
+from estimator.detection import classify
+from estimator.detection.detect import local
+
+ARCSEC_RAD = np.radians(1 / 3600)
+ANYTHING = RateEstimate(np.zeros(3), 100.0 * np.eye(3))
+DOME = Sight(np.array([0.02, -0.03, 0.3]), 1.2)
+GLOBAL = replace(CAMERA, row_time_s=0.0)
+
+
+def any_rate(rng: np.random.Generator, most_deg_s: float = 5.0) -> Floats:
+    """Degrees per second about any axis, at least one across the boresight."""
+    across = units(rng, 1)[0] * [1, 1, 0]
+    return rng.uniform(1.0, most_deg_s) * (across / np.linalg.norm(across) + [0, 0, rng.uniform(-0.3, 0.3)])
+
+
+def exact(rate_rad_s: Floats) -> RateEstimate:
+    return RateEstimate(rate_rad_s, np.zeros((3, 3)))
+
+
+@law(motion.tangent_motion, motion.places_cam, motion.center_streak_px, motion.Sight.take, Camera.row_delays_s)
+@given(rng=SEEDS)
+def test_images_move_as_the_rate_says(rng: np.random.Generator) -> None:
+    for sight in STARS, DOME, DOME._replace(radius_m=rng.uniform(1.0, 1.4, 30)):
+        seen = replace(moving(rng, any_rate(rng), sight=sight), camera=GLOBAL)
+        rays = GLOBAL.rays(seen.still_px)
+        step_s = 1e-6
+        moved = [GLOBAL.tangents(seen.pixels(np.full(30, t_s))) for t_s in (-step_s, step_s)]
+        expected = (moved[1] - moved[0]) / 2 / step_s
+        assert_allclose(motion.tangent_motion(rays, sight) @ seen.rate_rad_s, expected, rtol=0, atol=1e-6)
+        assert_allclose(seen.cam_from_ref.apply(seen.place_ref), motion.places_cam(rays, sight), rtol=0, atol=1e-12)
+        some = motion.places_cam(rays[[3, 1]], sight.take(np.array([3, 1])))
+        assert_allclose(some, motion.places_cam(rays, sight)[[3, 1]], rtol=0, atol=0)
+    middle_px = np.array([[5.0, (CAMERA.height_px - 1) / 2], [5.0, (CAMERA.height_px - 1) / 2 + 10]])
+    assert_allclose(CAMERA.row_delays_s(middle_px), [0, 10 * CAMERA.row_time_s], rtol=0, atol=1e-18)
+    dx, dy = motion.center_streak_px(CAMERA, exact(np.array([0.1, 0.2, 5.0])), 0.5)
+    assert (dx, dy) == pytest.approx((-0.2 * 0.5 * 3000, 0.1 * 0.5 * 3000))
+
+
+@law(motion.at_middle_row, motion.error_gain, motion.covariance_of)
+@given(rng=SEEDS)
+def test_lights_of_a_rolling_shutter_are_put_where_a_global_one_sees_them(rng: np.random.Generator) -> None:
+    for sight in STARS, DOME:
+        seen = moving(rng, any_rate(rng, 10.0), sight=sight)
+        found = seen.centroids()
+        still = motion.at_middle_row(CAMERA, found, exact(seen.rate_rad_s), sight)
+        assert_allclose(still.xy_px, seen.still_px, rtol=0, atol=1e-9)
+        assert np.abs(found.xy_px - seen.still_px).max() > 1
+        # An error of a centroid moves its place at the middle row by the gain.
+        error_px = rng.normal(0, 1e-4, found.xy_px.shape)
+        off = motion.at_middle_row(CAMERA, replace(found, xy_px=found.xy_px + error_px), exact(seen.rate_rad_s), sight)
+        gain = motion.error_gain(CAMERA, motion.tangent_motion(CAMERA.rays(found.xy_px), sight) @ seen.rate_rad_s)
+        assert_allclose(off.xy_px - still.xy_px, np.einsum("nij,nj->ni", gain, error_px), rtol=0, atol=2e-6)
+        assert still.covariance_px2 is not None
+        expected = gain @ motion.covariance_of(found) @ np.swapaxes(gain, 1, 2)
+        assert_allclose(still.covariance_px2, expected, rtol=0, atol=1e-12)
+        # An error of the rate moves it too.
+        other = seen.rate_rad_s + rng.normal(0, 1e-6, 3)
+        moved = motion.at_middle_row(CAMERA, found, exact(other), sight).xy_px - still.xy_px
+        sure = RateEstimate(seen.rate_rad_s, np.outer(other - seen.rate_rad_s, other - seen.rate_rad_s))
+        spread = motion.at_middle_row(CAMERA, replace(found, sigma_px=0 * found.sigma_px), sure, sight)
+        assert spread.covariance_px2 is not None
+        assert_allclose(np.sqrt(spread.covariance_px2[:, [0, 1], [0, 1]]), np.abs(moved), rtol=0.02, atol=1e-5)
+    assert motion.at_middle_row(GLOBAL, found, exact(seen.rate_rad_s)) is found
+
+
+@law(rate.from_streaks, rate.chords, rate.aligned, rate.inliers, rate.inverses, motion.streak_factor)
+@given(rng=SEEDS)
+def test_exact_streaks_give_the_rate_in_one_of_two_signs(rng: np.random.Generator) -> None:
+    for camera in CAMERA, GLOBAL:
+        for sight in STARS, DOME:
+            seen = replace(moving(rng, any_rate(rng), sight=sight), camera=camera)
+            found = seen.centroids()
+            assert found.streak_px is not None
+            rates = rate.from_streaks(camera, found, EXPOSURE_S, sight)
+            off = [np.linalg.norm(one.rate_rad_s - seen.rate_rad_s) for one in rates]
+            assert len(rates) == 2
+            assert not any(one.sign_known for one in rates)
+            assert min(off) < 1e-3 * np.linalg.norm(seen.rate_rad_s)  # a chord is not quite T times the velocity
+            opposite = rates[int(np.argmax(off))].rate_rad_s
+            assert opposite @ seen.rate_rad_s < 0
+            # One wrong streak of thirty is left out.
+            wrong = replace(found, streak_px=found.streak_px + np.where(np.arange(30)[:, None] == 7, 5.0, 0.0))
+            again = rate.from_streaks(camera, wrong, EXPOSURE_S, sight)
+            assert min(np.linalg.norm(one.rate_rad_s - seen.rate_rad_s) for one in again) < 1e-3
+    assert rate.from_streaks(CAMERA, found.take(np.arange(2)), EXPOSURE_S) == []
+    assert rate.from_streaks(CAMERA, replace(found, streak_px=None), EXPOSURE_S) == []
+    for exposure_s in 0.0, -1.0, np.nan, np.inf:
+        assert answered(lambda exposure_s=exposure_s: rate.from_streaks(CAMERA, found, exposure_s), ImageError) is None
+
+
+def test_the_rate_of_streaks_errs_as_it_says() -> None:
+    nees = []
+    for seed in range(300):
+        rng = np.random.default_rng([21, seed])
+        seen = replace(moving(rng, any_rate(rng), 12), camera=GLOBAL)
+        both = rate.from_streaks(GLOBAL, seen.centroids(rng), EXPOSURE_S)
+        best = min(both, key=lambda one: float(np.linalg.norm(one.rate_rad_s - seen.rate_rad_s)))
+        error = best.rate_rad_s - seen.rate_rad_s
+        nees.append(error @ np.linalg.solve(best.covariance_rad2_s2, error))
+    assert np.mean(nees) == pytest.approx(3, abs=4 * np.sqrt(6 / 300))
+
+
+@law(rolling.fit)
+@given(rng=SEEDS)
+def test_attitude_and_rate_are_found_together(rng: np.random.Generator) -> None:
+    for sight in STARS, DOME:
+        seen = moving(rng, any_rate(rng), sight=sight)
+        found, start = seen.centroids(), Rotation.from_rotvec(rng.normal(0, 1e-3, 3)) * seen.cam_from_ref
+        places, lever = seen.place_ref, sight.lever_cam_m
+        rows = rolling.fit(CAMERA, found, places, lever, (start, np.zeros(3)), ANYTHING)
+        assert (rows.cam_from_ref * seen.cam_from_ref.inv()).magnitude() < 1e-3 * ARCSEC_RAD
+        assert_allclose(rows.rate.rate_rad_s, seen.rate_rad_s, rtol=0, atol=1e-8)
+        first = start, rows.rate.rate_rad_s
+        streaks = rolling.fit(CAMERA, found, places, lever, first, ANYTHING, EXPOSURE_S)
+        assert (streaks.cam_from_ref * seen.cam_from_ref.inv()).magnitude() < 0.1 * ARCSEC_RAD
+        more, less = (np.trace(one.rate.covariance_rad2_s2) for one in (rows, streaks))
+        assert less < more
+        assert_covariance(streaks.rate.covariance_rad2_s2)
+    few = found.take(np.arange(1)), places[:1]
+    assert answered(lambda: rolling.fit(CAMERA, few[0], few[1], lever, (start, np.zeros(3)), ANYTHING)) is None
+
+
+@law(rolling.rate_covariance_rad2)
+@given(rng=SEEDS)
+def test_an_error_of_the_rate_turns_the_attitude(rng: np.random.Generator) -> None:
+    seen, error = moving(rng, any_rate(rng)), rng.normal(0, 1e-5, 3)
+    found = seen.centroids()
+    wrong = motion.at_middle_row(CAMERA, found, exact(seen.rate_rad_s + error))
+    place = seen.cam_from_ref.apply(seen.place_ref)
+    jacobian = nearfield.tangent_jacobian(place, place).reshape(-1, 2, 3)
+    residual = GLOBAL.tangents(wrong.xy_px) - GLOBAL.tangents(seen.still_px)
+    turned, *_ = np.linalg.lstsq(jacobian.reshape(-1, 3), residual.ravel(), rcond=None)
+    covariance = rolling.rate_covariance_rad2(CAMERA, found, jacobian, np.outer(error, error))
+    assert_allclose(covariance, np.outer(turned, turned), rtol=0, atol=0.05 * float(turned @ turned))
+
+
+def test_a_rolling_frame_s_attitude_errs_as_it_says() -> None:
+    """Of the attitude that is solved after the rate, with the covariance of both."""
+    nees = []
+    for seed in range(300):
+        rng = np.random.default_rng([22, seed])
+        seen = moving(rng, any_rate(rng), 10)
+        found, places = seen.centroids(rng), seen.place_ref
+        fit = rolling.fit(CAMERA, found, places, np.zeros(3), (seen.cam_from_ref, seen.rate_rad_s), ANYTHING)
+        place = seen.cam_from_ref.apply(places)
+        jacobian = nearfield.tangent_jacobian(place, place)
+        noise = np.linalg.inv(jacobian.T @ jacobian) * (found.sigma_px[0] / CAMERA.focal_px) ** 2
+        by_rate = rolling.rate_covariance_rad2(CAMERA, found, jacobian.reshape(-1, 2, 3), fit.rate.covariance_rad2_s2)
+        error = (fit.cam_from_ref * seen.cam_from_ref.inv()).as_rotvec()
+        nees.append(error @ np.linalg.solve(noise + by_rate, error))
+    assert np.mean(nees) == pytest.approx(3, abs=4 * np.sqrt(6 / 300))
+
+
+def moments_of(seen: Moving, variance_px2: float) -> Floats:
+    """(N, 3) second moments of round images of a rolling shutter: a D D' and the streak's."""
+    velocity = seen.camera.focal_px * motion.tangent_motion(GLOBAL.rays(seen.still_px), seen.sight) @ seen.rate_rad_s
+    u, w = CAMERA.row_time_s * velocity.T
+    gain = 1 / (1 - w)
+    shear = np.moveaxis(np.array([[np.ones_like(u), u * gain], [0 * u, gain]]), 2, 0)
+    streak = (gain * velocity.T * EXPOSURE_S).T
+    matrix = variance_px2 * shear @ np.swapaxes(shear, 1, 2) + np.einsum("ni,nj->nij", streak, streak) / 12
+    return np.column_stack([matrix[:, 0, 0] - matrix[:, 1, 1], 2 * matrix[:, 0, 1], matrix[:, 0, 0] + matrix[:, 1, 1]])
+
+
+@law(disk_rate.from_moments)
+@given(rng=SEEDS)
+def test_disks_of_a_rolling_shutter_tell_the_rate(rng: np.random.Generator) -> None:
+    seen = moving(rng, any_rate(rng, 8.0), sight=DOME)
+    disks = replace(seen.centroids(), xy_px=seen.still_px, streak_px=None, moments_px2=moments_of(seen, 30.0))
+    rates = disk_rate.from_moments(CAMERA, disks, EXPOSURE_S, DOME)
+    assert len(rates) == 2
+    assert min(np.linalg.norm(one.rate_rad_s - seen.rate_rad_s) for one in rates) < np.radians(0.05)
+    assert_covariance(rates[0].covariance_rad2_s2)
+    assert disk_rate.from_moments(GLOBAL, disks, EXPOSURE_S, DOME) == []
+    points = replace(disks, moments_px2=moments_of(seen, 0.1) * 0.01)
+    assert disk_rate.from_moments(CAMERA, points, EXPOSURE_S, DOME) == []
+
+
+@law(classify.moments)
+@given(rng=SEEDS)
+def test_moments_of_an_ellipse_are_its_own(rng: np.random.Generator) -> None:
+    xx, yy = rng.uniform(12, 30, 2)
+    xy = rng.uniform(-0.5, 0.5) * np.sqrt(xx * yy)
+    offset = np.stack(np.meshgrid(np.arange(60) - 29.5, np.arange(60) - 29.5), axis=-1)
+    distance2 = np.einsum("yxi,ij,yxj->yx", offset, np.linalg.inv([[xx, xy], [xy, yy]]), offset)
+    image = np.where(distance2 < 4, 5000.0, 0.0) + rng.normal(100, 1, (60, 60))  # a uniform ellipse: a quarter of it
+    blobs = local(image, 8.0, 50)
+    assert len(blobs) == 1
+    assert_allclose(classify.moments(image, blobs)[0], [xx - yy, 2 * xy, xx + yy], rtol=0, atol=0.05 * (xx + yy))
+
+
+@law(RateEstimate.resolved)
+@given(rng=SEEDS)
+def test_another_rate_tells_the_sign(rng: np.random.Generator) -> None:
+    true, spread = rng.normal(0, 1, 3), 0.01 * np.eye(3)
+    unsigned = RateEstimate(-true, spread, sign_known=False)
+    told = unsigned.resolved(RateEstimate(true + rng.normal(0, 0.1, 3), spread))
+    if true @ true > 1:
+        assert told.sign_known
+        assert_allclose(told.rate_rad_s, true, rtol=0, atol=0)
+    assert unsigned.resolved(unsigned) is unsigned
+    assert not unsigned.resolved(RateEstimate(true, 1e4 * np.eye(3))).sign_known
+    known = RateEstimate(true, spread)
+    assert known.resolved(RateEstimate(-true, spread)) is known
+    assert np.array_equal(told.covariance_rad2_s2, spread)
+
+
+def test_centroids_keep_their_streaks() -> None:
+    found = moving(np.random.default_rng(1), np.array([1.0, 2.0, 0.0])).centroids()
+    part: Centroids = found.take(np.array([4, 2]))
+    assert part.streak_px is not None
+    assert found.streak_px is not None
+    assert part.streak_covariance_px2 is not None
+    assert_allclose(part.streak_px, found.streak_px[[4, 2]], rtol=0, atol=0)
+    assert_allclose(part.streak_covariance_px2[:, 0, 0], STREAK_SIGMA_PX**2, rtol=1e-12, atol=0)
