@@ -23,6 +23,7 @@ from estimator.detection.shefex import maximum_scan, sequential_scan
 
 MAX_BLOBS = 20_000
 GROW_SIGMA = 3.5
+SPARE = 4  # blobs that are classified, per blob returned: hot pixels and tracks do not take the places of stars
 MIN_GROWN_PX = 8  # smallest area of a blob that is significant only as a whole
 # With fewer stars than FEW_STARS, faint streaks of SEARCH_LENGTH_PX are searched in DIRECTIONS directions.
 FEW_STARS, DIRECTIONS, SEARCH_LENGTH_PX = 8, 8, 10.0
@@ -54,9 +55,16 @@ def default(
     the square root of its length. The streak is that of the priors (from the gyro); otherwise the one that the
     brightest blobs share; otherwise, if few stars were found, the direction in which most streaks are found. Streaks
     longer than MAX_STREAK_PX are detected with the filter for round stars.
+
+    Of the blobs found, those that cannot be stars (`classify`) are returned as far as the stars leave room.
     """
     image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
     of_type("priors", priors, FramePriors)
+    return _stars_first(_classified(image, threshold_sigma, min_area_px, SPARE * max_blobs, priors), max_blobs)
+
+
+def _classified(image: NDArray, threshold_sigma: float, min_area_px: int, max_blobs: int, priors: FramePriors) -> Blobs:
+    """The brightest blobs with their flags, detected with the filter along the frame's streak if it is smeared."""
     background = estimate_background(image)
     if priors.streak_px is None or not 2 <= max(map(abs, priors.streak_px)) <= MAX_STREAK_PX:
         blobs = detect_blobs(image, background, threshold_sigma * background.noise, min_area_px, max_blobs, GROW_SIGMA)
@@ -74,6 +82,15 @@ def default(
         priors = FramePriors(blobs.streak_px, priors.saturation)
     streaks = detect_streaks(image, background, threshold_sigma, max_blobs, priors)
     return classify.classify(image, streaks, priors)
+
+
+def _stars_first(blobs: Blobs, max_blobs: int) -> Blobs:
+    """At most `max_blobs` blobs: the brightest that may be stars, and of the others as many as there is room for."""
+    if len(blobs) <= max_blobs:
+        return blobs
+    star = blobs.flag & classify.NO_STAR == 0
+    kept = star & (np.cumsum(star) <= max_blobs)
+    return blobs.take(kept | (~star & (np.cumsum(~star) <= max_blobs - np.count_nonzero(kept))))
 
 
 def local(

@@ -203,6 +203,22 @@ def test_blobs_come_brightest_first_and_the_faintest_are_dropped() -> None:
     np.testing.assert_allclose(blobs.xy_px, [[61, 21], [101, 21]], rtol=0, atol=0.1)
 
 
+def test_hot_pixels_do_not_take_the_places_of_stars() -> None:
+    """Two hundred bright hot pixels beside the stars, and room for sixty blobs: all the stars are among them."""
+    image, xy_px = field_of_stars(4)
+    rng = np.random.default_rng(5)
+    row, column = np.meshgrid(*(np.arange(8, side - 8, 16) for side in image.shape), indexing="ij")
+    places = rng.permutation(np.column_stack([row.ravel(), column.ravel()]))
+    far = np.array([np.hypot(*(xy_px - place[::-1]).T).min() > 8 for place in places])
+    hot = places[far][:200]
+    image[hot[:, 0], hot[:, 1]] += 60_000
+    blobs = detect.default(image, max_blobs=60)
+    assert len(hot) > 150
+    assert len(blobs) == 60
+    stars = blobs.take(blobs.flag & NO_STAR == 0)
+    assert nearest_px(stars.xy_px, xy_px).max() < 1
+
+
 def test_small_blobs_are_left_out() -> None:
     image = np.random.default_rng(12).normal(0, 1, (64, 64))
     image[30, 30] = 60.0  # filtered: a peak of 15, shoulders of 7.5 and corners of 3.75 against 5 * .375
