@@ -104,9 +104,10 @@ def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None)
         (np.flipud, FOV_DEG, r"^perhaps mirrored: "),
         (np.array, 30.0, r"^perhaps another field of view: it solves with --fov 14\.8$"),
         (np.array, 11.1, r"^perhaps another field of view: it solves with --fov 14\.8$"),  # the vertical one
-        (spread(disk(30)), FOV_DEG, r"^blobs of 6\d px: out of focus\?$"),
-        (spread(trail(150)), FOV_DEG, r"^trails of 16\d px: "),  # sqrt(150^2 + 75^2) = 168
-        (spread(trail(400)), FOV_DEG, r"^trails of 4[45]\d px: "),  # 447, and the width of a star
+        pytest.param(spread(disk(30)), FOV_DEG, r"^blobs of 6\d px: out of focus\?$", marks=pytest.mark.slow),
+        # sqrt(150^2 + 75^2) = 168, sqrt(400^2 + 200^2) = 447, and the width of a star
+        pytest.param(spread(trail(150)), FOV_DEG, r"^trails of 16\d px: ", marks=pytest.mark.slow),
+        pytest.param(spread(trail(400)), FOV_DEG, r"^trails of 4[45]\d px: ", marks=pytest.mark.slow),
         (bleach, FOV_DEG, r"^overexposed: 80% of the pixels are at 255; "),
         (noise, 20.0, r"^too few lights \(0\): "),
         (dots, 20.0, r"^no cause found: no field of 2° to 100° fits, nor the mirrored picture; [^-]*$"),

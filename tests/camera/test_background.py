@@ -252,6 +252,7 @@ def test_frames_drawn_between_nodes_are_within_a_thousandth(part: dict[str, obje
     np.testing.assert_allclose(drawn(glow(**part), lens)[::3, ::3], whole_map(glow(**part), lens), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_cusp_of_two_stops_is_rounded_off_within_a_node_of_the_axis() -> None:
     lens = optics(vignetting={"kind": "two_stops", "cutoff_deg": 50.0})
     error = np.abs(drawn(glow(**SLOPED), lens)[::3, ::3] / whole_map(glow(**SLOPED), lens) - 1)

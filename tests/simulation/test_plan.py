@@ -416,7 +416,11 @@ def test_a_wrong_focal_length_is_warned_of_where_the_tracker_refuses(focal_lengt
 
 @pytest.mark.parametrize(
     "layout",
-    ["{kind: poisson_disk, count: 1400, cap_deg: 42}", "{kind: fibonacci, count: 1400, cap_deg: 42}", GEODESIC],
+    [
+        "{kind: poisson_disk, count: 1400, cap_deg: 42}",
+        pytest.param("{kind: fibonacci, count: 1400, cap_deg: 42}", marks=pytest.mark.slow),
+        pytest.param(GEODESIC, marks=pytest.mark.slow),
+    ],
 )
 def test_fields_alike_are_those_that_the_tracker_refuses_as_ambiguous(layout: str) -> None:
     """On rendered frames at the attitudes in reach: none, some three of four, all."""

@@ -108,6 +108,7 @@ def test_exact_streaks_give_the_rate_in_one_of_two_signs(rng: np.random.Generato
         assert answered(lambda exposure_s=exposure_s: rate.from_streaks(CAMERA, found, exposure_s), ImageError) is None
 
 
+@pytest.mark.slow
 def test_the_rate_of_streaks_errs_as_it_says() -> None:
     nees = []
     for seed in range(300):
@@ -154,6 +155,7 @@ def test_an_error_of_the_rate_turns_the_attitude(rng: np.random.Generator) -> No
     assert_allclose(covariance, np.outer(turned, turned), rtol=0, atol=0.05 * float(turned @ turned))
 
 
+@pytest.mark.slow
 def test_a_rolling_frame_s_attitude_errs_as_it_says() -> None:
     """Of the attitude that is solved after the rate, with the covariance of both."""
     nees = []

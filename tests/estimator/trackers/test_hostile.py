@@ -144,6 +144,7 @@ def test_a_mirrored_sky_is_refused(stars: catalog.StarCatalog, frames: int) -> N
     assert right >= 0.9 * frames
 
 
+@pytest.mark.slow
 def test_four_stars_among_twice_as_many_strangers_are_no_sky(tmp_path: Path) -> None:
     """A mirrored sky that once had an answer: 4 of 12 lights on stars, a chance of one in ten thousand by itself."""
     name, shot, answer, _, _ = hostile.Judge(tmp_path).take(68, 14)
