@@ -33,7 +33,8 @@ from estimator.identification.chance import (
 )
 from estimator.identification.stars import quads, search
 from estimator.identification.stars.evidence import Detections, Solution
-from estimator.trackers import warm_up
+from estimator.trackers import misfit, warm_up
+from estimator.trackers.misfit import Refit
 from estimator.trackers.pipeline import Clock, Report, Settings, brightest, check_algorithms, process_frame
 from estimator.trackers.refinement import NO_MATCH, FieldMatcher
 from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
@@ -281,8 +282,9 @@ class StarTracker:
             return Attitude(f"no attitude: {error}")
         seen_cam = cam_from_ref.apply(vectors)
         residual = self.camera.pixels(seen_cam) - centroids.xy_px[observed]
-        covariance_rad2 = covariance(rays, sigma_rad, self.settings.solver)
         xy_px = centroids.xy_px[observed]
+        sigma_rad = sigma_rad * np.sqrt(misfit.variance_of(residual / sigma_px[:, None], 3))
+        covariance_rad2 = covariance(rays, sigma_rad, self.settings.solver)
         covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, self.camera, xy_px, seen_cam, sigma_rad)
         match = StarMatch(observed, star, cam_from_ref, float("nan"))
         rms_px = float(np.sqrt(np.mean(residual**2)))
@@ -345,9 +347,10 @@ class StarTracker:
             clock.lap("identify")
             if not len(solution.star):
                 continue
-            if not self.focal_uncertainty and self.field_matcher.misfits(solution, centroids):
+            refitted = self.refit(centroids, solution, sigma_px)
+            if not self.focal_uncertainty and self.field_matcher.misfits(refitted.solution, centroids):
                 continue
-            attitude = self.attitude_of(centroids, solution, sigma_px)
+            attitude = self.attitude_of(centroids, refitted, sigma_px)
             if self.focal_uncertainty and not (
                 model.min_error_px == MIN_ERROR_PX and self.field_matcher.fits(solution, centroids, sigma_px)
             ):
@@ -372,20 +375,30 @@ class StarTracker:
         known = not self.focal_uncertainty
         return quads.identify(detections, self.quads, patterns, self.sky, most, model.max_checks, known)
 
-    def attitude_of(self, centroids: Centroids, solution: Solution, sigma_px: Floats) -> Attitude:
-        """The attitude of a solution; solved again from its matches if the settings name another solver."""
+    def refit(self, centroids: Centroids, solution: Solution, sigma_px: Floats) -> Refit:
+        """A solution with the errors and, of a calibrated global shutter, the lens that its residuals tell."""
         camera = self.camera if solution.focal_ratio == 1 else self.camera.zoomed(solution.focal_ratio)
+        free = 0.0 if solution.focal_ratio == 1 else search.WRONG_FOCAL
+        if self.focal_uncertainty:
+            variance = misfit.scale_of(solution, True)
+            return Refit(solution._replace(covariance_rad2=variance * solution.covariance_rad2), camera, variance)
+        fit_lens = not (self.camera.row_time_s or self.camera.focal_sigma)
+        detections = self.detections(centroids, sigma_px, free)
+        return misfit.refit(solution, detections, self.sky, camera, centroids.xy_px, fit_lens)
+
+    def attitude_of(self, centroids: Centroids, refitted: Refit, sigma_px: Floats) -> Attitude:
+        """The attitude of a solution; solved again from its matches if the settings name another solver."""
+        solution, camera, variance = refitted
         cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
         covariance_rad2 = solution.covariance_rad2
+        sigma_rad = np.sqrt(variance) * sigma_px[solution.observed] / camera.focal_px
         solver = self.settings.solver
         if solver != "default":
             rays, vectors = camera.rays(centroids.xy_px[solution.observed]), self.stars.vectors[solution.star]
-            sigma_rad = sigma_px[solution.observed] / camera.focal_px
             cam_from_ref = SOLVERS[solver](rays, vectors, sigma_rad)
             covariance_rad2 = covariance(rays, sigma_rad, solver)
         match = StarMatch(solution.observed, solution.star, cam_from_ref, -solution.dex)
         rms_px = solution.rms * self.camera.focal_px
-        sigma_rad = sigma_px[solution.observed] / camera.focal_px
         seen_cam = cam_from_ref.apply(self.stars.vectors[solution.star])
         xy_px = centroids.xy_px[solution.observed]
         covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, camera, xy_px, seen_cam, sigma_rad)

@@ -203,7 +203,8 @@ class TrackingMode:
         if hypothesis.dex + prior_gain_dex < ACCEPT_DEX:
             return None
         solution = evidence.build_solution(detections, tracker.sky, hypothesis)
-        attitude = tracker.attitude_of(centroids, solution._replace(dex=hypothesis.dex + prior_gain_dex), sigma_px)
+        refitted = tracker.refit(centroids, solution._replace(dex=hypothesis.dex + prior_gain_dex), sigma_px)
+        attitude = tracker.attitude_of(centroids, refitted, sigma_px)
         clock.lap("solve")
         return self._report(attitude, centroids, sigma_px, clock, len(window_centers_px), saturated, streak_px)
 
@@ -262,7 +263,8 @@ class TrackingMode:
             return TrackedReport(attitude, centroids, clock.seconds)
         match: StarMatch = attitude.match
         vectors_cam = attitude.cam_from_ref.apply(self.tracker.stars.vectors[match.star])
-        residual_px = self.tracker.camera.pixels(vectors_cam) - centroids.xy_px[match.observed]
+        camera = attitude.camera or self.tracker.camera
+        residual_px = camera.pixels(vectors_cam) - centroids.xy_px[match.observed]
         chi2 = float(np.sum((residual_px / sigma_px[match.observed][:, None]) ** 2))
         chi2_per_dof = chi2 / max(2 * len(match.star) - 3, 1)
         streak = float(np.hypot(*streak_px)) if streak_px is not None else 0.0
