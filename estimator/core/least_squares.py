@@ -24,7 +24,7 @@ CONVERGED_CHI2, CONVERGED_PX = 1e-4, 1e-3
 SLOPE_STEP, MIN_DAMPING, MAX_DAMPING, MAX_STEPS, CONVERGED_FALL, TINY = 1e-4, 1e-9, 1e6, 40, 1e-10, 1e-12
 
 # Prior of the factor of claimed variances: probability that it is 1, else from 1 to this, evenly in its logarithm.
-PRIOR_RIGHT, MAX_VARIANCE_FACTOR = 0.9, 100.0
+PRIOR_RIGHT, MAX_VARIANCE_FACTOR = 0.5, 100.0
 FACTORS = np.geomspace(1.0, MAX_VARIANCE_FACTOR, 60)
 
 

@@ -19,13 +19,15 @@ from estimator.attitude.systematic import geometry
 from estimator.catalog.sky_index import SkyIndex
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
-from estimator.core.least_squares import variance_factor
+from estimator.core.least_squares import PRIOR_RIGHT, variance_factor
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.stars import evidence
 from estimator.identification.stars.evidence import Detections, Solution
 
 TELLING = 1.2  # variance factor above which matches and lens are tried anew
-WIDENINGS = 6  # most rounds of matching with greater errors
+DOUBTFUL = 1.0  # reduced chi-square above which greater errors are tried
+TRIED = 2.0 ** np.arange(7)  # factors of the variances
+PRIOR_WRONG = (1 - PRIOR_RIGHT) / (len(TRIED) - 1)
 LENS_MATCHES = 6  # least number of matches for a fit of the lens
 FOCAL_PRIOR, CORNER_PRIOR = 0.01, 0.01  # standard deviations: relative focal length, distortion at the corner
 LENS_ROUNDS = 4
@@ -36,10 +38,10 @@ def degrees_of_freedom(solution: Solution, free_focal: bool) -> int:
     return max(2 * len(solution.star) - (4 if free_focal else 3), 1)
 
 
-def scale_of(solution: Solution, free_focal: bool) -> float:
-    """Factor of the claimed variances by the residuals of a solution."""
+def scale_of(solution: Solution, free_focal: bool, assumed: float = 1.0) -> float:
+    """Factor of the claimed variances by the residuals of a solution, which assumed another factor."""
     dof = degrees_of_freedom(solution, free_focal)
-    return variance_factor(solution.chi2 * dof, dof)
+    return variance_factor(assumed * solution.chi2 * dof, dof)
 
 
 def variance_of(residual: Floats, parameters: int) -> float:
@@ -53,23 +55,29 @@ def scaled(detections: Detections, variance: float) -> Detections:
 
 
 def widened(solution: Solution, detections: Detections, sky: SkyIndex) -> tuple[Solution, float]:
-    """Match again with the errors that the residuals tell, as long as the evidence rises; factor of the variances.
+    """The solution with the errors of most evidence, and the expected factor of the variances over all that were tried.
 
+    The gates hide how great the errors are, so that each factor has its own matches; their Bayes factors, with the
+    prior of `least_squares.variance_factor`, are their weights.
     detections : with the errors of the model, and the focal uncertainty with which the solution was found
     """
-    free_focal, total = detections.focal_uncertainty > 0, 1.0
-    for _ in range(WIDENINGS):
-        more = scale_of(solution, free_focal)
-        if more < TELLING:
-            break
-        wide = scaled(detections, total * more)
-        R = Rotation.from_quat(solution.cam_from_ref_xyzw).as_matrix()
-        gates = 1.5 * GATE_SIGMA * wide.sigma
-        found = evidence.evaluate(wide, sky, R, solution.focal_ratio, gates, -np.inf)
-        if found.dex <= solution.dex:
-            break
-        solution, total = evidence.build_solution(wide, sky, found), total * more
-    return solution, total
+    if solution.chi2 < DOUBTFUL:
+        return solution, 1.0
+    tried = [solution, *(_matched(solution, scaled(detections, variance), sky) for variance in TRIED[1:])]
+    dex = np.array([one.dex for one in tried]) + np.log10([PRIOR_RIGHT, *(len(TRIED) - 1) * [PRIOR_WRONG]])
+    best = int(np.argmax(dex))
+    weight = 10 ** (dex - dex[best])
+    variance = float(weight @ TRIED / weight.sum())
+    covariance = tried[best].covariance_rad2 * (variance / TRIED[best])
+    return tried[best]._replace(covariance_rad2=covariance), variance
+
+
+def _matched(solution: Solution, detections: Detections, sky: SkyIndex) -> Solution:
+    """A solution matched and fitted again with other errors."""
+    R = Rotation.from_quat(solution.cam_from_ref_xyzw).as_matrix()
+    gates = 1.5 * GATE_SIGMA * detections.sigma
+    found = evidence.evaluate(detections, sky, R, solution.focal_ratio, gates, -np.inf)
+    return evidence.build_solution(detections, sky, found)
 
 
 class Refit(NamedTuple):
@@ -93,12 +101,10 @@ def refit(
     camera     : of the solution;  xy_px : (N, 2) centroids
     """
     free_focal = detections.focal_uncertainty > 0
-    solution, total = widened(solution, detections, sky)
-    variance = total * scale_of(solution, free_focal)
+    solution, variance = widened(solution, detections, sky)
     if fit_lens and variance >= TELLING and len(solution.star) >= LENS_MATCHES:
         return with_lens(solution, detections, sky, camera, xy_px, variance)
-    covariance = solution.covariance_rad2 * (variance / total)
-    return Refit(solution._replace(covariance_rad2=covariance), camera, variance)
+    return Refit(solution, camera, variance)
 
 
 def with_lens(
