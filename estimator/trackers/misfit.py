@@ -10,6 +10,7 @@ residuals still exceed multiplies the covariance (`least_squares.variance_factor
 from __future__ import annotations
 
 from dataclasses import replace
+from math import log10, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -19,29 +20,19 @@ from estimator.attitude.systematic import geometry
 from estimator.catalog.sky_index import SkyIndex
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
+from estimator.core.jit import jit
 from estimator.core.least_squares import PRIOR_RIGHT, variance_factor
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.stars import evidence
 from estimator.identification.stars.evidence import Detections, Solution
 
-TELLING = 1.2  # variance factor above which matches and lens are tried anew
-DOUBTFUL = 1.0  # reduced chi-square above which greater errors are tried
+TELLING = 1.5  # variance factor above which matches and lens are tried anew
+DOUBTFUL = 0.7  # reduced chi-square above which greater errors are tried
 TRIED = 2.0 ** np.arange(7)  # factors of the variances
-PRIOR_WRONG = (1 - PRIOR_RIGHT) / (len(TRIED) - 1)
+PRIOR_WRONG_DEX = log10((1 - PRIOR_RIGHT) / PRIOR_RIGHT / (len(TRIED) - 1))  # of each, beside the claimed errors
 LENS_MATCHES = 6  # least number of matches for a fit of the lens
 FOCAL_PRIOR, CORNER_PRIOR = 0.01, 0.01  # standard deviations: relative focal length, distortion at the corner
 LENS_ROUNDS = 4
-
-
-def degrees_of_freedom(solution: Solution, free_focal: bool) -> int:
-    """Two for each match, less those of the attitude and of a free focal length."""
-    return max(2 * len(solution.star) - (4 if free_focal else 3), 1)
-
-
-def scale_of(solution: Solution, free_focal: bool, assumed: float = 1.0) -> float:
-    """Factor of the claimed variances by the residuals of a solution, which assumed another factor."""
-    dof = degrees_of_freedom(solution, free_focal)
-    return variance_factor(assumed * solution.chi2 * dof, dof)
 
 
 def variance_of(residual: Floats, parameters: int) -> float:
@@ -49,35 +40,50 @@ def variance_of(residual: Floats, parameters: int) -> float:
     return variance_factor(float(np.sum(residual**2)), max(residual.size - parameters, 1))
 
 
-def scaled(detections: Detections, variance: float) -> Detections:
-    """The detections with their variances multiplied."""
-    return detections._replace(sigma=np.sqrt(variance) * detections.sigma, weight=detections.weight / variance)
-
-
-def widened(solution: Solution, detections: Detections, sky: SkyIndex) -> tuple[Solution, float]:
+@jit
+def widened(solution: Solution, R_cam_from_ref: Floats, detections: Detections, sky: SkyIndex) -> tuple[Solution, float]:
     """The solution with the errors of most evidence, and the expected factor of the variances over all that were tried.
 
     The gates hide how great the errors are, so that each factor has its own matches; their Bayes factors, with the
-    prior of `least_squares.variance_factor`, are their weights.
+    prior of `least_squares.variance_factor`, are their weights. The covariance is multiplied by the factor.
     detections : with the errors of the model, and the focal uncertainty with which the solution was found
     """
-    if solution.chi2 < DOUBTFUL:
-        return solution, 1.0
-    tried = [solution, *(_matched(solution, scaled(detections, variance), sky) for variance in TRIED[1:])]
-    dex = np.array([one.dex for one in tried]) + np.log10([PRIOR_RIGHT, *(len(TRIED) - 1) * [PRIOR_WRONG]])
-    best = int(np.argmax(dex))
-    weight = 10 ** (dex - dex[best])
-    variance = float(weight @ TRIED / weight.sum())
-    covariance = tried[best].covariance_rad2 * (variance / TRIED[best])
-    return tried[best]._replace(covariance_rad2=covariance), variance
+    best, best_dex, dex = solution, solution.dex, np.empty(len(TRIED))
+    dex[0] = solution.dex
+    for n in range(1, len(TRIED)):
+        wide = Detections(
+            detections.tangent,
+            detections.sigma * sqrt(TRIED[n]),
+            detections.weight / TRIED[n],
+            detections.mag,
+            detections.mag_sigma,
+            detections.field,
+            detections.focal_uncertainty,
+        )
+        gates = 1.5 * GATE_SIGMA * wide.sigma
+        found = evidence.evaluate(wide, sky, R_cam_from_ref.copy(), solution.focal_ratio, gates, -np.inf)
+        dex[n] = found.dex + PRIOR_WRONG_DEX
+        if dex[n] > best_dex:
+            best, best_dex = evidence.build_solution(wide, sky, found), dex[n]
+    weight = 10 ** (dex - best_dex)
+    variance = np.sum(weight * TRIED) / np.sum(weight)
+    covariance = best.covariance_rad2 * (variance / TRIED[np.argmax(dex)])
+    return with_covariance(best, covariance), variance
 
 
-def _matched(solution: Solution, detections: Detections, sky: SkyIndex) -> Solution:
-    """A solution matched and fitted again with other errors."""
-    R = Rotation.from_quat(solution.cam_from_ref_xyzw).as_matrix()
-    gates = 1.5 * GATE_SIGMA * detections.sigma
-    found = evidence.evaluate(detections, sky, R, solution.focal_ratio, gates, -np.inf)
-    return evidence.build_solution(detections, sky, found)
+@jit
+def with_covariance(solution: Solution, covariance_rad2: Floats) -> Solution:
+    """The solution with another covariance."""
+    return Solution(
+        solution.observed,
+        solution.star,
+        solution.cam_from_ref_xyzw,
+        covariance_rad2,
+        solution.focal_ratio,
+        solution.rms,
+        solution.chi2,
+        solution.dex,
+    )
 
 
 class Refit(NamedTuple):
@@ -95,13 +101,13 @@ class Refit(NamedTuple):
 def refit(
     solution: Solution, detections: Detections, sky: SkyIndex, camera: Camera, xy_px: Floats, fit_lens: bool
 ) -> Refit:
-    """The solution as it is if its residuals agree with the model; else matched, fitted and scaled anew.
+    """The solution matched, fitted and scaled anew by its residuals.
 
     detections : with the errors of the model, and the focal uncertainty with which the solution was found
     camera     : of the solution;  xy_px : (N, 2) centroids
     """
-    free_focal = detections.focal_uncertainty > 0
-    solution, variance = widened(solution, detections, sky)
+    R_cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw).as_matrix()
+    solution, variance = widened(solution, R_cam_from_ref, detections, sky)
     if fit_lens and variance >= TELLING and len(solution.star) >= LENS_MATCHES:
         return with_lens(solution, detections, sky, camera, xy_px, variance)
     return Refit(solution, camera, variance)
@@ -118,49 +124,47 @@ def with_lens(
     """
     cam_from_ref, keep = Rotation.from_quat(solution.cam_from_ref_xyzw), np.ones(len(solution.star), bool)
     xx, yy, xy = detections.weight[solution.observed].T
-    weight = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
+    whiten = np.linalg.cholesky(np.moveaxis(np.array([[xx, xy], [xy, yy]]), 2, 0)).swapaxes(1, 2)
     vectors_ref, xy_px = sky.vectors[solution.star], xy_px[solution.observed]
-    corner2 = float(np.max(np.sum(detections.field.reshape(2, 2) ** 2, axis=0)) + np.min(detections.field**2))
+    corner2 = float(np.sum(np.square(detections.field[[0, 2]])))
     prior = np.diag([0.0, 0.0, 0.0, 1 / FOCAL_PRIOR**2, (corner2 / CORNER_PRIOR) ** 2])
     lens, change = camera, np.zeros(5)
     for _ in range(LENS_ROUNDS):
         seen = cam_from_ref.apply(vectors_ref)
         view = geometry(seen, seen)
-        residual = lens.tangents(xy_px) - view.tangent
-        r2 = np.sum(view.tangent**2, axis=1)
-        slopes = np.concatenate(
-            [view.jacobian, view.tangent[:, :, None], (r2[:, None] * view.tangent)[:, :, None]], axis=2
-        )
-        weighted = np.einsum("kij,kia->kaj", weight, slopes) * (keep / variance)[:, None, None]
-        normal = np.einsum("kaj,kjb->ab", weighted, slopes) + prior
-        step = np.linalg.solve(normal, np.einsum("kaj,kj->a", weighted, residual) - prior @ change)
-        change = change + np.concatenate([np.zeros(3), step[3:]])
-        cam_from_ref = Rotation.from_rotvec(step[:3]) * cam_from_ref
-        lens = lens_of(camera, change)
-        left = residual - slopes @ step
-        distance2 = np.einsum("ki,kij,kj->k", left, weight, left)
-        dof = max(2 * int(keep.sum()) - 5, 1)
-        found = variance_factor(float(distance2[keep].sum()), dof)
-        covariance = np.linalg.inv(normal)[:3, :3]
+        radial = view.tangent * np.sum(view.tangent**2, axis=1)[:, None]
+        slopes = whiten @ np.concatenate([view.jacobian, view.tangent[:, :, None], radial[:, :, None]], axis=2)
+        residual = (whiten @ (lens.tangents(xy_px) - view.tangent)[:, :, None])[:, :, 0]
+        kept, count = slopes[keep].reshape(-1, 5), int(keep.sum())
+        normal = kept.T @ kept / variance + prior
+        step = np.linalg.solve(normal, kept.T @ residual[keep].ravel() / variance - prior @ change)
+        change[3:] += step[3:]
+        cam_from_ref, lens = Rotation.from_rotvec(step[:3]) * cam_from_ref, _lens_of(camera, *change[3:])
+        distance2 = np.sum((residual - slopes @ step) ** 2, axis=1)
+        chi2 = float(distance2[keep].sum())
+        found = variance_factor(chi2, 2 * count - 5)
         near = distance2 <= GATE_SIGMA**2 * found
         if near.sum() < LENS_MATCHES:
             break
         keep, variance = near, found
-    rms = float(np.sqrt(np.mean(left[keep] ** 2)))
-    found_solution = solution._replace(
+    left = lens.tangents(xy_px[keep]) - _tangents(cam_from_ref.apply(vectors_ref[keep]))
+    fitted = solution._replace(
         observed=solution.observed[keep],
         star=solution.star[keep],
         cam_from_ref_xyzw=cam_from_ref.as_quat(),
-        covariance_rad2=covariance,
-        rms=rms,
-        chi2=float(distance2[keep].sum()) / dof,
+        covariance_rad2=np.linalg.inv(kept.T @ kept / variance + prior)[:3, :3],
+        rms=float(np.sqrt(np.mean(left**2))),
+        chi2=chi2 / (2 * count - 5),
     )
-    return Refit(found_solution, lens, variance)
+    return Refit(fitted, lens, variance)
 
 
-def lens_of(camera: Camera, change: Floats) -> Camera:
-    """The camera with its log focal length and first distortion coefficient changed by the last two elements."""
-    k1, *others = camera.distortion
-    return replace(
-        camera, focal_px=camera.focal_px * float(np.exp(change[3])), distortion=(k1 + float(change[4]), *others)
-    )
+def _tangents(seen_cam: Floats) -> Floats:
+    return np.asarray(seen_cam[:, :2] / seen_cam[:, 2:])
+
+
+def _lens_of(camera: Camera, log_focal: float, k1: float) -> Camera:
+    """The camera with its log focal length and first distortion coefficient changed."""
+    first, *others = camera.distortion
+    focal_px, distortion = camera.focal_px * float(np.exp(log_focal)), (first + float(k1), *others)
+    return replace(camera, focal_px=focal_px, distortion=distortion)

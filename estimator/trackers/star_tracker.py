@@ -27,6 +27,7 @@ from estimator.catalog import catalog, pair_index, quad_index, sky_index
 from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
+from estimator.core.least_squares import variance_factor
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification.chance import (
     MIN_EVIDENCE_MATCHES,
@@ -198,6 +199,9 @@ class StarTracker:
         """
         cam_from_ref, xy_px, light = self.rich_field()
         warm_up.run(self.camera, xy_px, light, dtype, self.solve)
+        # Residuals of four standard deviations: the errors are matched and fitted anew then.
+        moved_px = xy_px + 0.4 * (-1.0) ** np.arange(len(xy_px))[:, None]
+        self.solve_centroids(Centroids(moved_px, np.full(len(xy_px), 0.1), light))
         # As many false lights as stars: whether the camera model fits the field is tested then.
         xy_px = np.concatenate([xy_px, xy_px[:, ::-1]])
         centroids = Centroids(xy_px, np.full(len(xy_px), 0.1), np.concatenate([light, light / 2]))
@@ -378,12 +382,14 @@ class StarTracker:
     def refit(self, centroids: Centroids, solution: Solution, sigma_px: Floats) -> Refit:
         """A solution with the errors and, of a calibrated global shutter, the lens that its residuals tell."""
         camera = self.camera if solution.focal_ratio == 1 else self.camera.zoomed(solution.focal_ratio)
-        free = 0.0 if solution.focal_ratio == 1 else search.WRONG_FOCAL
+        if not len(solution.star) or solution.chi2 < misfit.DOUBTFUL:
+            return Refit(solution, camera, 1.0)
         if self.focal_uncertainty:
-            variance = misfit.scale_of(solution, True)
+            dof = max(2 * len(solution.star) - 4, 1)
+            variance = variance_factor(dof * solution.chi2, dof)
             return Refit(solution._replace(covariance_rad2=variance * solution.covariance_rad2), camera, variance)
+        detections = self.detections(centroids, sigma_px, 0.0 if solution.focal_ratio == 1 else search.WRONG_FOCAL)
         fit_lens = not (self.camera.row_time_s or self.camera.focal_sigma)
-        detections = self.detections(centroids, sigma_px, free)
         return misfit.refit(solution, detections, self.sky, camera, centroids.xy_px, fit_lens)
 
     def attitude_of(self, centroids: Centroids, refitted: Refit, sigma_px: Floats) -> Attitude:
