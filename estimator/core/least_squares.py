@@ -135,7 +135,7 @@ def misfit_factor(chi2: float, degrees_of_freedom: int) -> float:
     return reduced if reduced > 1 + 4 * sqrt(2 / degrees_of_freedom) else 1.0
 
 
-def variance_factor(chi2: float, degrees_of_freedom: int) -> float:
+def variance_factor(chi2: float, degrees_of_freedom: float) -> float:
     """Expected factor of the claimed variances, given the chi-square of residuals: 1 where they agree with the claim.
 
     The factor v is 1 with the probability PRIOR_RIGHT, else anything to MAX_VARIANCE_FACTOR with equal probabilities of

@@ -33,6 +33,7 @@ PRIOR_WRONG_DEX = log10((1 - PRIOR_RIGHT) / PRIOR_RIGHT / (len(TRIED) - 1))  # o
 LENS_MATCHES = 6  # least number of matches for a fit of the lens
 FOCAL_PRIOR, CORNER_PRIOR = 0.01, 0.01  # standard deviations: relative focal length, distortion at the corner
 LENS_ROUNDS = 4
+SHEAR_CHANCE = 1e-4  # probability of random residuals that look sheared
 
 
 def variance_of(residual: Floats, parameters: int) -> float:
@@ -91,11 +92,13 @@ class Refit(NamedTuple):
 
     solution : with the covariance multiplied by `variance`
     camera   : with the fitted lens;  variance : factor of the claimed variances
+    sheared  : whether the field is stretched or sheared, as by a rolling shutter: its attitude is none
     """
 
     solution: Solution
     camera: Camera
     variance: float
+    sheared: bool = False
 
 
 def refit(
@@ -147,6 +150,7 @@ def with_lens(
         if near.sum() < LENS_MATCHES:
             break
         keep, variance = near, found
+    sheared = _is_sheared(whiten[keep], view.tangent[keep], slopes[keep], (residual - slopes @ step)[keep])
     left = lens.tangents(xy_px[keep]) - _tangents(cam_from_ref.apply(vectors_ref[keep]))
     fitted = solution._replace(
         observed=solution.observed[keep],
@@ -156,7 +160,22 @@ def with_lens(
         rms=float(np.sqrt(np.mean(left**2))),
         chi2=chi2 / (2 * count - 5),
     )
-    return Refit(fitted, lens, variance)
+    return Refit(fitted, lens, variance, sheared)
+
+
+def _is_sheared(whiten: Floats, tangent: Floats, slopes: Floats, residual: Floats) -> bool:
+    """Whether a stretch (x, -y) and a shear (y, x) of the field explain the residuals of K matches.
+
+    By an F-test, whatever the errors: with m degrees of freedom left, random residuals keep no more than the share q of
+    their chi-square with the probability q^(m/2).
+    """
+    x, y = tangent.T
+    change = np.stack([np.stack([x, -y], axis=1), np.stack([y, x], axis=1)], axis=2)
+    design = np.concatenate([slopes, whiten @ change], axis=2).reshape(-1, 7)
+    errors = residual.ravel()
+    solved, _, _, _ = np.linalg.lstsq(design, errors, rcond=None)
+    share = np.sum((errors - design @ solved) ** 2) / np.sum(errors**2)
+    return bool(share ** ((len(errors) - 7) / 2) < SHEAR_CHANCE)
 
 
 def _tangents(seen_cam: Floats) -> Floats:

@@ -352,7 +352,8 @@ class StarTracker:
             if not len(solution.star):
                 continue
             refitted = self.refit(centroids, solution, sigma_px)
-            if not self.focal_uncertainty and self.field_matcher.misfits(refitted.solution, centroids):
+            partial = not self.focal_uncertainty and self.field_matcher.misfits(refitted.solution, centroids)
+            if partial or refitted.sheared:
                 continue
             attitude = self.attitude_of(centroids, refitted, sigma_px)
             if self.focal_uncertainty and not (
@@ -384,17 +385,17 @@ class StarTracker:
         camera = self.camera if solution.focal_ratio == 1 else self.camera.zoomed(solution.focal_ratio)
         if not len(solution.star) or solution.chi2 < misfit.DOUBTFUL:
             return Refit(solution, camera, 1.0)
-        if self.focal_uncertainty:
+        if self.focal_uncertainty or self.camera.row_time_s:
+            # The lens or the rate is fitted afterwards: matches beyond the gate belong to it.
             dof = max(2 * len(solution.star) - 4, 1)
             variance = variance_factor(dof * solution.chi2, dof)
             return Refit(solution._replace(covariance_rad2=variance * solution.covariance_rad2), camera, variance)
         detections = self.detections(centroids, sigma_px, 0.0 if solution.focal_ratio == 1 else search.WRONG_FOCAL)
-        fit_lens = not (self.camera.row_time_s or self.camera.focal_sigma)
-        return misfit.refit(solution, detections, self.sky, camera, centroids.xy_px, fit_lens)
+        return misfit.refit(solution, detections, self.sky, camera, centroids.xy_px, not self.camera.focal_sigma)
 
     def attitude_of(self, centroids: Centroids, refitted: Refit, sigma_px: Floats) -> Attitude:
         """The attitude of a solution; solved again from its matches if the settings name another solver."""
-        solution, camera, variance = refitted
+        solution, camera, variance, _ = refitted
         cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
         covariance_rad2 = solution.covariance_rad2
         sigma_rad = np.sqrt(variance) * sigma_px[solution.observed] / camera.focal_px

@@ -183,7 +183,7 @@ class TrackingMode:
     def _track(
         self, image: NDArray, predicted: Rotation, streak_px: tuple[float, float] | None, clock: Clock
     ) -> TrackedReport | None:
-        """Solve from the detections in windows; None if the evidence is below ACCEPT_DEX."""
+        """Solve from the detections in windows; None if the evidence is below ACCEPT_DEX, or the field is sheared."""
         tracker = self.tracker
         window_centers_px = self.window_centers_px(predicted)
         if len(window_centers_px) < MIN_EVIDENCE_MATCHES:
@@ -204,6 +204,8 @@ class TrackingMode:
             return None
         solution = evidence.build_solution(detections, tracker.sky, hypothesis)
         refitted = tracker.refit(centroids, solution._replace(dex=hypothesis.dex + prior_gain_dex), sigma_px)
+        if refitted.sheared:
+            return None
         attitude = tracker.attitude_of(centroids, refitted, sigma_px)
         clock.lap("solve")
         return self._report(attitude, centroids, sigma_px, clock, len(window_centers_px), saturated, streak_px)
