@@ -42,7 +42,9 @@ def variance_of(residual: Floats, parameters: int) -> float:
 
 
 @jit
-def widened(solution: Solution, R_cam_from_ref: Floats, detections: Detections, sky: SkyIndex) -> tuple[Solution, float]:
+def widened(
+    solution: Solution, R_cam_from_ref: Floats, detections: Detections, sky: SkyIndex
+) -> tuple[Solution, float]:
     """The solution with the errors of most evidence, and the expected factor of the variances over all that were tried.
 
     The gates hide how great the errors are, so that each factor has its own matches; their Bayes factors, with the
@@ -184,6 +186,8 @@ def _tangents(seen_cam: Floats) -> Floats:
 
 def _lens_of(camera: Camera, log_focal: float, k1: float) -> Camera:
     """The camera with its log focal length and first distortion coefficient changed."""
-    first, *others = camera.distortion
-    focal_px, distortion = camera.focal_px * float(np.exp(log_focal)), (first + float(k1), *others)
+    focal_px, distortion = (
+        camera.focal_px * float(np.exp(log_focal)),
+        (k1 + camera.distortion[0], *camera.distortion[1:]),
+    )
     return replace(camera, focal_px=focal_px, distortion=distortion)
