@@ -186,8 +186,6 @@ def _tangents(seen_cam: Floats) -> Floats:
 
 def _lens_of(camera: Camera, log_focal: float, k1: float) -> Camera:
     """The camera with its log focal length and first distortion coefficient changed."""
-    focal_px, distortion = (
-        camera.focal_px * float(np.exp(log_focal)),
-        (k1 + camera.distortion[0], *camera.distortion[1:]),
-    )
+    focal_px = camera.focal_px * float(np.exp(log_focal))
+    distortion = (camera.distortion[0] + float(k1), *camera.distortion[1:])
     return replace(camera, focal_px=focal_px, distortion=distortion)
