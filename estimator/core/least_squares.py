@@ -23,6 +23,10 @@ CONVERGED_CHI2, CONVERGED_PX = 1e-4, 1e-3
 # relative fall of the loss at which it has converged; diagonal for a parameter without effect.
 SLOPE_STEP, MIN_DAMPING, MAX_DAMPING, MAX_STEPS, CONVERGED_FALL, TINY = 1e-4, 1e-9, 1e6, 40, 1e-10, 1e-12
 
+# Prior of the factor of claimed variances: probability that it is 1, else from 1 to this, evenly in its logarithm.
+PRIOR_RIGHT, MAX_VARIANCE_FACTOR = 0.5, 100.0
+FACTORS = np.geomspace(1.0, MAX_VARIANCE_FACTOR, 60)
+
 
 @jit(fastmath={"reassoc", "contract"})
 def normal_equations(rows: Floats, weight: Floats, count: int, normal: Floats) -> None:
@@ -129,6 +133,24 @@ def misfit_factor(chi2: float, degrees_of_freedom: int) -> float:
         return 1.0
     reduced = chi2 / degrees_of_freedom
     return reduced if reduced > 1 + 4 * sqrt(2 / degrees_of_freedom) else 1.0
+
+
+def variance_factor(chi2: float, degrees_of_freedom: float) -> float:
+    """Expected factor of the claimed variances, given the chi-square of residuals: 1 where they agree with the claim.
+
+    The factor v is 1 with the probability PRIOR_RIGHT, else anything to MAX_VARIANCE_FACTOR with equal probabilities of
+    equal ratios (Jeffreys' prior of a scale). With the likelihood v^(-n/2) exp(-chi2 / (2 v)), n degrees of freedom,
+
+        E v = [p + (1 - p) <v L(v) / L(1)>] / [p + (1 - p) <L(v) / L(1)>].
+
+    With many degrees of freedom it is the reduced chi-square, wherever that is significant (the ratio of R. T. Birge,
+    Phys. Rev. 40, 207 (1932); Gelman et al., Bayesian Data Analysis, 3rd ed., sections 3.2 and 14.2).
+    """
+    log_ratio = 0.5 * (chi2 * (1 - 1 / FACTORS) - degrees_of_freedom * np.log(FACTORS))
+    highest = max(float(log_ratio.max()), 0.0)
+    wrong = (1 - PRIOR_RIGHT) * np.exp(log_ratio - highest) / len(FACTORS)
+    right = PRIOR_RIGHT * np.exp(-highest)
+    return float((right + wrong @ FACTORS) / (right + wrong.sum()))
 
 
 def fit_soft_l1(

@@ -26,6 +26,7 @@ from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.stars import evidence
 from estimator.identification.stars.evidence import Solution
+from estimator.trackers import misfit
 from estimator.trackers.pipeline import Settings, direction_sigma_rad
 
 NO_MATCH = "no identification beyond chance"
@@ -103,7 +104,10 @@ class FieldMatcher:
         if abs(self.camera.fov_rad / camera.fov_rad - 1) > 1.2 * self.focal_uncertainty + 1e-9:
             return Attitude(NO_MATCH)
         seen_cam = cam_from_ref.apply(vectors)
-        rms_px = float(np.sqrt(np.mean((camera.pixels(seen_cam) - xy) ** 2)))
+        residual_px = camera.pixels(seen_cam) - xy
+        rms_px = float(np.sqrt(np.mean(residual_px**2)))
+        residual, parameters = residual_px / (camera.focal_px * sigma_rad)[:, None], 5 if fit_lens else 3
+        sigma_rad = sigma_rad * np.sqrt(misfit.variance_of(residual, parameters))
         covariance_rad2 = covariance(rays, sigma_rad, self.settings.solver)
         covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, camera, xy, seen_cam, sigma_rad)
         match = StarMatch(observed, star, cam_from_ref, chance)

@@ -27,13 +27,15 @@ from estimator.catalog import catalog, pair_index, quad_index, sky_index
 from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
+from estimator.core.least_squares import variance_factor
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification.chance import (
     MIN_EVIDENCE_MATCHES,
 )
 from estimator.identification.stars import quads, search
 from estimator.identification.stars.evidence import Detections, Solution
-from estimator.trackers import warm_up
+from estimator.trackers import misfit, warm_up
+from estimator.trackers.misfit import Refit
 from estimator.trackers.pipeline import Clock, Report, Settings, brightest, check_algorithms, process_frame
 from estimator.trackers.refinement import NO_MATCH, FieldMatcher
 from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
@@ -197,6 +199,9 @@ class StarTracker:
         """
         cam_from_ref, xy_px, light = self.rich_field()
         warm_up.run(self.camera, xy_px, light, dtype, self.solve)
+        # Residuals of four standard deviations: the errors are matched and fitted anew then.
+        moved_px = xy_px + 0.4 * (-1.0) ** np.arange(len(xy_px))[:, None]
+        self.solve_centroids(Centroids(moved_px, np.full(len(xy_px), 0.1), light))
         # As many false lights as stars: whether the camera model fits the field is tested then.
         xy_px = np.concatenate([xy_px, xy_px[:, ::-1]])
         centroids = Centroids(xy_px, np.full(len(xy_px), 0.1), np.concatenate([light, light / 2]))
@@ -281,8 +286,9 @@ class StarTracker:
             return Attitude(f"no attitude: {error}")
         seen_cam = cam_from_ref.apply(vectors)
         residual = self.camera.pixels(seen_cam) - centroids.xy_px[observed]
-        covariance_rad2 = covariance(rays, sigma_rad, self.settings.solver)
         xy_px = centroids.xy_px[observed]
+        sigma_rad = sigma_rad * np.sqrt(misfit.variance_of(residual / sigma_px[:, None], 3))
+        covariance_rad2 = covariance(rays, sigma_rad, self.settings.solver)
         covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, self.camera, xy_px, seen_cam, sigma_rad)
         match = StarMatch(observed, star, cam_from_ref, float("nan"))
         rms_px = float(np.sqrt(np.mean(residual**2)))
@@ -345,9 +351,11 @@ class StarTracker:
             clock.lap("identify")
             if not len(solution.star):
                 continue
-            if not self.focal_uncertainty and self.field_matcher.misfits(solution, centroids):
+            refitted = self.refit(centroids, solution, sigma_px)
+            partial = not self.focal_uncertainty and self.field_matcher.misfits(refitted.solution, centroids)
+            if partial or refitted.sheared:
                 continue
-            attitude = self.attitude_of(centroids, solution, sigma_px)
+            attitude = self.attitude_of(centroids, refitted, sigma_px)
             if self.focal_uncertainty and not (
                 model.min_error_px == MIN_ERROR_PX and self.field_matcher.fits(solution, centroids, sigma_px)
             ):
@@ -372,20 +380,32 @@ class StarTracker:
         known = not self.focal_uncertainty
         return quads.identify(detections, self.quads, patterns, self.sky, most, model.max_checks, known)
 
-    def attitude_of(self, centroids: Centroids, solution: Solution, sigma_px: Floats) -> Attitude:
-        """The attitude of a solution; solved again from its matches if the settings name another solver."""
+    def refit(self, centroids: Centroids, solution: Solution, sigma_px: Floats) -> Refit:
+        """A solution with the errors and, of a calibrated global shutter, the lens that its residuals tell."""
         camera = self.camera if solution.focal_ratio == 1 else self.camera.zoomed(solution.focal_ratio)
+        if not len(solution.star) or solution.chi2 < misfit.DOUBTFUL:
+            return Refit(solution, camera, 1.0)
+        if self.focal_uncertainty or self.camera.row_time_s:
+            # The lens or the rate is fitted afterwards: matches beyond the gate belong to it.
+            dof = max(2 * len(solution.star) - 4, 1)
+            variance = variance_factor(dof * solution.chi2, dof)
+            return Refit(solution._replace(covariance_rad2=variance * solution.covariance_rad2), camera, variance)
+        detections = self.detections(centroids, sigma_px, 0.0 if solution.focal_ratio == 1 else search.WRONG_FOCAL)
+        return misfit.refit(solution, detections, self.sky, camera, centroids.xy_px, not self.camera.focal_sigma)
+
+    def attitude_of(self, centroids: Centroids, refitted: Refit, sigma_px: Floats) -> Attitude:
+        """The attitude of a solution; solved again from its matches if the settings name another solver."""
+        solution, camera, variance, _ = refitted
         cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
         covariance_rad2 = solution.covariance_rad2
+        sigma_rad = np.sqrt(variance) * sigma_px[solution.observed] / camera.focal_px
         solver = self.settings.solver
         if solver != "default":
             rays, vectors = camera.rays(centroids.xy_px[solution.observed]), self.stars.vectors[solution.star]
-            sigma_rad = sigma_px[solution.observed] / camera.focal_px
             cam_from_ref = SOLVERS[solver](rays, vectors, sigma_rad)
             covariance_rad2 = covariance(rays, sigma_rad, solver)
         match = StarMatch(solution.observed, solution.star, cam_from_ref, -solution.dex)
         rms_px = solution.rms * self.camera.focal_px
-        sigma_rad = sigma_px[solution.observed] / camera.focal_px
         seen_cam = cam_from_ref.apply(self.stars.vectors[solution.star])
         xy_px = centroids.xy_px[solution.observed]
         covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, camera, xy_px, seen_cam, sigma_rad)

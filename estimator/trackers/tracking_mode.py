@@ -183,7 +183,7 @@ class TrackingMode:
     def _track(
         self, image: NDArray, predicted: Rotation, streak_px: tuple[float, float] | None, clock: Clock
     ) -> TrackedReport | None:
-        """Solve from the detections in windows; None if the evidence is below ACCEPT_DEX."""
+        """Solve from the detections in windows; None if the evidence is below ACCEPT_DEX, or the field is sheared."""
         tracker = self.tracker
         window_centers_px = self.window_centers_px(predicted)
         if len(window_centers_px) < MIN_EVIDENCE_MATCHES:
@@ -203,7 +203,10 @@ class TrackingMode:
         if hypothesis.dex + prior_gain_dex < ACCEPT_DEX:
             return None
         solution = evidence.build_solution(detections, tracker.sky, hypothesis)
-        attitude = tracker.attitude_of(centroids, solution._replace(dex=hypothesis.dex + prior_gain_dex), sigma_px)
+        refitted = tracker.refit(centroids, solution._replace(dex=hypothesis.dex + prior_gain_dex), sigma_px)
+        if refitted.sheared:
+            return None
+        attitude = tracker.attitude_of(centroids, refitted, sigma_px)
         clock.lap("solve")
         return self._report(attitude, centroids, sigma_px, clock, len(window_centers_px), saturated, streak_px)
 
@@ -262,7 +265,8 @@ class TrackingMode:
             return TrackedReport(attitude, centroids, clock.seconds)
         match: StarMatch = attitude.match
         vectors_cam = attitude.cam_from_ref.apply(self.tracker.stars.vectors[match.star])
-        residual_px = self.tracker.camera.pixels(vectors_cam) - centroids.xy_px[match.observed]
+        camera = attitude.camera or self.tracker.camera
+        residual_px = camera.pixels(vectors_cam) - centroids.xy_px[match.observed]
         chi2 = float(np.sum((residual_px / sigma_px[match.observed][:, None]) ** 2))
         chi2_per_dof = chi2 / max(2 * len(match.star) - 3, 1)
         streak = float(np.hypot(*streak_px)) if streak_px is not None else 0.0

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import scipy
 from hypothesis import given
 from hypothesis import strategies as some
 from laws import SEEDS, law
 
 from estimator.core.arrays import Floats
-from estimator.core.least_squares import fit_soft_l1, soft_l1
+from estimator.core.least_squares import MAX_VARIANCE_FACTOR, fit_soft_l1, soft_l1, variance_factor
 
 
 @law(soft_l1)
@@ -45,3 +46,20 @@ def test_the_robust_fit_finds_scipy_s_minimum(rng: np.random.Generator, count: i
 def test_a_parameter_without_effect_stays_where_it_was(rng: np.random.Generator) -> None:
     found = fit_soft_l1(lambda p: p[:1] - np.array([3.0, 3.0]), np.array([0.0, 7.0]), np.ones(2))
     np.testing.assert_allclose(found, [3.0, 7.0], atol=1e-6)
+
+
+@law(variance_factor)
+@given(some.integers(1, 200), some.floats(0.0, 1e6))
+def test_variance_factor_is_one_to_its_limit_and_grows_with_chi_square(dof: int, chi2: float) -> None:
+    assert 1 <= variance_factor(chi2, dof) <= MAX_VARIANCE_FACTOR
+    assert variance_factor(chi2, dof) <= variance_factor(1.1 * chi2 + 1, dof) + 1e-9
+
+
+@pytest.mark.parametrize("factor", [4.0, 9.0, 25.0])
+def test_variance_factor_is_the_reduced_chi_square_with_many_degrees_of_freedom(factor: float) -> None:
+    assert abs(variance_factor(factor * 1000, 1000) / factor - 1) < 0.02
+
+
+def test_variance_factor_of_a_right_claim_is_about_one() -> None:
+    chi2 = np.random.default_rng(3).chisquare(27, 2000)
+    assert np.mean([variance_factor(one, 27) for one in chi2]) < 1.1

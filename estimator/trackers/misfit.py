@@ -1,0 +1,191 @@
+"""Errors that exceed the model: a solution's matches, lens and covariance where its residuals are too great.
+
+The claimed centroid errors may be too small, and the lens may have drifted from its calibration. Both show in the
+chi-square of the residuals, but only in part: matches beyond the gate are lost. The errors are therefore multiplied by
+the factor that the residuals tell and the field is matched again, as long as the evidence rises (`widened`). Then the
+focal length and the first radial distortion coefficient are fitted with the attitude (`with_lens`), and what the
+residuals still exceed multiplies the covariance (`least_squares.variance_factor`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import log10, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.systematic import geometry
+from estimator.catalog.sky_index import SkyIndex
+from estimator.core.arrays import Floats
+from estimator.core.camera import Camera
+from estimator.core.jit import jit
+from estimator.core.least_squares import PRIOR_RIGHT, variance_factor
+from estimator.identification.chance import GATE_SIGMA
+from estimator.identification.stars import evidence
+from estimator.identification.stars.evidence import Detections, Solution
+
+TELLING = 1.5  # variance factor above which matches and lens are tried anew
+DOUBTFUL = 0.7  # reduced chi-square above which greater errors are tried
+TRIED = 2.0 ** np.arange(7)  # factors of the variances
+PRIOR_WRONG_DEX = log10((1 - PRIOR_RIGHT) / PRIOR_RIGHT / (len(TRIED) - 1))  # of each, beside the claimed errors
+LENS_MATCHES = 6  # least number of matches for a fit of the lens
+FOCAL_PRIOR, CORNER_PRIOR = 0.01, 0.01  # standard deviations: relative focal length, distortion at the corner
+LENS_ROUNDS = 4
+SHEAR_CHANCE = 1e-4  # probability of random residuals that look sheared
+
+
+def variance_of(residual: Floats, parameters: int) -> float:
+    """Factor of the claimed variances by (K, 2) residuals in standard deviations, after a fit of some parameters."""
+    return variance_factor(float(np.sum(residual**2)), max(residual.size - parameters, 1))
+
+
+@jit
+def widened(
+    solution: Solution, R_cam_from_ref: Floats, detections: Detections, sky: SkyIndex
+) -> tuple[Solution, float]:
+    """The solution with the errors of most evidence, and the expected factor of the variances over all that were tried.
+
+    The gates hide how great the errors are, so that each factor has its own matches; their Bayes factors, with the
+    prior of `least_squares.variance_factor`, are their weights. The covariance is multiplied by the factor.
+    detections : with the errors of the model, and the focal uncertainty with which the solution was found
+    """
+    best, best_dex, dex = solution, solution.dex, np.empty(len(TRIED))
+    dex[0] = solution.dex
+    for n in range(1, len(TRIED)):
+        wide = Detections(
+            detections.tangent,
+            detections.sigma * sqrt(TRIED[n]),
+            detections.weight / TRIED[n],
+            detections.mag,
+            detections.mag_sigma,
+            detections.field,
+            detections.focal_uncertainty,
+        )
+        gates = 1.5 * GATE_SIGMA * wide.sigma
+        found = evidence.evaluate(wide, sky, R_cam_from_ref.copy(), solution.focal_ratio, gates, -np.inf)
+        dex[n] = found.dex + PRIOR_WRONG_DEX
+        if dex[n] > best_dex:
+            best, best_dex = evidence.build_solution(wide, sky, found), dex[n]
+    weight = 10 ** (dex - best_dex)
+    variance = np.sum(weight * TRIED) / np.sum(weight)
+    covariance = best.covariance_rad2 * (variance / TRIED[np.argmax(dex)])
+    return with_covariance(best, covariance), variance
+
+
+@jit
+def with_covariance(solution: Solution, covariance_rad2: Floats) -> Solution:
+    """The solution with another covariance."""
+    return Solution(
+        solution.observed,
+        solution.star,
+        solution.cam_from_ref_xyzw,
+        covariance_rad2,
+        solution.focal_ratio,
+        solution.rms,
+        solution.chi2,
+        solution.dex,
+    )
+
+
+class Refit(NamedTuple):
+    """A solution with the errors and the lens that its residuals tell.
+
+    solution : with the covariance multiplied by `variance`
+    camera   : with the fitted lens;  variance : factor of the claimed variances
+    sheared  : whether the field is stretched or sheared, as by a rolling shutter: its attitude is none
+    """
+
+    solution: Solution
+    camera: Camera
+    variance: float
+    sheared: bool = False
+
+
+def refit(
+    solution: Solution, detections: Detections, sky: SkyIndex, camera: Camera, xy_px: Floats, fit_lens: bool
+) -> Refit:
+    """The solution matched, fitted and scaled anew by its residuals.
+
+    detections : with the errors of the model, and the focal uncertainty with which the solution was found
+    camera     : of the solution;  xy_px : (N, 2) centroids
+    """
+    R_cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw).as_matrix()
+    solution, variance = widened(solution, R_cam_from_ref, detections, sky)
+    if fit_lens and variance >= TELLING and len(solution.star) >= LENS_MATCHES:
+        return with_lens(solution, detections, sky, camera, xy_px, variance)
+    return Refit(solution, camera, variance)
+
+
+def with_lens(
+    solution: Solution, detections: Detections, sky: SkyIndex, camera: Camera, xy_px: Floats, variance: float
+) -> Refit:
+    """Fit attitude, focal length and the first radial distortion coefficient to the matches of a solution.
+
+    Gauss-Newton steps of the tangents t: t changes by J w with a small rotation w, by t with the logarithm of the focal
+    length, and by |t|^2 t with the coefficient. Both have normal priors about the calibration. Each round drops matches
+    beyond GATE_SIGMA of the errors that the last one found. The covariance is that of the attitude, whatever the lens.
+    """
+    cam_from_ref, keep = Rotation.from_quat(solution.cam_from_ref_xyzw), np.ones(len(solution.star), bool)
+    xx, yy, xy = detections.weight[solution.observed].T
+    whiten = np.linalg.cholesky(np.moveaxis(np.array([[xx, xy], [xy, yy]]), 2, 0)).swapaxes(1, 2)
+    vectors_ref, xy_px = sky.vectors[solution.star], xy_px[solution.observed]
+    corner2 = float(np.sum(np.square(detections.field[[0, 2]])))
+    prior = np.diag([0.0, 0.0, 0.0, 1 / FOCAL_PRIOR**2, (corner2 / CORNER_PRIOR) ** 2])
+    lens, change = camera, np.zeros(5)
+    for _ in range(LENS_ROUNDS):
+        seen = cam_from_ref.apply(vectors_ref)
+        view = geometry(seen, seen)
+        radial = view.tangent * np.sum(view.tangent**2, axis=1)[:, None]
+        slopes = whiten @ np.concatenate([view.jacobian, view.tangent[:, :, None], radial[:, :, None]], axis=2)
+        residual = (whiten @ (lens.tangents(xy_px) - view.tangent)[:, :, None])[:, :, 0]
+        kept, count = slopes[keep].reshape(-1, 5), int(keep.sum())
+        normal = kept.T @ kept / variance + prior
+        step = np.linalg.solve(normal, kept.T @ residual[keep].ravel() / variance - prior @ change)
+        change[3:] += step[3:]
+        cam_from_ref, lens = Rotation.from_rotvec(step[:3]) * cam_from_ref, _lens_of(camera, *change[3:])
+        distance2 = np.sum((residual - slopes @ step) ** 2, axis=1)
+        chi2 = float(distance2[keep].sum())
+        found = variance_factor(chi2, 2 * count - 5)
+        near = distance2 <= GATE_SIGMA**2 * found
+        if near.sum() < LENS_MATCHES:
+            break
+        keep, variance = near, found
+    sheared = _is_sheared(whiten[keep], view.tangent[keep], slopes[keep], (residual - slopes @ step)[keep])
+    left = lens.tangents(xy_px[keep]) - _tangents(cam_from_ref.apply(vectors_ref[keep]))
+    fitted = solution._replace(
+        observed=solution.observed[keep],
+        star=solution.star[keep],
+        cam_from_ref_xyzw=cam_from_ref.as_quat(),
+        covariance_rad2=np.linalg.inv(kept.T @ kept / variance + prior)[:3, :3],
+        rms=float(np.sqrt(np.mean(left**2))),
+        chi2=chi2 / (2 * count - 5),
+    )
+    return Refit(fitted, lens, variance, sheared)
+
+
+def _is_sheared(whiten: Floats, tangent: Floats, slopes: Floats, residual: Floats) -> bool:
+    """Whether a stretch (x, -y) and a shear (y, x) of the field explain the residuals of K matches.
+
+    By an F-test, whatever the errors: with m degrees of freedom left, random residuals keep no more than the share q of
+    their chi-square with the probability q^(m/2).
+    """
+    x, y = tangent.T
+    change = np.stack([np.stack([x, -y], axis=1), np.stack([y, x], axis=1)], axis=2)
+    design = np.concatenate([slopes, whiten @ change], axis=2).reshape(-1, 7)
+    errors = residual.ravel()
+    solved, _, _, _ = np.linalg.lstsq(design, errors, rcond=None)
+    share = np.sum((errors - design @ solved) ** 2) / np.sum(errors**2)
+    return bool(share ** ((len(errors) - 7) / 2) < SHEAR_CHANCE)
+
+
+def _tangents(seen_cam: Floats) -> Floats:
+    return np.asarray(seen_cam[:, :2] / seen_cam[:, 2:])
+
+
+def _lens_of(camera: Camera, log_focal: float, k1: float) -> Camera:
+    """The camera with its log focal length and first distortion coefficient changed."""
+    focal_px = camera.focal_px * float(np.exp(log_focal))
+    distortion = (camera.distortion[0] + float(k1), *camera.distortion[1:])
+    return replace(camera, focal_px=focal_px, distortion=distortion)
