@@ -316,7 +316,7 @@ def test_a_solver_s_own_error_is_a_cause() -> None:
             "afit_simsat",
             {"camera__preset": "lu205c", "tracker__assumed_row_time": "0 s"},
             "tracker.assumed_row_time",
-            "rolling shutter",
+            "corrects the rows",
         ),
         (
             "afit_simsat",
