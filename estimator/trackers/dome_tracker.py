@@ -22,7 +22,6 @@ from estimator.catalog import pair_index
 from estimator.core import checks
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
-from estimator.core.least_squares import variance_factor
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.leds import search
@@ -318,8 +317,8 @@ class DomeTracker:
 
         Two LEDs whose images touch form one blob at neither's position. Residual lengths are divided by their sigmas;
         those above 5 times the median (above 5 if the median is below 1) are rejected. The rest has 2 K - 3 degrees of
-        freedom; its chi-square has that mean, and more by what the attitude cannot absorb of the common errors. The
-        factor is `least_squares.variance_factor` of the chi-square with the same mean and spread (Satterthwaite 1946).
+        freedom; its chi-square has that mean, and more by what the attitude cannot absorb of the common errors. If it
+        exceeds its mean by more than 3 standard deviations, their ratio is the factor, else 1.
         """
         residual = self._residual_px(centroids, observed, star, body_from_lab)
         length = np.linalg.norm(residual, axis=1) / (sigma_rad * self.camera.focal_px)
@@ -337,8 +336,7 @@ class DomeTracker:
             mean = noise * dof + float(np.trace(left))
             spread = np.sqrt(2 * noise**2 * dof + 4 * noise * np.trace(left) + 2 * np.trace(left @ left))
         chi2 = float(np.sum(length[inlier] ** 2))
-        freedom = 2 * (mean / spread) ** 2
-        return observed[inlier], star[inlier], variance_factor(chi2 / mean * freedom, freedom)
+        return observed[inlier], star[inlier], chi2 / mean if chi2 > mean + 3 * spread else 1.0
 
     def _lever_covariance(self, cam_from_lab: Rotation, star: NDArray) -> Floats:
         """(3, 3) covariance in camera axes from the error of the pupil's position, which is common to all frames.

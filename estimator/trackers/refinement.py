@@ -168,7 +168,7 @@ class FieldMatcher:
         if len(centroids) - matched < MISFIT_SHARE * matched:
             return False
         near, by_chance = self.near_misses(solution, centroids)
-        return near - by_chance > max(MISFIT_SHARE * matched, 3 * np.sqrt(by_chance))
+        return bool(near - by_chance > max(MISFIT_SHARE * matched, 3 * np.sqrt(by_chance)))
 
     def near_misses(self, solution: Solution, centroids: Centroids) -> tuple[int, float]:
         """Number of unmatched detections beside a star, and how many are expected by chance."""
