@@ -27,10 +27,6 @@ COLORS = (1, 2, 3, 4)  # channels of a color image, with transparency, or of one
 _FIELDS = f"fov_deg from {NARROWEST_DEG} to {math.degrees(WIDEST_RAD):.0f}, or fov_rad above 0 to {WIDEST_RAD}"
 
 
-def _is_finite_float(value: object) -> bool:
-    return type(value) is float and math.isfinite(value)
-
-
 @dataclass(frozen=True, slots=True)
 class Camera:
     """A pinhole with Brown-Conrady distortion, in camera axes +x right, +y down, +z boresight.

@@ -131,7 +131,7 @@ class Centroids:
     moments_px2    : (N, 3) second moments xx - yy, 2 xy, xx + yy of lights that are disks; None if not measured
 
     Any array of numbers is taken; it is kept as C-contiguous float64. Raises ImageError for other shapes, or for arrays
-    of different lengths; the numbers are checked by whoever solves them (`check_values`).
+    of different lengths; the trackers check the numbers (`check_values`).
     """
 
     xy_px: Floats

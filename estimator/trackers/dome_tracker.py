@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude import systematic
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, on_sphere, project
-from estimator.attitude.motion import center_streak_px
 from estimator.attitude.nearfield import SOLVERS, fitted_sigma_rad
 from estimator.catalog import pair_index
 from estimator.core import checks
@@ -143,14 +142,12 @@ class DomeTracker:
     ) -> Report:
         """Solve one frame. Raises ImageError for bad input; any other failure is reported in the status.
 
-        streak_px : (dx, dy) that lights move during the exposure, from the gyro; None if unknown, or if `rate` tells it
-        rate      : of the camera, from the gyro; None: a rolling shutter's rate is told by the frame
-        exposure_s: tells the rate from streaks; None if unknown
+        streak_px : (dx, dy) that lights move during the exposure, from the gyro; None: unknown, or from `rate`
+        rate      : of the camera, from the gyro; None: with a rolling shutter it is estimated from the frame
+        exposure_s: to estimate the rate from streaks; None if unknown
         """
-        if streak_px is None and rate is not None and rate.sign_known and exposure_s is not None:
-            streak_px = center_streak_px(self.camera, rate, exposure_s)
         solve = partial(self.solve_centroids, rate=rate, exposure_s=exposure_s)
-        return process_frame(image, self.camera, self.settings, solve, streak_px)
+        return process_frame(image, self.camera, self.settings, solve, streak_px, rate, exposure_s)
 
     def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
         """Compile all that `solve` and `solve_centroids` use: call it before the experiment.

@@ -17,12 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.attitude.motion import center_streak_px
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera, check_frame
 from estimator.core.errors import ImageError
-from estimator.core.types import Attitude, Blobs, Centroids, FramePriors
+from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, RateEstimate
 from estimator.detection import classify
 from estimator.detection.classify import NO_STAR, Flag
 from estimator.detection.detect import DETECTORS, in_row_order, replace_bad_pixels, to_native
@@ -221,9 +222,16 @@ def process_frame(
     settings: Settings,
     solve: Callable[[Centroids, Clock], Attitude],
     streak_px: tuple[float, float] | None = None,
+    rate: RateEstimate | None = None,
+    exposure_s: float | None = None,
 ) -> Report:
-    """Process a frame through all stages: detect, centroid, then `solve`. Returns the report with timings."""
+    """Process a frame through all stages: detect, centroid, then `solve`. Returns the report with timings.
+
+    Without streak_px, a rate of known sign and the exposure time give the streak.
+    """
     clock = Clock()
+    if streak_px is None and rate is not None and rate.sign_known and exposure_s is not None:
+        streak_px = center_streak_px(camera, rate, exposure_s)
     centroids = detect_and_centroid(image, camera, settings, clock, streak_px)
     return Report(solve(centroids, clock), centroids, clock.seconds)
 

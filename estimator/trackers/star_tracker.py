@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.motion import center_streak_px, covariance_of
+from estimator.attitude.motion import covariance_of
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.attitude.systematic import with_focal_error
 from estimator.catalog import catalog, pair_index, quad_index, sky_index
@@ -181,14 +181,12 @@ class StarTracker:
     ) -> Report:
         """Solve one frame. Raises ImageError for bad input; any other failure is reported in the status.
 
-        streak_px : (dx, dy) that stars move during the exposure, from the gyro; None if unknown, or if `rate` tells it
-        rate      : of the camera, from the gyro; None: a rolling shutter's rate is told by the frame
-        exposure_s: tells the rate from streaks; None if unknown
+        streak_px : (dx, dy) that stars move during the exposure, from the gyro; None: unknown, or from `rate`
+        rate      : of the camera, from the gyro; None: with a rolling shutter it is estimated from the frame
+        exposure_s: to estimate the rate from streaks; None if unknown
         """
-        if streak_px is None and rate is not None and rate.sign_known and exposure_s is not None:
-            streak_px = center_streak_px(self.camera, rate, exposure_s)
         solve = functools.partial(self.solve_centroids, rate=rate, exposure_s=exposure_s)
-        return process_frame(image, self.camera, self.settings, solve, streak_px)
+        return process_frame(image, self.camera, self.settings, solve, streak_px, rate, exposure_s)
 
     def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
         """Compile all that `solve` and `solve_centroids` use, and build the quads: call it before the flight.

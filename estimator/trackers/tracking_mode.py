@@ -116,7 +116,7 @@ class TrackingMode:
 
         now_from_then : cam(t_s) from cam at the last solved frame, from the gyros; None: the last rate is extrapolated
         streak_px     : (dx, dy) that stars move during the exposure, from the gyros
-        exposure_s    : tells the rate from streaks
+        exposure_s    : to estimate the rate from streaks
         """
         check_frame(image, self.tracker.camera)
         image, streak_px = in_row_order(image), checks.pixel_step("streak_px", streak_px)
