@@ -65,7 +65,12 @@ def with_imports(source: Path, uses: Mapping[Path, set[Path]]) -> set[Path]:
 TRACKER, FRAME = "skysim.simulation.compilation", ("--frames", "1", "--out", "{folder}")
 GROUPS: tuple[Sequence[Sequence[str]], ...] = (
     [(TRACKER, "shefex2")],
-    [("skysim", "render", "shefex2", *FRAME), ("skysim", "render", "afit_simsat", *FRAME), (TRACKER, "afit_simsat")],
+    [
+        ("skysim", "render", "afit_simsat", *FRAME),
+        ("skysim", "render", "shefex2", *FRAME),
+        (TRACKER, "afit_simsat"),
+        ("skysim", "solve", "{folder}/frame_0000.png"),
+    ],
 )
 
 

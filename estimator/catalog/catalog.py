@@ -8,6 +8,7 @@ light.
 from __future__ import annotations
 
 import datetime
+import functools
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -175,6 +176,20 @@ def read(path: str | Path) -> StarCatalog:
 
     The header gives the epoch, `epoch_jyear`. Raises ImageError with one line if the file cannot be read.
     """
+    try:
+        state = Path(path).stat()
+    except (OSError, TypeError, ValueError):
+        return _read(path)  # refuses it
+    return _kept(path, state.st_dev, state.st_ino, state.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=4)
+def _kept(path: str | Path, *_state: int) -> StarCatalog:
+    """The catalog of a file in this state. The last four are kept: it takes 0.1 s to read one."""
+    return _read(path)
+
+
+def _read(path: str | Path) -> StarCatalog:
     (hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag), epoch_yr = columns(path, COLUMNS)
     radec_rad = np.radians(ra_deg), np.radians(dec_deg)
     stars = from_columns(hip.astype(np.int64), *radec_rad, pm_ra, pm_dec, parallax, v_mag, epoch_yr)
@@ -223,7 +238,8 @@ def columns(path: str | Path, names: Sequence[str], optional: Sequence[str] = ()
 
 def _epoch_yr(lines: Sequence[str]) -> float:
     """The Julian year in the header's line `# epoch_jyear: 1991.25`. Raises ValueError."""
-    found = [match for line in lines if (match := re.fullmatch(r"#\s*epoch_jyear:\s*(\d+\.?\d*)\s*", line))]
+    comments = (line for line in lines if line.startswith("#"))
+    found = [match for line in comments if (match := re.fullmatch(r"#\s*epoch_jyear:\s*(\d+\.?\d*)\s*", line))]
     epoch_yr = float(found[0][1]) if found else np.nan
     if not EPOCHS_YR[0] <= epoch_yr <= EPOCHS_YR[1]:
         raise ValueError("its header has no epoch_jyear of {:g} to {:g}".format(*EPOCHS_YR))

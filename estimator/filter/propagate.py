@@ -25,6 +25,7 @@ def advance(
     samples: Floats,
     noise: tuple[float, float, float, float, float],
     columns: Ints,
+    inverse: Floats,
     slow: tuple[int, int],
 ) -> tuple[Floats, Floats, Floats, float, float]:
     """Return attitude, values, covariance, saturation_rad and lost_rad after the samples; equations: AttitudeFilter.
@@ -33,13 +34,13 @@ def advance(
     samples : (M, 5) rows of t_s, the rotation in the interval that ends there (3), and MEASURED, SATURATED or MISSING
     noise   : arw^2, bias^2, 1 / bias_time, 1 / systematic_time, outage_rad_s
     columns : (9,) state of each element of the gyro's matrix M, row by row; -1 if it is none
+    inverse : (3, 3) `inverse_response` of the values, of which no element of M changes here
     slow    : first and last + 1 of the normalized systematic states
     """
     t_s, wxyz, values, covariance, saturation_rad, lost_rad = state
     arw2, bias2, decay_per_s, slow_per_s, outage_rad_s = noise
     wxyz, values, covariance = wxyz.copy(), values.copy(), covariance.copy()
     size = len(values)
-    inverse = inverse_response(values, columns)
     rotation, rows, buffer = np.empty(3), np.zeros((3, size)), np.empty((3, size))
     exponential, decay = np.empty((3, 6)), np.ones(size)
     for n in range(len(samples)):
@@ -96,17 +97,14 @@ def add_noise(covariance: Floats, angle_variance: float, bias_variance: float, s
         covariance[i + 3, i + 3] += bias_variance
 
 
-@jit
 def inverse_response(values: Floats, columns: Ints) -> Floats:
     """(3, 3) inverse of I + M, with the elements of M among the values."""
-    response, known = np.eye(3), False
-    for k in range(9):
-        if columns[k] >= 0:
-            response[k // 3, k % 3] += values[columns[k]]
-            known = known or values[columns[k]] != 0
-    if known:
-        response[:] = np.linalg.inv(response)
-    return response
+    used = columns >= 0
+    if not used.any():
+        return np.eye(3)
+    response = np.eye(3).ravel()
+    response[used] += values[columns[used]]
+    return np.asarray(np.linalg.inv(response.reshape(3, 3)), dtype=float)
 
 
 @jit
@@ -181,4 +179,6 @@ def rotate_quaternion(ref_from_body_wxyz: Floats, rotation_rad: Floats) -> None:
     a, b, c, d = q
     q[0], q[1] = a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y
     q[2], q[3] = a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w
-    q /= math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    norm = math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    for i in range(4):
+        q[i] /= norm

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.arrays import Floats, Ints
 from estimator.filter.models import STATES, GyroModel, TrackerModel
-from estimator.filter.propagate import advance
+from estimator.filter.propagate import advance, inverse_response
 
 DIAGONAL = np.arange(0, 9, 4)
 OFF_DIAGONAL = np.array([1, 2, 3, 5, 6, 7])
@@ -110,9 +110,9 @@ def propagate_state(state: State, samples: Floats, gyro: GyroModel, tracker: Tra
         1 / tracker.systematic_time_s,
         gyro.outage_rad_s,
     )
-    slow = layout.slices["systematic"]
+    slow, inverse = layout.slices["systematic"], inverse_response(state.values, layout.columns)
     wxyz, values, covariance, saturation_rad, lost_rad = advance(
-        tuple(state[:6]), samples, noise, layout.columns, (slow.start, slow.stop)
+        tuple(state[:6]), samples, noise, layout.columns, inverse, (slow.start, slow.stop)
     )
     return state._replace(
         t_s=float(samples[-1, 0]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from pathlib import Path
@@ -72,8 +73,11 @@ def with_exif(path: Path, image: NDArray, orientation: int = 1, focal_35mm: int 
     return path
 
 
+make_solver = functools.lru_cache(maxsize=8)(plate_solver.make_solver)  # it keeps its trackers
+
+
 def answer(path: Path, fov_deg: float | None = FOV_DEG, annotated: Path | None = None) -> dict[str, Any]:
-    return plate_solver.solve_file(path, plate_solver.make_solver(fov_deg, None), annotated)
+    return plate_solver.solve_file(path, make_solver(fov_deg, None), annotated)
 
 
 def check_right(found: dict[str, Any], truth: Truth, fov_deg: float = FOV_DEG) -> None:
@@ -293,7 +297,7 @@ def test_json_is_stable_and_says_more(gray: NDArray, tmp_path: Path) -> None:
     assert found["hint"] == ""
 
 
-@pytest.mark.parametrize("name", ["x.JPG", "x.fits.gz"])
+@pytest.mark.parametrize("name", ["x.JPG", pytest.param("x.fits.gz", marks=pytest.mark.slow)])
 def test_the_browser_s_panel_sees_the_same_picture(
     sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path, name: str
 ) -> None:

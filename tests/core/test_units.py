@@ -39,7 +39,7 @@ def test_what_is_not_common_goes_to_astropy(text: str) -> None:
         assert in_si(text, "m") == pytest.approx(expected, rel=0, abs=0, nan_ok=True)
 
 
-@pytest.mark.parametrize("name", ["shefex2", "afit_simsat"])
+@pytest.mark.parametrize("name", ["shefex2", pytest.param("afit_simsat", marks=pytest.mark.slow)])
 def test_a_scene_is_loaded_without_astropy(name: str) -> None:
     code = f"import sys; from skysim.scene import loader; loader.load({name!r}); print('astropy' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

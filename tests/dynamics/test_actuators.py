@@ -347,6 +347,7 @@ def pushed_along_x(set_: CmgSet, seconds: float) -> tuple[np.ndarray, np.ndarray
     return np.array(momentum), np.array(rates), np.array(angles)
 
 
+@pytest.mark.slow
 def test_the_pseudo_inverse_is_caught_by_the_inner_singularity():
     """It keeps rotors 2 and 4 opposed; at (-90, 0, 90, 0) deg the others are spent: h_x = 2 c = 1.155 and no more."""
     momentum, rates, angles = pushed_along_x(pyramid_set("pseudo_inverse"), 60)

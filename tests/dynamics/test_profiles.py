@@ -76,6 +76,7 @@ def test_rate_and_acceleration_are_continuous_at_every_sample() -> None:
     assert np.abs(np.diff(jerk, axis=0)).max() > 1e-3  # the next derivative does jump, so the test can fail
 
 
+@pytest.mark.slow
 def test_the_error_is_of_fourth_order_up_to_both_ends() -> None:
     """Half the step, a sixteenth of the error: within and in the first and last step alike."""
     t = np.linspace(0, 6, 4001)

@@ -185,6 +185,7 @@ def test_the_cap_s_margin_is_the_angle_beyond_the_field() -> None:
     assert found.corner_deg == pytest.approx(25 + math.degrees(at_bearing), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_the_cap_s_margin_at_the_tilt_stop_is_stated_and_a_study_is_warned_of_it() -> None:
     """The maneuver tilts by 9.6 deg, the stop is at 30: 5 deg of tilt more need 5 deg of LEDs more on a sphere."""
     testbed = bed(
@@ -242,6 +243,7 @@ def test_what_cross_and_sigma_are_of_is_said() -> None:
     assert [one for one in fact(exact, "expected error").lines if one.startswith("cross: sqrt(x² + y²)")]
 
 
+@pytest.mark.slow
 def test_a_solver_s_own_error_is_a_cause() -> None:
     """`infinity` ignores the lever: half a degree on this dome at every tilt (nearfield.py)."""
     values = fact(check(bed("afit_simsat_ideal", tracker__solver="infinity")), "expected error").values["frames"]
@@ -385,6 +387,7 @@ def test_smear_is_not_also_reported_as_faint_lights() -> None:
     assert line.startswith("exposure.time: images move by up to 1")
 
 
+@pytest.mark.slow
 def test_the_brightest_hundred_of_many_lights_are_no_fault() -> None:
     """The tracker takes as many from a frame; the fact says so, and no warning blames the area or the exposure."""
     tape = "{kind: string, pitch: 4 mm, spacing: 14 mm, cap_deg: 32}"
@@ -422,7 +425,7 @@ def test_a_wrong_focal_length_is_warned_of_where_the_tracker_refuses(focal_lengt
 @pytest.mark.parametrize(
     "layout",
     [
-        "{kind: poisson_disk, count: 1400, cap_deg: 42}",
+        pytest.param("{kind: poisson_disk, count: 1400, cap_deg: 42}", marks=pytest.mark.slow),
         pytest.param("{kind: fibonacci, count: 1400, cap_deg: 42}", marks=pytest.mark.slow),
         pytest.param(GEODESIC, marks=pytest.mark.slow),
     ],
@@ -506,6 +509,7 @@ def test_a_check_costs_a_fraction_of_a_second() -> None:
     assert checked - began < 2 * (time.process_time() - checked)
 
 
+@pytest.mark.slow
 def test_a_profile_that_is_too_fast_is_refused_before_the_run(tmp_path: Path) -> None:
     """Half a turn about z in two seconds: 2.5 rad/s^2, where the wheels give a hundredth of that."""
     t_s = np.linspace(0, 2, 41)

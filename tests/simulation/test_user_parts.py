@@ -118,6 +118,7 @@ def test_what_a_prescribed_motion_cannot_do_is_refused(changes: dict[str, Any], 
 # --- profiles -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_table_is_followed_exactly_without_a_controller_and_closely_with_one() -> None:
     columns = swing(TIMES)
     exact = moved("afit_simsat", {"motion.control": None, "motion.maneuver": []}, profile=columns)

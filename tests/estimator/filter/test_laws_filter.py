@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.types import FilterState
 from estimator.filter.mekf import USED, AttitudeFilter, GyroModel
+from estimator.filter.propagate import inverse_response
 from estimator.trackers import exposure_control
 from estimator.trackers.exposure_control import Control, Exposure, Observation
 
@@ -23,6 +24,17 @@ GYRO = GyroModel(1e-5, 1e-4, 1000.0)
 
 def filtering(rng: np.random.Generator) -> AttitudeFilter:
     return AttitudeFilter(GYRO, 0.0, turn(rng), 10 ** rng.uniform(-5, 0), 10 ** rng.uniform(-6, -2))
+
+
+@law(inverse_response)
+@given(seed=SEEDS, used=arrays(bool, 9))
+def test_the_inverse_response_undoes_the_gyro_s_matrix(seed: int, used: NDArray) -> None:
+    """The states of the matrix are anywhere among the values; elements that are no state are 0."""
+    rng = np.random.default_rng(seed)
+    values, columns = 0.1 * rng.normal(size=20), np.full(9, -1)
+    columns[used] = rng.choice(20, used.sum(), replace=False)
+    matrix = np.where(used, values[columns], 0.0).reshape(3, 3)
+    np.testing.assert_allclose(inverse_response(values, columns) @ (np.eye(3) + matrix), np.eye(3), atol=1e-12)
 
 
 def assert_sound(told: FilterState) -> None:

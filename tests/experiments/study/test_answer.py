@@ -297,6 +297,7 @@ def test_findings_of_many_levels_are_few(tmp_path: Path) -> None:
     assert wide.endswith("[first levels; with other numbers at all others]")
 
 
+@pytest.mark.slow
 def test_a_rolling_shutter_is_checked_at_the_rates_of_the_trials(tmp_path: Path) -> None:
     """The scene turns by 0.5 deg/s and its trials by up to 20: the warning is of 20, and none is given at rest."""
     shutter = {"camera.shutter": {"kind": "rolling", "row_time": "80 us"}, "tracker.assumed_row_time": "0 s"}
@@ -313,6 +314,7 @@ def test_a_rolling_shutter_is_checked_at_the_rates_of_the_trials(tmp_path: Path)
     assert [one for one in known if "row_time" in one] == []
 
 
+@pytest.mark.slow
 def test_a_report_begins_with_scene_findings_and_answers(tmp_path: Path) -> None:
     plan = loaded(tmp_path, figures=[{"kind": "map", "value": "stars_least"}])
     assert done(plan, tmp_path / "study.sqlite").failed == 0
