@@ -22,7 +22,8 @@ demo: $(READY)
 	$(BIN)/skysim run afit_simsat_ideal --frames 20 --out out/afit_simsat_ideal
 	$(BIN)/skysim run shefex2 --out out/shefex2
 
-PYTEST = NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
+# Kept bytecode: the tests start some hundred processes, each of which would compile the sources again.
+PYTEST = PYTHONDONTWRITEBYTECODE= NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
 
 test: $(READY)
 	$(PYTEST) -m "not slow and not long and not browser"

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import ast
 import math
+import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Collection, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -61,29 +64,50 @@ def with_imports(source: Path, uses: Mapping[Path, set[Path]]) -> set[Path]:
     return found
 
 
-# Modules run as commands, one group per process. The last one finds most of its functions compiled by the first group.
+COMPILED = pytest.StashKey[tuple[Path, ThreadPoolExecutor]]()
+# Modules run as commands, one group per process. Whatever two groups need is compiled once, by the first that needs it.
 TRACKER, FRAME = "skysim.simulation.compilation", ("--frames", "1", "--out", "{folder}")
+BLIND = "skysim", "solve", "{folder}/frame_0000.png"
 GROUPS: tuple[Sequence[Sequence[str]], ...] = (
-    [(TRACKER, "shefex2")],
-    [
-        ("skysim", "render", "afit_simsat", *FRAME),
-        ("skysim", "render", "shefex2", *FRAME),
-        (TRACKER, "afit_simsat"),
-        ("skysim", "solve", "{folder}/frame_0000.png"),
-    ],
+    [(TRACKER, "shefex2"), ("skysim", "render", "shefex2", *FRAME), BLIND],
+    [("skysim", "render", "afit_simsat", *FRAME), (TRACKER, "afit_simsat")],
 )
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_setupnodes(config: pytest.Config) -> None:
-    """Fill numba's cache, if it is empty, before the workers of xdist start: each of them would compile everything."""
-    if config.args != config.getini("testpaths") or any(ROOT.glob("estimator/*/__pycache__/*.nbi")):
-        return
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor() as pool:
-        list(pool.map(lambda group: [run_module(words, folder) for words in group], GROUPS))
+    """Fill numba's cache, if it is empty, while the workers of xdist collect; each of them would compile everything."""
+    if config.args == config.getini("testpaths") and not any(ROOT.glob("estimator/*/__pycache__/*.nbi")):
+        config.stash[COMPILED] = Path(tempfile.mkdtemp()), ThreadPoolExecutor()
+        folder, pool = config.stash[COMPILED]
+        groups = [pool.submit(run_modules, group, folder) for group in GROUPS]
+        pool.submit(lambda: (wait(groups), (folder / "done").touch()))
 
 
-def run_module(words: Sequence[str], folder: str) -> None:
-    """Run `python -m WORDS`; its output appears only if it fails."""
-    command = [sys.executable, "-m", *(word.format(folder=folder) for word in words)]
-    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+def run_modules(group: Sequence[Sequence[str]], folder: Path) -> None:
+    """Run `python -m WORDS` for each of a group; the output appears only if one fails."""
+    for words in group:
+        command = [sys.executable, "-m", *(word.format(folder=folder) for word in words)]
+        subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: Any) -> None:
+    """Say to a worker of xdist which file shows that the compilation is done."""
+    if COMPILED in node.config.stash:
+        node.workerinput["compiled"] = str(node.config.stash[COMPILED][0] / "done")
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """A worker waits for the compilation before its first test."""
+    done = getattr(session.config, "workerinput", {}).get("compiled")
+    while done and not Path(done).exists():
+        time.sleep(0.1)
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Remove what the compilation left."""
+    if COMPILED in config.stash:
+        folder, pool = config.stash[COMPILED]
+        pool.shutdown()
+        shutil.rmtree(folder)

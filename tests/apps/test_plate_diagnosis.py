@@ -150,7 +150,9 @@ def test_what_is_left_for_an_unknown_field_is_a_narrow_one() -> None:
 # The catalog's depth
 
 
-@pytest.mark.parametrize(("focal", "expected"), [("60 mm", "5.7"), ("75 mm", "3.6")])
+@pytest.mark.parametrize(
+    ("focal", "expected"), [("60 mm", "5.7"), pytest.param("75 mm", "3.6", marks=pytest.mark.slow)]
+)
 def test_a_catalog_that_is_too_shallow_is_named_and_a_deeper_one_solves(focal: str, expected: str) -> None:
     """Near the galactic pole. The expectation by hand: 7996 stars on 41,253 deg^2, times the field's."""
     fov_deg = math.degrees(2 * math.atan(658 * 9.9e-3 / 2 / float(focal.removesuffix(" mm"))))

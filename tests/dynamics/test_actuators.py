@@ -444,6 +444,7 @@ def test_variable_speed_gyros_at_their_limits_keep_the_direction():
         assert given @ torque > 0
 
 
+@pytest.mark.slow
 def test_rotors_at_rest_work_as_wheels():
     set_, torque = variable(), np.array([0.1, 0.2, -0.1])
     rate, motor = set_.drive(torque, STILL, np.zeros(3), np.zeros(3), 0.0)

@@ -575,6 +575,7 @@ def test_a_wrong_option_of_solve_is_one_line(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_camera_file_with_a_slip_is_one_line(skysim: Skysim, rendered: Path, tmp_path: Path) -> None:
     camera = tmp_path / "camera.yaml"
     camera.write_text(SHEFEX.read_text().replace('focal_length: "25 mm"', "focal_length: 25"))

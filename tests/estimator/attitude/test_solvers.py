@@ -26,12 +26,12 @@ def in_field(rng: np.random.Generator, *shape: int, half: float = np.tan(FOV_RAD
 
 # All stars' optimum; TRIAD's is that of two.
 OPTIMAL = {name: solver for name, solver in SOLVERS.items() if name != "triad"}
-every_optimal = pytest.mark.parametrize("solve", OPTIMAL.values(), ids=OPTIMAL)
 COSTLY = "davenport", "svd", "esoq2"  # to compile
-every_solver = pytest.mark.parametrize(
-    "solve",
-    [pytest.param(solve, id=name, marks=[pytest.mark.slow] * (name in COSTLY)) for name, solve in SOLVERS.items()],
-)
+CASES = {
+    name: pytest.param(solve, id=name, marks=[pytest.mark.slow] * (name in COSTLY)) for name, solve in SOLVERS.items()
+}
+every_solver = pytest.mark.parametrize("solve", CASES.values())
+every_optimal = pytest.mark.parametrize("solve", [CASES[name] for name in OPTIMAL])
 
 
 def error_rad(a: Rotation, b: Rotation) -> float:

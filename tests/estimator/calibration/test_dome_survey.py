@@ -227,7 +227,7 @@ def gauged(
 
 @pytest.mark.parametrize(
     ("sigma_m", "length_known"),
-    [(np.inf, False), pytest.param(0.002, True, marks=pytest.mark.long)],
+    [pytest.param(np.inf, False, marks=pytest.mark.slow), pytest.param(0.002, True, marks=pytest.mark.long)],
     ids=["start and its size", "measured and length"],
 )
 def test_the_covariance_is_the_scatter(sigma_m: float, length_known: bool) -> None:
