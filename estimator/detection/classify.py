@@ -26,9 +26,14 @@ MAX_SIZE_FRACTION = 0.05  # of the frame's shorter side: no star is that wide; t
 MAX_NOISE_RATIO = 4.0  # local noise over the frame's median noise
 CLEAR_SIGMA = 10.0  # of a pixel: bright enough for its shape to be significant
 VOTING_BLOBS = 15  # number of brightest blobs that decide whether the frame is smeared
+VOTES = 0.6  # share of them that must agree
+SAME_STREAKS, MIN_BROKEN_PX = 3, 12.0  # where streaks break up: least number of whole ones, and their least length
 # Shortest streak that most of the brightest blobs share, and shortest line of one blob: shorter ones are explained by
 # noise or, of one blob, by a pair of stars or defocus.
 MIN_STREAK_PX, MIN_TRACK_PX = 2.0, 6.0
+# Of a line from the shared one, relative to it: the streaks of one frame differ in length and direction by rotation and
+# distortion, and the ends of bright ones are seen farther out.
+SAME_LINE = 0.5
 
 
 class Flag(IntFlag):
@@ -110,7 +115,8 @@ def _flags(
     """
     height, width = size
     typical_noise, typical_width2 = max(median(noise), step), median(shape[:, 2])
-    max_side = max(MAX_SIZE_FRACTION * min(height, width) + sqrt(hypot(common_line[0], common_line[1])), 16.0)
+    shared2 = hypot(common_line[0], common_line[1])
+    max_side = max(MAX_SIZE_FRACTION * min(height, width) + sqrt(shared2), 16.0)
     flag = np.zeros(len(shape), np.int64)
     for n in range(len(shape)):
         peak_light, neighbor_light, width2, line_x, line_y = shape[n]
@@ -120,7 +126,8 @@ def _flags(
         # 6 pixel_noise: three sigma of the sum of four pixels.
         spike = neighbor_light + 6 * pixel_noise < MIN_NEIGHBOR_RATIO * peak_light
         # A track differs from the shared line, is narrow, and is at least twice as long as wide (in rms).
-        track = diff2 > MIN_TRACK_PX**2 and width2 < 4 * typical_width2 and diff2 > 12 * 4 * width2
+        track = diff2 > max(MIN_TRACK_PX**2, SAME_LINE * shared2)
+        track = track and width2 < 4 * typical_width2 and diff2 > 12 * 4 * width2
         if smeared:  # noise dominates the shape of a faint streak
             track = track and peak_light > CLEAR_SIGMA * pixel_noise
         side = max(boxes[n, 2] - boxes[n, 0], boxes[n, 3] - boxes[n, 1]) + 1
@@ -134,13 +141,36 @@ def _flags(
 
 @jit
 def _common_line(lines: Floats) -> tuple[float, float]:
-    """Return the line, as L^2 (cos 2a, sin 2a), shared by over 60 % of the brightest blobs, or (0, 0)."""
+    """Return the line, as L^2 (cos 2a, sin 2a), shared by over 60 % of the brightest blobs, or (0, 0).
+
+    Long faint streaks break up into pieces. If there is no such line, it is therefore that of the brightest blob with
+    SAME_STREAKS like it and over 60 % that are parallel to it and no longer.
+    """
     voting = lines[:VOTING_BLOBS]
     x, y = median(voting[:, 0]), median(voting[:, 1])
-    agree = 0
-    for n in range(len(voting)):
-        agree += hypot(voting[n, 0] - x, voting[n, 1] - y) < 0.5 * hypot(x, y)
-    return (x, y) if agree > 0.6 * len(voting) else (0.0, 0.0)
+    if _count_same(voting, x, y) > VOTES * len(voting):
+        return x, y
+    for k in range(len(voting)):
+        x, y = voting[k]
+        square = hypot(x, y)
+        if square < MIN_BROKEN_PX**2 or _count_same(voting, x, y) < SAME_STREAKS:
+            continue
+        parallel = 0
+        for n in range(len(voting)):
+            along, across = voting[n, 0] * x + voting[n, 1] * y, voting[n, 1] * x - voting[n, 0] * y
+            parallel += abs(across) < SAME_LINE * along < SAME_LINE * (1 + SAME_LINE) * square**2
+        if parallel > VOTES * len(voting):
+            return x, y
+    return 0.0, 0.0
+
+
+@jit
+def _count_same(lines: Floats, x: float, y: float) -> int:
+    """Number of lines that are like one."""
+    same = 0
+    for n in range(len(lines)):
+        same += hypot(lines[n, 0] - x, lines[n, 1] - y) < SAME_LINE * hypot(x, y)
+    return same
 
 
 def _double_angle(streak_px: tuple[float, float]) -> tuple[float, float]:

@@ -194,6 +194,38 @@ def test_only_a_clear_line_is_a_track_among_streaks(peak_sigma: float, flag: int
     assert [flags_near(blobs, x, y) for x, y in places] == [flag] * len(places)
 
 
+def trailed_frame(seed: int, flux_per_px: float, spread: float) -> np.ndarray:
+    """A frame of 15 trails of 45 px, longer or shorter by a relative standard deviation; the first five are bright."""
+    rng, light = np.random.default_rng(seed), np.zeros(SHAPE)
+    places = [(x, y) for y in (80, 240, 400) for x in (70, 190, 310, 430, 550)]
+    for row, (x, y) in enumerate(places):
+        length, flux = 45 * (1 + spread * rng.standard_normal()), 600.0 if row < 5 else flux_per_px
+        for along in np.arange(0.25, length, 0.5) - length / 2:
+            patch = star(35 + 0.8 * along, 35 + 0.6 * along, flux / 2, 0.8, (71, 71))
+            light[y - 35 : y + 36, x - 35 : x + 36] += patch
+    return exposed(rng, light)
+
+
+def test_long_streaks_that_differ_by_some_percent_are_no_tracks() -> None:
+    """Of 45 px: at 5 % the squared lengths, 2,000 px^2, differ by 200, far more than a track of 6 px."""
+    blobs = detect.default(trailed_frame(60, 600.0, 0.05))
+    assert len(blobs) == 15
+    assert blobs.flag.tolist() == [0] * 15
+    assert np.hypot(*blobs.streak_px) == pytest.approx(45, rel=0.08)
+
+
+def test_streaks_that_break_up_into_pieces_are_found_whole() -> None:
+    """Ten of 15 trails are just above the noise of a pixel; the bright ones tell how long all are."""
+    image = trailed_frame(61, 60.0, 0.02)
+    background = detect.estimate_background(image)
+    pieces = detect.detect_blobs(image, background, 5.0 * background.noise, 3, 100, detect.GROW_SIGMA)
+    assert len(pieces) > 20
+    blobs = detect.default(image)
+    assert len(blobs) == 15
+    assert np.degrees(np.arctan2(blobs.streak_px[1], blobs.streak_px[0])) == pytest.approx(36.9, abs=5)
+    assert np.hypot(*blobs.streak_px) == pytest.approx(45, rel=0.1)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("centroider", ["cog", "gaussian_window", "gaussian_fit"])
 @pytest.mark.parametrize("over", [2.0, 10.0])
