@@ -18,6 +18,7 @@ from estimator.core.types import Centroids
 from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
+from skysim.apps.plate_solver import binned
 from skysim.apps.plate_solver.solution import PlateSolution, annotated_image, solution_fields
 from skysim.apps.plate_solver.solver import FOV_LIMITS_DEG, Solver, make_solver, solve_array, validated_date
 from skysim.core.errors import InputError
@@ -29,6 +30,7 @@ ANNOTATED = ".annotated.png"
 # differs by 4 % for sensors of 4:3; the rest is rounding, distortion and a small crop.
 DIAGONAL_35MM = math.hypot(36, 24)
 FOCAL_35MM_UNCERTAINTY = 0.10
+BINNED = "its lights are large: they were found in the picture binned {0}x{0}"
 TOP_DOWN = "no ROWORDER in the header: its first row is the highest here, not the lowest as the standard recommends"
 
 
@@ -172,7 +174,22 @@ def solve_picture(picture: images.Picture, solver: Solver, date_utc: datetime.da
         centroids[reading] = outcomes[-1].report.centroids
         if outcomes[-1].report.attitude.solved:
             return outcomes[-1]
-    return outcomes[0]
+    return solve_binned(tried, date_utc) or outcomes[0]
+
+
+def solve_binned(tried: list[Hypothesis], date_utc: datetime.datetime | None) -> Outcome | None:
+    """The first hypothesis that is solved by the large lights of the binned picture (`binned`), if any."""
+    if tried[0].solver.camera:
+        return None  # a frame of a camera that is known, with its own saturation
+    for pixels in {id(one.pixels): one.pixels for one in tried}.values():
+        for factor, centroids in binned.large_lights(pixels, tried[0].solver.settings):
+            for one in (one for one in tried if one.pixels is pixels):
+                solver = replace(one.solver, hypotheses=one.solver.hypotheses * binned.EXTRA_TRIES)
+                report, tracker = solve_array(pixels, solver, date_utc, centroids, binned.EFFORTS)
+                if report.attitude.solved:
+                    notes = [one.assumption] * bool(one.assumption) + [BINNED.format(factor)]
+                    return Outcome(one._replace(assumption="; ".join(notes)), report, tracker, tried)
+    return None
 
 
 def hypotheses(picture: images.Picture, solver: Solver) -> list[Hypothesis]:
