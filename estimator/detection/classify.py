@@ -19,6 +19,7 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
 from estimator.core.types import Blobs, FramePriors
 from estimator.detection.background import FILTERED_NOISE, filtered, interpolate, median
+from estimator.detection.captions import find_captions
 
 # Sum of the four neighbors over the central pixel: about .5 for a centered Gaussian of sigma 0.4 px, 0 for a spike.
 MIN_NEIGHBOR_RATIO = 0.25
@@ -44,6 +45,7 @@ class Flag(IntFlag):
     TRACK     : a line that the other blobs do not share: a particle or a satellite
     HUGE      : too large for a star: the Moon, a lamp, the horizon
     TEXTURE   : in a part of the frame much noisier than the rest: trees, clouds
+    TEXT      : of a line of text that is burned into the picture
     """
 
     SATURATED = 1
@@ -51,10 +53,11 @@ class Flag(IntFlag):
     TRACK = 4
     HUGE = 8
     TEXTURE = 16
+    TEXT = 32
 
 
-NO_STAR = Flag.HOT | Flag.TRACK | Flag.HUGE | Flag.TEXTURE
-SATURATED, HOT, TRACK, HUGE, TEXTURE = (int(flag) for flag in Flag)  # plain integers for compiled code
+NO_STAR = Flag.HOT | Flag.TRACK | Flag.HUGE | Flag.TEXTURE | Flag.TEXT
+SATURATED, HOT, TRACK, HUGE, TEXTURE, TEXT = (int(flag) for flag in Flag)  # plain integers for compiled code
 
 
 def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
@@ -66,9 +69,10 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
         return replace(blobs, streak_px=priors.streak_px)
     background = blobs.background
     shape = _shapes(image, blobs.box_px, background.level, background.noise)
+    text = find_captions(blobs.box_px, blobs.peak)
     streak_px = priors.streak_px
     if streak_px is None:
-        common_line = _common_line(shape[:, 3:])
+        common_line = _common_line(shape[~text, 3:])
         if common_line[0] ** 2 + common_line[1] ** 2 > MIN_STREAK_PX**4 and len(blobs) >= 3:
             streak_px = _half_angle(common_line)
     else:
@@ -85,7 +89,7 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
         priors.saturation,
         FILTERED_NOISE * (image.dtype.kind in "iu"),
     )
-    return replace(blobs, flag=flag, streak_px=streak_px)
+    return replace(blobs, flag=flag | TEXT * text, streak_px=streak_px)
 
 
 def moments(image: NDArray, blobs: Blobs) -> Floats:

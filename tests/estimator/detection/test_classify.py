@@ -1,5 +1,6 @@
 """Star or not: what the flags of a blob say, on frames drawn here."""
 
+import cv2
 import numpy as np
 import pytest
 from scipy.special import erf
@@ -224,6 +225,35 @@ def test_streaks_that_break_up_into_pieces_are_found_whole() -> None:
     assert len(blobs) == 15
     assert np.degrees(np.arctan2(blobs.streak_px[1], blobs.streak_px[0])) == pytest.approx(36.9, abs=5)
     assert np.hypot(*blobs.streak_px) == pytest.approx(45, rel=0.1)
+
+
+@pytest.mark.parametrize("height_px", [16, 30])
+def test_a_caption_is_text_and_tells_no_streak(height_px: int) -> None:
+    """Most of the brightest lights are letters, some of them vertical lines."""
+    rng = np.random.default_rng(62)
+    light, xy = sky_frame(rng, 15, 0.8)
+    image = exposed(rng, light)
+    mask = np.zeros(SHAPE, np.uint8)
+    cv2.putText(mask, "2012-06-22 11:11:14", (30, 48), cv2.FONT_HERSHEY_DUPLEX, height_px / 22, 255, 1)
+    image[mask > 128] = 60_000
+    blobs = detect.default(image)
+    far = xy[xy[:, 1] > 70]
+    assert [flags_near(blobs, *place) for place in far] == [0] * len(far)
+    assert blobs.streak_px is None
+    written = (blobs.box_px[:, 3] < 65) & (blobs.peak == 60_000)
+    assert written.sum() > 10
+    assert np.all(blobs.flag[written] & NO_STAR)
+    assert np.count_nonzero(blobs.flag[written] & Flag.TEXT) >= written.sum() - 1
+
+
+def test_rows_of_equal_lights_are_no_text() -> None:
+    """LEDs are disks of one size and may be in a row; letters differ in width."""
+    light = np.zeros(SHAPE)
+    y, x = np.mgrid[-12:13, -12:13]
+    for at in range(60, 600, 26):
+        light[188:213, at - 12 : at + 13] += 2e4 / (1 + np.exp((np.hypot(x, y) - 7) / 0.4))
+    blobs = detect.default(exposed(np.random.default_rng(63), light))
+    assert blobs.flag.tolist() == [0] * 21
 
 
 @pytest.mark.slow
