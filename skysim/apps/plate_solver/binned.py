@@ -2,7 +2,7 @@
 
 The detector's filter suits stars of some pixels. A star of hundreds of pixels is broken up by noise, and a faint one is
 not seen. Both are as the detector expects them where the pixels are added up in squares (binned). Only a picture whose
-brightest lights are still large when it is binned is solved that way, with a higher bar of evidence (`EXTRA_TRIES`).
+brightest lights are still large when it is binned is solved that way.
 """
 
 from __future__ import annotations
@@ -25,8 +25,6 @@ from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 FACTORS = (8, 4, 2)  # sides of the squares: the most reduced picture is the fastest
 MIN_SIDE_PX = 200  # of a binned picture
 BRIGHTEST, MIN_AREA_PX = 12, 30  # of so many lights of the binned picture the median area; a sharp star has 10
-EXTRA_TRIES = 1000  # the binned pictures together add no more than a few thousandths to the chance of a false match
-EFFORTS = 2  # searches of a binned picture: the quick ones solve what the others do
 MAX_SIGMA_PX = 20.0  # that `Centroids.check_values` allows
 
 
