@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from benchmarks import attitude, detect, dynamics, identify, instrument, nees, rate, rolling, start
+from benchmarks import attitude, detect, dynamics, identify, instrument, nees, photographs, rate, rolling, start
 
 AREAS: dict[str, Callable[[], list[dict[str, Any]]]] = {
     "instrument": instrument.measure,
@@ -20,6 +20,7 @@ AREAS: dict[str, Callable[[], list[dict[str, Any]]]] = {
     "rolling": rolling.measure,
     "rate": rate.measure,
     "nees": nees.measure,
+    "photographs": photographs.measure,
 }
 
 

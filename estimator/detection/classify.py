@@ -19,6 +19,7 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
 from estimator.core.types import Blobs, FramePriors
 from estimator.detection.background import FILTERED_NOISE, filtered, interpolate, median
+from estimator.detection.captions import find_captions
 
 # Sum of the four neighbors over the central pixel: about .5 for a centered Gaussian of sigma 0.4 px, 0 for a spike.
 MIN_NEIGHBOR_RATIO = 0.25
@@ -26,9 +27,14 @@ MAX_SIZE_FRACTION = 0.05  # of the frame's shorter side: no star is that wide; t
 MAX_NOISE_RATIO = 4.0  # local noise over the frame's median noise
 CLEAR_SIGMA = 10.0  # of a pixel: bright enough for its shape to be significant
 VOTING_BLOBS = 15  # number of brightest blobs that decide whether the frame is smeared
+VOTES = 0.6  # share of them that must agree
+SAME_STREAKS, MIN_BROKEN_PX = 3, 12.0  # where streaks break up: least number of whole ones, and their least length
 # Shortest streak that most of the brightest blobs share, and shortest line of one blob: shorter ones are explained by
 # noise or, of one blob, by a pair of stars or defocus.
 MIN_STREAK_PX, MIN_TRACK_PX = 2.0, 6.0
+# Of a line from the shared one, relative to it: the streaks of one frame differ in length and direction by rotation and
+# distortion, and the ends of bright ones are seen farther out.
+SAME_LINE = 0.5
 
 
 class Flag(IntFlag):
@@ -39,6 +45,7 @@ class Flag(IntFlag):
     TRACK     : a line that the other blobs do not share: a particle or a satellite
     HUGE      : too large for a star: the Moon, a lamp, the horizon
     TEXTURE   : in a part of the frame much noisier than the rest: trees, clouds
+    TEXT      : of a line of text that is burned into the picture
     """
 
     SATURATED = 1
@@ -46,10 +53,11 @@ class Flag(IntFlag):
     TRACK = 4
     HUGE = 8
     TEXTURE = 16
+    TEXT = 32
 
 
-NO_STAR = Flag.HOT | Flag.TRACK | Flag.HUGE | Flag.TEXTURE
-SATURATED, HOT, TRACK, HUGE, TEXTURE = (int(flag) for flag in Flag)  # plain integers for compiled code
+NO_STAR = Flag.HOT | Flag.TRACK | Flag.HUGE | Flag.TEXTURE | Flag.TEXT
+SATURATED, HOT, TRACK, HUGE, TEXTURE, TEXT = (int(flag) for flag in Flag)  # plain integers for compiled code
 
 
 def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
@@ -61,9 +69,10 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
         return replace(blobs, streak_px=priors.streak_px)
     background = blobs.background
     shape = _shapes(image, blobs.box_px, background.level, background.noise)
+    text = find_captions(blobs.box_px, blobs.peak)
     streak_px = priors.streak_px
     if streak_px is None:
-        common_line = _common_line(shape[:, 3:])
+        common_line = _common_line(shape[~text, 3:])
         if common_line[0] ** 2 + common_line[1] ** 2 > MIN_STREAK_PX**4 and len(blobs) >= 3:
             streak_px = _half_angle(common_line)
     else:
@@ -80,7 +89,7 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
         priors.saturation,
         FILTERED_NOISE * (image.dtype.kind in "iu"),
     )
-    return replace(blobs, flag=flag, streak_px=streak_px)
+    return replace(blobs, flag=flag | TEXT * text, streak_px=streak_px)
 
 
 def moments(image: NDArray, blobs: Blobs) -> Floats:
@@ -110,7 +119,8 @@ def _flags(
     """
     height, width = size
     typical_noise, typical_width2 = max(median(noise), step), median(shape[:, 2])
-    max_side = max(MAX_SIZE_FRACTION * min(height, width) + sqrt(hypot(common_line[0], common_line[1])), 16.0)
+    shared2 = hypot(common_line[0], common_line[1])
+    max_side = max(MAX_SIZE_FRACTION * min(height, width) + sqrt(shared2), 16.0)
     flag = np.zeros(len(shape), np.int64)
     for n in range(len(shape)):
         peak_light, neighbor_light, width2, line_x, line_y = shape[n]
@@ -120,7 +130,8 @@ def _flags(
         # 6 pixel_noise: three sigma of the sum of four pixels.
         spike = neighbor_light + 6 * pixel_noise < MIN_NEIGHBOR_RATIO * peak_light
         # A track differs from the shared line, is narrow, and is at least twice as long as wide (in rms).
-        track = diff2 > MIN_TRACK_PX**2 and width2 < 4 * typical_width2 and diff2 > 12 * 4 * width2
+        track = diff2 > max(MIN_TRACK_PX**2, SAME_LINE * shared2)
+        track = track and width2 < 4 * typical_width2 and diff2 > 12 * 4 * width2
         if smeared:  # noise dominates the shape of a faint streak
             track = track and peak_light > CLEAR_SIGMA * pixel_noise
         side = max(boxes[n, 2] - boxes[n, 0], boxes[n, 3] - boxes[n, 1]) + 1
@@ -134,13 +145,36 @@ def _flags(
 
 @jit
 def _common_line(lines: Floats) -> tuple[float, float]:
-    """Return the line, as L^2 (cos 2a, sin 2a), shared by over 60 % of the brightest blobs, or (0, 0)."""
+    """Return the line, as L^2 (cos 2a, sin 2a), shared by over 60 % of the brightest blobs, or (0, 0).
+
+    Long faint streaks break up into pieces. If there is no such line, it is therefore that of the brightest blob with
+    SAME_STREAKS like it and over 60 % that are parallel to it and no longer.
+    """
     voting = lines[:VOTING_BLOBS]
     x, y = median(voting[:, 0]), median(voting[:, 1])
-    agree = 0
-    for n in range(len(voting)):
-        agree += hypot(voting[n, 0] - x, voting[n, 1] - y) < 0.5 * hypot(x, y)
-    return (x, y) if agree > 0.6 * len(voting) else (0.0, 0.0)
+    if _count_same(voting, x, y) > VOTES * len(voting):
+        return x, y
+    for k in range(len(voting)):
+        x, y = voting[k]
+        square = hypot(x, y)
+        if square < MIN_BROKEN_PX**2 or _count_same(voting, x, y) < SAME_STREAKS:
+            continue
+        parallel = 0
+        for n in range(len(voting)):
+            along, across = voting[n, 0] * x + voting[n, 1] * y, voting[n, 1] * x - voting[n, 0] * y
+            parallel += abs(across) < SAME_LINE * along < SAME_LINE * (1 + SAME_LINE) * square**2
+        if parallel > VOTES * len(voting):
+            return x, y
+    return 0.0, 0.0
+
+
+@jit
+def _count_same(lines: Floats, x: float, y: float) -> int:
+    """Number of lines that are like one."""
+    same = 0
+    for n in range(len(lines)):
+        same += hypot(lines[n, 0] - x, lines[n, 1] - y) < SAME_LINE * hypot(x, y)
+    return same
 
 
 def _double_angle(streak_px: tuple[float, float]) -> tuple[float, float]:

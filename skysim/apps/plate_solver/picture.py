@@ -18,6 +18,7 @@ from estimator.core.types import Centroids
 from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
+from skysim.apps.plate_solver import retries
 from skysim.apps.plate_solver.solution import PlateSolution, annotated_image, solution_fields
 from skysim.apps.plate_solver.solver import FOV_LIMITS_DEG, Solver, make_solver, solve_array, validated_date
 from skysim.core.errors import InputError
@@ -172,7 +173,24 @@ def solve_picture(picture: images.Picture, solver: Solver, date_utc: datetime.da
         centroids[reading] = outcomes[-1].report.centroids
         if outcomes[-1].report.attitude.solved:
             return outcomes[-1]
-    return outcomes[0]
+    return solve_again(outcomes, date_utc) or outcomes[0]
+
+
+def solve_again(refused: list[Outcome], date_utc: datetime.datetime | None) -> Outcome | None:
+    """The first hypothesis that is solved by other centroids of its picture (`retries`), if any."""
+    if refused[0].hypothesis.solver.camera:
+        return None  # a frame of a camera that is known, with its own saturation
+    for pixels in {id(one.hypothesis.pixels): one.hypothesis.pixels for one in refused}.values():
+        readings = [one for one in refused if one.hypothesis.pixels is pixels]
+        settings = readings[0].hypothesis.solver.settings
+        for note, efforts, centroids in retries.retries(pixels, readings[0].report.centroids, settings):
+            for one in (one.hypothesis for one in readings):
+                solver = replace(one.solver, hypotheses=one.solver.hypotheses * retries.EXTRA_TRIES)
+                report, tracker = solve_array(pixels, solver, date_utc, centroids, efforts)
+                if report.attitude.solved:
+                    notes = [one.assumption] * bool(one.assumption) + [note]
+                    return Outcome(one._replace(assumption="; ".join(notes)), report, tracker, refused[0].tried)
+    return None
 
 
 def hypotheses(picture: images.Picture, solver: Solver) -> list[Hypothesis]:

@@ -256,18 +256,22 @@ def validated_date(date_utc: datetime.datetime | None) -> tuple[datetime.datetim
 
 
 def solve_array(
-    image: NDArray, solver: Solver, date_utc: datetime.datetime | None, centroids: Centroids | None = None
+    image: NDArray,
+    solver: Solver,
+    date_utc: datetime.datetime | None,
+    centroids: Centroids | None = None,
+    efforts: int | None = None,
 ) -> tuple[Report, StarTracker]:
     """Solve one monochrome image and return the report and the tracker that made it.
 
-    date_utc : None if unknown;  centroids : of this image, if they are known
+    date_utc : None if unknown;  centroids : of this image, if they are known;  efforts : see `solve_centroids`
     """
     height_px, width_px = image.shape
     first = next(solver.trackers(width_px, height_px, date_utc))
     clock = Clock()
     if centroids is None:  # of the camera only the size is used
         centroids = detect_and_centroid(image, first.camera, solver.settings, clock)
-    attitude, tracker = solve_centroids(centroids, solver, (width_px, height_px), date_utc, clock)
+    attitude, tracker = solve_centroids(centroids, solver, (width_px, height_px), date_utc, clock, efforts)
     return Report(attitude, centroids, clock.seconds), tracker
 
 
@@ -277,15 +281,23 @@ def solve_centroids(
     size_px: tuple[int, int],
     date_utc: datetime.datetime | None,
     clock: Clock,
+    efforts: int | None = None,
 ) -> tuple[Attitude, StarTracker]:
-    """Solve the centroids of an image of (width, height) with every tracker of the solver, as `solve_array`."""
+    """Solve the centroids of an image of (width, height) with every tracker of the solver, as `solve_array`.
+
+    efforts : number of searches that are made, of growing effort; None: all of them
+    """
     first = next(solver.trackers(*size_px, date_utc))
+    made = range(first.efforts)[:efforts]
     if solver.field_is_known:
-        attitude = first.solve_centroids(centroids, clock)
+        for effort in [None] if efforts is None else made:
+            attitude = first.solve_centroids(centroids, clock, effort)
+            if attitude.solved:
+                break
         allowed = ACCEPT_LOG10_CHANCE - math.log10(solver.hypotheses)
         return (Attitude(NO_MATCH) if log10_chance(attitude) > allowed and attitude.solved else attitude), first
     tries = len(solver.candidate_cameras(*size_px)) * solver.hypotheses
-    for effort in range(first.efforts):  # try all fields of view quickly before trying any thoroughly
+    for effort in made:  # try all fields of view quickly before trying any thoroughly
         trackers = solver.trackers(*size_px, date_utc)
         attitude, tracker = best_attitude(centroids, trackers, clock, effort, tries)
         if attitude.solved:

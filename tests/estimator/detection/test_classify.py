@@ -1,5 +1,6 @@
 """Star or not: what the flags of a blob say, on frames drawn here."""
 
+import cv2
 import numpy as np
 import pytest
 from scipy.special import erf
@@ -192,6 +193,67 @@ def test_only_a_clear_line_is_a_track_among_streaks(peak_sigma: float, flag: int
     image = exposed(rng, light)
     blobs = classify.classify(image, detect.default(image), FramePriors((10.0, -6.0)))
     assert [flags_near(blobs, x, y) for x, y in places] == [flag] * len(places)
+
+
+def trailed_frame(seed: int, flux_per_px: float, spread: float) -> np.ndarray:
+    """A frame of 15 trails of 45 px, longer or shorter by a relative standard deviation; the first five are bright."""
+    rng, light = np.random.default_rng(seed), np.zeros(SHAPE)
+    places = [(x, y) for y in (80, 240, 400) for x in (70, 190, 310, 430, 550)]
+    for row, (x, y) in enumerate(places):
+        length, flux = 45 * (1 + spread * rng.standard_normal()), 600.0 if row < 5 else flux_per_px
+        for along in np.arange(0.25, length, 0.5) - length / 2:
+            patch = star(35 + 0.8 * along, 35 + 0.6 * along, flux / 2, 0.8, (71, 71))
+            light[y - 35 : y + 36, x - 35 : x + 36] += patch
+    return exposed(rng, light)
+
+
+def test_long_streaks_that_differ_by_some_percent_are_no_tracks() -> None:
+    """Of 45 px: at 5 % the squared lengths, 2,000 px^2, differ by 200, far more than a track of 6 px."""
+    blobs = detect.default(trailed_frame(60, 600.0, 0.05))
+    assert len(blobs) == 15
+    assert blobs.flag.tolist() == [0] * 15
+    assert np.hypot(*blobs.streak_px) == pytest.approx(45, rel=0.08)
+
+
+def test_streaks_that_break_up_into_pieces_are_found_whole() -> None:
+    """Ten of 15 trails are just above the noise of a pixel; the bright ones tell how long all are."""
+    image = trailed_frame(61, 60.0, 0.02)
+    background = detect.estimate_background(image)
+    pieces = detect.detect_blobs(image, background, 5.0 * background.noise, 3, 100, detect.GROW_SIGMA)
+    assert len(pieces) > 20
+    blobs = detect.default(image)
+    assert len(blobs) == 15
+    assert np.degrees(np.arctan2(blobs.streak_px[1], blobs.streak_px[0])) == pytest.approx(36.9, abs=5)
+    assert np.hypot(*blobs.streak_px) == pytest.approx(45, rel=0.1)
+
+
+@pytest.mark.parametrize("height_px", [24, 30])
+def test_a_caption_is_text_and_tells_no_streak(height_px: int) -> None:
+    """Most of the brightest lights are letters, some of them vertical lines."""
+    rng = np.random.default_rng(62)
+    light, xy = sky_frame(rng, 15, 0.8)
+    image = exposed(rng, light)
+    mask = np.zeros(SHAPE, np.uint8)
+    cv2.putText(mask, "2012-06-22 11:11:14", (30, 48), cv2.FONT_HERSHEY_DUPLEX, height_px / 22, 255, 1)
+    image[mask > 128] = 60_000
+    blobs = detect.default(image)
+    far = xy[xy[:, 1] > 70]
+    assert [flags_near(blobs, *place) for place in far] == [0] * len(far)
+    assert blobs.streak_px is None
+    written = (blobs.box_px[:, 3] < 65) & (blobs.peak == 60_000)
+    assert written.sum() > 10
+    assert np.all(blobs.flag[written] & NO_STAR)
+    assert np.count_nonzero(blobs.flag[written] & Flag.TEXT) >= written.sum() - 1
+
+
+def test_rows_of_equal_lights_are_no_text() -> None:
+    """LEDs are disks of one size and may be in a row; letters differ in width."""
+    light = np.zeros(SHAPE)
+    y, x = np.mgrid[-12:13, -12:13]
+    for at in range(60, 600, 26):
+        light[188:213, at - 12 : at + 13] += 2e4 / (1 + np.exp((np.hypot(x, y) - 7) / 0.4))
+    blobs = detect.default(exposed(np.random.default_rng(63), light))
+    assert blobs.flag.tolist() == [0] * 21
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, ra_dec_roll_rad
-from estimator.detection import background, classify, components, detect, windows
+from estimator.detection import background, captions, classify, components, detect, windows
 from estimator.detection.classify import Flag
 from estimator.detection.detect import DETECTORS
 from estimator.trackers import pipeline
@@ -161,6 +161,20 @@ def test_mending_changes_bad_pixels_alone(rng: np.random.Generator, bad: NDArray
     changed = set(map(tuple, np.argwhere(mended != frame)[:, ::-1].tolist()))
     assert changed <= set(map(tuple, bad.tolist()))
     assert frame.min() <= mended.min() <= mended.max() <= frame.max()
+
+
+@law()
+@given(SEEDS, some.integers(5, 12), some.integers(8, 30), some.booleans())
+def test_letters_are_text_wherever_they_are(rng: np.random.Generator, letters: int, height: int, even: bool) -> None:
+    """A line of letters beside lights far below; moved and in any order; none if they are equally wide."""
+    width = np.full(letters, height) if even else rng.permutation(np.arange(letters) % 2 + 1) * height // 2
+    left = np.cumsum(width + rng.integers(1, height, letters)) - width
+    line = np.column_stack([left, np.zeros_like(left), left + width - 1, np.full(letters, height - 1)])
+    lights = rng.integers(0, 400, (6, 1)) * [1, 0, 1, 0] + np.arange(6)[:, None] * [0, 60, 0, 60] + [0, 100, 6, 106]
+    order = rng.permutation(letters + 6)
+    boxes = (np.concatenate([line, lights]) + rng.integers(0, 1000, 2)[[0, 1, 0, 1]])[order].astype(np.int64)
+    text = captions.find_captions(boxes, np.where(order < letters, 255.0, 200.0))
+    assert text.tolist() == ((order < letters) & (not even)).tolist()
 
 
 @law(classify.classify, Blobs.take)
