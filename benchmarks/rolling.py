@@ -3,7 +3,9 @@
 Every frame is rendered twice with the same seeds, with the camera's rolling shutter and with a global one, at a random
 attitude and a constant rate about a random axis, of stars mostly perpendicular to the boresight. The tracker gets the
 rate from a gyro (0.01 deg/s about each axis) or takes it from the frame. NEES is 3 for an honest covariance; errors are
-compared over the frames that both solve.
+compared over the frames that both solve. A frame without a gyro must tell three unknowns more: its errors are compared
+with the Cramer-Rao bound of rows and streaks (median of the normalized error, 1 at the bound), and that bound of the
+roll with what it were if the rate were known, which no tracker of one frame can better.
 """
 
 from __future__ import annotations
@@ -15,7 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from estimator.attitude.motion import covariance_of, error_gain, streak_factor
+from estimator.attitude.nearfield import tangent_jacobian
+from estimator.attitude.rate import chords
 from estimator.core.types import Attitude, RateEstimate
+from estimator.trackers.dome_tracker import DomeTracker
+from estimator.trackers.pipeline import Report
+from estimator.trackers.star_tracker import StarTracker
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Truth
 from skysim.experiments.study.execution.trials import constant_rate
@@ -29,6 +37,7 @@ RATES_DEG_S = (0.0, 1.0, 2.0, 5.0, 10.0)
 GYRO_RAD_S = np.radians(0.01)
 ROLL_SHARE = 0.2  # of the boresight in a random axis, if stars are smeared: streaks are then nearly parallel
 BAR_NEES, BAR_ERROR = 0.3, 1.2
+CHI2_MEDIAN = 2.366  # of chi-square with three degrees of freedom: double stars do not count in a median
 ONE_FRAME = {"exposure.first": "0 s", "exposure.frames": "1"}
 
 
@@ -61,11 +70,16 @@ WORKS = (
 
 
 class Solved(NamedTuple):
-    """Errors of one frame: NEES, cross-boresight and roll in arcseconds; NaN if it was not solved."""
+    """Errors of one frame: NEES, cross-boresight and roll in arcseconds; NaN if it was not solved.
+
+    bound : NEES by the Cramer-Rao bound of the frame alone;  roll_ratio : bound of the roll, over that of a known rate
+    """
 
     nees: float
     cross_arcsec: float
     roll_arcsec: float
+    bound: float = np.nan
+    roll_ratio: float = np.nan
 
 
 NOT_SOLVED = Solved(np.nan, np.nan, np.nan)
@@ -89,8 +103,11 @@ def _compare(work: Work, beds: tuple[Testbed, Testbed], rate_deg_s: float) -> It
         for n, bed in enumerate(beds):
             frame, truth, tracker = frame_of(work, bed, rate_deg_s, seed)
             for mode, rate in ("gyro", gyro(truth, seed)), ("frame only", None):
-                attitude = factory.solve_frame(tracker, frame, None, rate).attitude
-                errors.setdefault((mode, n), []).append(score(attitude, truth))
+                report = factory.solve_frame(tracker, frame, None, rate)
+                solved = score(report.attitude, truth)
+                if rate is None and n == 0 and np.isfinite(solved.nees):
+                    solved = with_bound(solved, tracker, report, truth, frame.exposure_s)
+                errors.setdefault((mode, n), []).append(solved)
     for mode in ("gyro", "frame only"):
         yield mode, np.array(errors[mode, 0]), np.array(errors[mode, 1])
 
@@ -129,6 +146,36 @@ def score(attitude: Attitude, truth: Truth) -> Solved:
     return Solved(nees, cross / ARCSEC_RAD, roll / ARCSEC_RAD)
 
 
+def with_bound(solved: Solved, tracker: factory.Estimator, report: Report, truth: Truth, exposure_s: float) -> Solved:
+    """The errors of a frame with its bound, from the information of its matched lights about attitude and rate."""
+    attitude, match = report.attitude, report.attitude.match
+    assert match is not None
+    assert attitude.cam_from_ref is not None
+    camera, seen = tracker.camera, report.centroids.take(match.observed)
+    if isinstance(tracker, StarTracker):
+        seen, place_ref, lever_m = tracker.with_errors(seen), tracker.stars.vectors[match.star], np.zeros(3)
+    else:
+        assert isinstance(tracker, DomeTracker)
+        seen, place_ref = tracker._with_errors(seen, match.star), tracker.leds.position_m[match.star]
+        lever_m = tracker.lever.cam_from_body.apply(tracker.lever.camera_body_m)
+    place = truth.cam_from_lab.apply(place_ref)
+    jacobian = tangent_jacobian(place, place - lever_m).reshape(-1, 2, 3)
+    velocity = -jacobian @ truth.rate_cam_rad_s
+    gain, delay_s = error_gain(camera, velocity), camera.row_delays_s(seen.xy_px)[:, None, None]
+    information = camera.focal_px**2 * np.linalg.inv(gain @ covariance_of(seen) @ np.swapaxes(gain, 1, 2))
+    slopes = np.concatenate([jacobian, -delay_s * jacobian], axis=2)
+    normal = np.sum(np.swapaxes(slopes, 1, 2) @ information @ slopes, axis=0)
+    rate_known = np.linalg.inv(normal[:3, :3])
+    if seen.streak_px is not None:
+        told = np.isfinite(seen.streak_px[:, 0])
+        by_rate = exposure_s * streak_factor(camera, velocity[told])[:, None, None] * jacobian[told]
+        normal[3:, 3:] += np.sum(np.swapaxes(by_rate, 1, 2) @ chords(camera, seen.take(told))[1] @ by_rate, axis=0)
+    bound = np.linalg.inv(normal)[:3, :3]
+    error = (attitude.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec()
+    ratio = float(np.sqrt(bound[2, 2] / rate_known[2, 2]))
+    return solved._replace(bound=float(error @ np.linalg.solve(bound, error)), roll_ratio=ratio)
+
+
 def _rows(name: str, ours: Floats, peer: Floats) -> list[dict[str, Any]]:
     solved, by_peer = np.isfinite(ours[:, 0]), np.isfinite(peer[:, 0])
     both = solved & by_peer
@@ -136,6 +183,10 @@ def _rows(name: str, ours: Floats, peer: Floats) -> list[dict[str, Any]]:
         row(f"{name}: solved", 100 * solved.mean(), "%", 100 * by_peer.mean(), None, solved.sum() >= by_peer.sum()),
         nees_row(f"{name}: NEES", ours[solved, 0], peer[by_peer, 0]),
     ]
+    if np.isfinite(ours[:, 3]).any():
+        by_bound, ratio = np.sqrt(np.nanmedian(ours[:, 3]) / CHI2_MEDIAN), np.nanmedian(ours[:, 4])
+        rows.append(row(f"{name}: error over its bound", by_bound, "", None, BAR_ERROR, by_bound <= BAR_ERROR))
+        rows.append(row(f"{name}: bound of the roll over that of a known rate", ratio, "", None, None, None))
     for column, angle in (1, "cross"), (2, "roll"):
         value, others = (float(np.median(np.abs(errors[both, column]))) for errors in (ours, peer))
         rows.append(row(f"{name}: {angle}", value, "arcsec median", others, BAR_ERROR, value <= BAR_ERROR * others))

@@ -46,9 +46,9 @@ def frames(testbed: Testbed, rate_deg_s: float, count: int, seed: int) -> Iterat
         rate_cam = np.radians(rate_deg_s) * np.array([np.cos(angle), np.sin(angle), 0.0])
         # Knots from 5 ms before the exposure; the attitude is `middle` at mid-exposure, 25 ms after its start.
         t_s = n * FRAME_S + np.arange(-10, 200) * KNOT_S
-        cam_from_icrs = Rotation.from_rotvec(np.outer(t_s - n * FRAME_S - 0.025, rate_cam)) * middle
-        lab_from_body = cam_from_icrs.inv() * testbed.mount.cam_from_body
         rate_body = testbed.mount.cam_from_body.inv().apply(rate_cam)
+        turned = Rotation.from_rotvec(np.outer(t_s - n * FRAME_S - 0.025, rate_body))
+        lab_from_body = middle.inv() * testbed.mount.cam_from_body * turned
         trajectory = Trajectory(t_s, lab_from_body, np.tile(rate_body, (len(t_s), 1)))
         frame, truth = exposure.render_frame(replace(testbed, trajectory=trajectory), n)
         yield frame, truth.cam_from_lab, streak_of(rate_cam, testbed)

@@ -27,7 +27,7 @@ from estimator.identification.stars import evidence
 from estimator.identification.stars.evidence import Detections, Solution
 
 TELLING = 1.5  # variance factor above which matches and lens are tried anew
-DOUBTFUL = 0.7  # reduced chi-square above which greater errors are tried
+DOUBTFUL = 0.7  # reduced chi-square above which greater errors are tried, also where every centroid is matched
 TRIED = 2.0 ** np.arange(7)  # factors of the variances
 PRIOR_WRONG_DEX = log10((1 - PRIOR_RIGHT) / PRIOR_RIGHT / (len(TRIED) - 1))  # of each, beside the claimed errors
 LENS_MATCHES = 6  # least number of matches for a fit of the lens

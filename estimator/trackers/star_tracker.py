@@ -34,7 +34,7 @@ from estimator.identification.chance import (
 )
 from estimator.identification.stars import quads, search
 from estimator.identification.stars.evidence import Detections, Solution
-from estimator.trackers import misfit, warm_up
+from estimator.trackers import companions, misfit, warm_up
 from estimator.trackers.misfit import Refit
 from estimator.trackers.pipeline import Clock, Report, Settings, brightest, check_algorithms, process_frame
 from estimator.trackers.refinement import NO_MATCH, FieldMatcher
@@ -381,14 +381,18 @@ class StarTracker:
     def refit(self, centroids: Centroids, solution: Solution, sigma_px: Floats) -> Refit:
         """A solution with the errors and, of a calibrated global shutter, the lens that its residuals tell."""
         camera = self.camera if solution.focal_ratio == 1 else self.camera.zoomed(solution.focal_ratio)
-        if not len(solution.star) or solution.chi2 < misfit.DOUBTFUL:
+        if not len(solution.star):
+            return Refit(solution, camera, 1.0)
+        detections = self.detections(centroids, sigma_px, 0.0 if solution.focal_ratio == 1 else search.WRONG_FOCAL)
+        solution, detections = companions.with_companions(solution, detections, self.sky)
+        # A few stars may fit by luck within gates that are too narrow for the others.
+        if len(solution.star) == len(centroids) and solution.chi2 < misfit.DOUBTFUL:
             return Refit(solution, camera, 1.0)
         if self.focal_uncertainty or self.camera.row_time_s:
             # The lens or the rate is fitted afterwards: matches beyond the gate belong to it.
             dof = max(2 * len(solution.star) - 4, 1)
             variance = variance_factor(dof * solution.chi2, dof)
             return Refit(solution._replace(covariance_rad2=variance * solution.covariance_rad2), camera, variance)
-        detections = self.detections(centroids, sigma_px, 0.0 if solution.focal_ratio == 1 else search.WRONG_FOCAL)
         return misfit.refit(solution, detections, self.sky, camera, centroids.xy_px, not self.camera.focal_sigma)
 
     def attitude_of(self, centroids: Centroids, refitted: Refit, sigma_px: Floats) -> Attitude:

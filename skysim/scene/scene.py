@@ -122,6 +122,8 @@ class Scene(ConfigModel):
         imu = self.vehicle.imu
         if self.filter and not imu:
             raise ValueError("filter: requires the section vehicle.imu")
+        if self.tracker.gyro and not imu:
+            raise ValueError("tracker.gyro: requires the section vehicle.imu")
         if control is None:
             return self
         present = {"ideal": True} | {kind: getattr(self.vehicle, kind) for kind in ("wheels", "fans", "cmgs")}

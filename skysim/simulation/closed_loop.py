@@ -8,6 +8,7 @@ updates the attitude filter, which the controller may use in the next period.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -15,7 +16,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from estimator.core.types import RateEstimate
 from estimator.trackers.pipeline import Clock, Report
+from skysim.camera.render import Window
 from skysim.core.errors import InputError
 from skysim.core.random_streams import AIR_CURRENT, IMU, JITTER, random_stream
 from skysim.core.types import Floats, Frame, Truth
@@ -28,7 +31,7 @@ from skysim.simulation.exposure import render_frame
 from skysim.simulation.reference_limits import check_reference
 from skysim.simulation.telemetry import TelemetryRecorder
 from skysim.simulation.testbed import exposure_window, time_tag_error_s
-from skysim.tracking import factory
+from skysim.tracking import factory, gyro
 from skysim.tracking.exposure_control import ExposureController
 from skysim.tracking.navigation import Navigation
 
@@ -63,7 +66,7 @@ class ClosedLoop:
         self.simulation = build_simulation(testbed, self.reference, history_s(scene) if discards_history else None)
         self.vibration = Vibration.draw(scene.motion, random_stream(scene.seed, JITTER, 0), self.reference)
         self.flight_computer = FlightComputer(scene, vehicle, self.reference, testbed.controllers)
-        self.navigation = build_navigation(testbed, start, not discards_history)
+        self.navigation = build_navigation(testbed, start, history_s(scene) if discards_history else math.inf)
         self.disturbances = DisturbanceModel.from_config(
             scene.vehicle.disturbances,
             imu.earth_rate_lab_rad_s(scene.site),
@@ -156,12 +159,22 @@ class OnboardCamera:
                 continue
             frame, truth = render_frame(loop.testbed_since(window.open_s), self.index, clock, window.exposure_s)
             self.exposure_control.update(frame)
-            report = factory.solve_frame(self.tracker, frame) if self.tracker else None
+            samples = loop.navigation.imu_samples() if loop.navigation and scene.tracker.gyro else None
+            rate = measured_rate(loop.testbed, samples, window)
+            report = factory.solve_frame(self.tracker, frame, rate=rate) if self.tracker else None
             # The filter takes the solution at its mid-exposure time, although it arrives later.
             navigation = loop.navigation if scene.filter and report else None
             update_status = navigation.update_filter(frame.t_mid_s, report.attitude) if navigation and report else ""
             self.index += 1
             yield CapturedFrame(frame, truth, report, update_status)
+
+
+def measured_rate(testbed: Testbed, samples: imu.Increments | None, window: Window) -> RateEstimate | None:
+    """The gyro's rate during an exposure as the tracker gets it; None without `tracker.gyro`."""
+    config, scene = testbed.scene.vehicle.imu, testbed.scene
+    if samples is None or config is None or not scene.tracker.gyro:
+        return None
+    return gyro.rate_of_frame(samples, window, scene.camera.height_px, config, testbed.mount)
 
 
 def history_s(scene: Scene) -> float:
@@ -197,12 +210,10 @@ def recent_motion(simulation: multibody.Simulation, vibration: Vibration, steps:
     return trajectory.t_s, trajectory.lab_from_body.as_quat(scalar_first=True), trajectory.rate_body_rad_s
 
 
-def build_navigation(testbed: Testbed, start: Rotation, keep_samples: bool) -> Navigation | None:
-    """The on-board navigation, or None without an IMU. keep_samples: whether it keeps every IMU sample."""
+def build_navigation(testbed: Testbed, start: Rotation, kept_s: float) -> Navigation | None:
+    """The on-board navigation, or None without an IMU. kept_s: how long it keeps IMU samples."""
     if testbed.scene.vehicle.imu is None:
         return None
     position_m = multibody.imu_position_m(testbed.vehicle)
     stream = random_stream(testbed.scene.seed, IMU, 0)
-    return Navigation(
-        testbed.scene, testbed.mount, start, position_m, testbed.vehicle.gravity_m_s2, stream, keep_samples
-    )
+    return Navigation(testbed.scene, testbed.mount, start, position_m, testbed.vehicle.gravity_m_s2, stream, kept_s)

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 from estimator.trackers.pipeline import Clock, Report
 from skysim.core.types import Frame, Truth
 from skysim.scene.scene import Scene
-from skysim.simulation.closed_loop import CapturedFrame, ClosedLoop, OnboardCamera
+from skysim.simulation.closed_loop import CapturedFrame, ClosedLoop, OnboardCamera, measured_rate
 from skysim.simulation.compilation import synthetic_frame
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.telemetry import TelemetryRecorder
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.testbed import Testbed, build_testbed, build_tracker, exposure_window
 from skysim.tracking import factory
 from skysim.tracking.exposure_control import ExposureController
 
@@ -156,5 +156,9 @@ def run(testbed: Testbed, estimator: factory.Estimator) -> Iterator[FrameResult]
     """Render and solve the frames in order; reuse the reports of frames that were solved during the motion."""
     warm_up(testbed, estimator)
     for frame, truth, seconds in render_frames(testbed):
-        report = testbed.reports.get(frame.index) or factory.solve_frame(estimator, frame)
+        report = testbed.reports.get(frame.index)
+        if report is None:
+            window = exposure_window(testbed.scene, frame.index, frame.exposure_s)
+            rate = measured_rate(testbed, testbed.imu_samples, window)
+            report = factory.solve_frame(estimator, frame, rate=rate)
         yield FrameResult(frame, truth, report, seconds)

@@ -20,6 +20,7 @@ from skysim.core.types import Floats, Mount
 from skysim.dynamics import imu
 from skysim.scene.scene import Scene
 from skysim.scene.sections.tracker import FilterConfig
+from skysim.tracking.gyro import latest
 
 
 class Navigation:
@@ -28,7 +29,7 @@ class Navigation:
     scene : with `vehicle.imu`, and optionally `filter`
     lab_from_body_wxyz : (4,) the true attitude at the start, when the navigator is zeroed
     position_body_m, gravity_m_s2 : of the accelerometers
-    keeps_samples : whether all IMU samples are kept, for `imu_samples`
+    kept_s : how long IMU samples are kept, for `imu_samples`
     """
 
     def __init__(
@@ -39,7 +40,7 @@ class Navigation:
         position_body_m: Floats,
         gravity_m_s2: float,
         rng: np.random.Generator,
-        keeps_samples: bool = True,
+        kept_s: float = math.inf,
     ) -> None:
         config = scene.vehicle.imu
         assert config is not None
@@ -55,7 +56,7 @@ class Navigation:
         self.navigator = imu.Navigator(assumed.as_quat(scalar_first=True), self.earth_compensated_rad_s)
         self.filter = build_filter(scene.filter, assumed) if scene.filter else None
         self.time_tag_sigma_s = scene.filter.time_tag_sigma_s if scene.filter else 0.0
-        self.keeps_samples, self.measured = keeps_samples, list[imu.Increments]()
+        self.kept_s, self.measured = kept_s, list[imu.Increments]()
         self.rate_rad_s = np.zeros(3)
         self.saturated = False
 
@@ -81,8 +82,8 @@ class Navigation:
             self.earth_sensed_rad_s,
         )
         measured = self.imu.measure(ideal)
-        if self.keeps_samples:
-            self.measured.append(measured)
+        self.measured.append(measured)
+        self.measured = latest(self.measured, self.kept_s)
         self.navigator.add(measured)
         self.saturated = bool(measured.saturated.any())
         compensation = self.earth_body_rad_s(self.navigator.lab_from_body_wxyz)
@@ -93,7 +94,7 @@ class Navigation:
             self.filter.propagate(ends_s, measured.angle_rad - compensation * self.step_s, measured.saturated)
 
     def imu_samples(self) -> imu.Increments:
-        """All IMU samples so far."""
+        """The IMU samples that are kept."""
         columns = zip(
             *((m.t_s, m.angle_rad, m.velocity_m_s, m.saturated, m.overloaded) for m in self.measured),
             strict=True,

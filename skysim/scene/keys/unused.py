@@ -142,6 +142,12 @@ RULES = (
         "tracker.name: own, or tracker.options",
     ),
     Rule(
+        ("tracker.gyro",),
+        external,
+        "an external tracker gets no rate",
+        "tracker.name: own",
+    ),
+    Rule(
         ("tracker.detector", "tracker.threshold_sigma", "tracker.min_area_px", "tracker.brightest"),
         lambda scene: external(scene) and scene.tracker.exposure_control is None,
         "an external tracker has its own detection",

@@ -98,6 +98,8 @@ class TrackerConfig(ConfigModel):
         under the stars all of them `default`
     assumed_distortion : k1, k2, p1, p2, k3 of the lens; as it is if left out
     assumed_row_time : of a rolling shutter; 0 for a tracker that takes all rows as exposed at once
+    gyro : whether the tracker gets the mean rate that `vehicle.imu` measures during each exposure, unless saturated,
+        for smear and a rolling shutter. Without it, as in the published labs, both follow from the frame alone
     brightest : only this many of the brightest detections of a frame are used
     exposure_control : every frame is exposed for `exposure.time` if left out
     """
@@ -117,6 +119,7 @@ class TrackerConfig(ConfigModel):
     assumed_focal_length_m: Annotated[Length, Field(gt=0)] | None = None
     assumed_distortion: tuple[Number, Number, Number, Number, Number] | None = None
     assumed_row_time_s: Annotated[Time, Field(ge=0)] | None = None
+    gyro: bool = False
     brightest: Annotated[int, Field(ge=3, le=1000)] | None = None
     assumed_camera_body_m: tuple[Length, Length, Length] | None = None
     survey: SurveyErrorsConfig = SurveyErrorsConfig()

@@ -8,6 +8,7 @@ from interpreted import interpreted
 from scipy import ndimage, optimize, stats
 from scipy.special import erf
 
+from estimator.centroiding import streak_fit
 from estimator.centroiding.centroid import cog, gaussian_fit, streak, streak_ends
 from estimator.core.types import FramePriors
 from estimator.detection import background as frame_background
@@ -252,6 +253,31 @@ def test_a_star_s_own_streak_errs_as_it_says_whatever_the_frame_s(stretch: float
     assert np.mean(nees) == pytest.approx(2, abs=4 * 2 / np.sqrt(len(nees)))
     offset, spread = np.mean(np.concatenate(errors), axis=0), np.std(np.concatenate(errors), axis=0)
     np.testing.assert_allclose(offset, 0, rtol=0, atol=4 * spread.max() / np.sqrt(len(nees)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_star_s_own_vector_is_that_of_the_data_without_the_priors(seed: int) -> None:
+    """Of seven Gaussian parameters: the posterior of data and priors leads back to mean and covariance of the data."""
+    rng = np.random.default_rng(seed)
+    place = [streak_fit.LENGTH, streak_fit.ANGLE]
+    data_mean = np.array([10.0, 11.0, 900.0, 9.0, 0.6, 0.9, 5.0])
+    root = 0.5 * rng.standard_normal((7, 7)) + 2 * np.eye(7)
+    scale = np.array([0.1, 0.1, 20.0, 0.9, 0.06, 0.1, 1.0])
+    covariance = scale[:, None] * np.linalg.inv(root @ root.T) * scale
+    prior_mean, prior = np.array([10.5, 0.7]), np.zeros((7, 7))
+    prior[place, place] = 1 / np.array([streak_fit.length_sigma_px(10.5), streak_fit.ANGLE_RAD]) ** 2
+    normal = np.linalg.inv(covariance) + prior
+    pull = np.zeros(7)
+    pull[place] = prior[place, place] * prior_mean
+    p = np.linalg.solve(normal, np.linalg.solve(covariance, data_mean) + pull)
+    out = np.full(5, np.nan)
+    streak_fit._own_vector(np.linalg.cholesky(normal), p, *prior_mean, 1.0, 0.01, np.empty(7), out)
+    length, angle = data_mean[place]
+    c, s = np.cos(angle), np.sin(angle)
+    by_both = np.array([[c, -length * s], [s, length * c]])
+    own = covariance[np.ix_(place, place)] + np.diag([0.01, 0.0])
+    np.testing.assert_allclose(out[:2], [length * c, length * s], rtol=1e-9)
+    np.testing.assert_allclose(out[[2, 4, 4, 3]].reshape(2, 2), by_both @ own @ by_both.T, rtol=1e-7)
 
 
 def test_a_frame_s_short_streak_is_corrected_by_its_stars() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy
+import scipy.integrate
 from hypothesis import given
 from hypothesis import strategies as some
 from laws import SEEDS, law
@@ -63,3 +64,19 @@ def test_variance_factor_is_the_reduced_chi_square_with_many_degrees_of_freedom(
 def test_variance_factor_of_a_right_claim_is_about_one() -> None:
     chi2 = np.random.default_rng(3).chisquare(27, 2000)
     assert np.mean([variance_factor(one, 27) for one in chi2]) < 1.1
+
+
+@pytest.mark.parametrize(("chi2", "dof"), [(2.0, 5), (12.0, 5), (30.0, 5), (40.0, 27), (200.0, 27), (1e4, 27)])
+def test_variance_factor_is_the_mean_of_bayes_posterior(chi2: float, dof: int) -> None:
+    """By quadrature over the factor: half of the prior at 1, half even in its logarithm from 1 to the limit."""
+
+    def moment(power: int) -> float:
+        span = np.log(MAX_VARIANCE_FACTOR)
+        scale = max(-dof / 2 * np.log(max(chi2 / dof, 1.0)) - dof / 2, -chi2 / 2)
+
+        def integrand(u: float) -> float:
+            return np.exp(power * u - dof * u / 2 - chi2 / 2 * np.exp(-u) - scale) / span
+
+        return 0.5 * scipy.integrate.quad(integrand, 0, span, limit=200)[0] + 0.5 * np.exp(-chi2 / 2 - scale)
+
+    assert variance_factor(chi2, dof) == pytest.approx(moment(1) / moment(0), rel=0.03)

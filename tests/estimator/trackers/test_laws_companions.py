@@ -1,0 +1,125 @@
+"""Double stars do not pull the attitude, and the covariance knows of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as some
+from laws import law
+from scipy.spatial.transform import Rotation
+
+from estimator.catalog import catalog
+from estimator.core.camera import Camera
+from estimator.core.types import Centroids
+from estimator.trackers import companions
+from estimator.trackers.companions import ARCSEC_RAD, ERROR_RAD, SHARE
+from estimator.trackers.pipeline import Settings
+from estimator.trackers.star_tracker import StarTracker
+from skysim.core.paths import CATALOGS
+
+CAMERA = Camera.from_fov(4056, 3040, np.radians(22))  # 20 arcseconds a pixel
+NOISE_PX, BRIGHT_PX, FIELDS = 0.05, 0.0115, 100
+OFF_RAD = 2.2 * ARCSEC_RAD
+
+
+@pytest.fixture(scope="module")
+def tracker() -> StarTracker:
+    stars = catalog.brighter_than(catalog.hipparcos(), 5.0)
+    return StarTracker(CAMERA, stars, stars.vectors, Settings(centroid_sigma_px=0.0, merge_px=0.0))
+
+
+def test_a_bright_double_does_not_pull_the_attitude(tracker: StarTracker) -> None:
+    """A double 2.2" off, with half of the field's information: the NEES is 13, without the model of companions 25."""
+    nees = []
+    for seed in range(FIELDS):
+        rng = np.random.default_rng([25, seed])
+        truth, stars = Rotation.random(rng=rng), tracker.stars
+        xy_px = np.nan_to_num(CAMERA.pixels(truth.apply(stars.vectors)), nan=-1e9)
+        star = np.flatnonzero(CAMERA.contains(xy_px))
+        sigma_px = np.full(len(star), NOISE_PX)
+        sigma_px[0] = BRIGHT_PX
+        noisy_px = xy_px[star] + sigma_px[:, None] * rng.standard_normal((len(star), 2))
+        azimuth = rng.uniform(0, 2 * np.pi)
+        noisy_px[0] += OFF_RAD * CAMERA.focal_px * np.array([np.cos(azimuth), np.sin(azimuth)])
+        answer = tracker.solve_centroids(Centroids(noisy_px, sigma_px, 10 ** (-0.4 * stars.v_mag[star])))
+        if answer.cam_from_ref is not None:
+            error = (answer.cam_from_ref * truth.inv()).as_rotvec()
+            nees.append(error @ np.linalg.solve(answer.covariance_rad2, error))
+    assert len(nees) >= 0.9 * FIELDS
+    assert np.mean(nees) < 18
+
+
+@law(companions.with_companions)
+@given(seed=some.integers(0, 10**6))
+def test_coarse_centroids_know_nothing_of_companions(tracker: StarTracker, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth, stars = Rotation.random(rng=rng), tracker.stars
+    xy_px = np.nan_to_num(CAMERA.pixels(truth.apply(stars.vectors)), nan=-1e9)
+    star = np.flatnonzero(CAMERA.contains(xy_px))
+    noise_px = 0.5  # 10 arcseconds
+    noisy_px = xy_px[star] + noise_px * rng.standard_normal((len(star), 2))
+    centroids = Centroids(noisy_px, np.full(len(star), noise_px), np.ones(len(star)))
+    detections = tracker.detections(centroids, tracker.sigma_px(centroids))
+    assert tracker.patterns is not None
+    solution = tracker._search(centroids, tracker.sigma_px(centroids), tracker.patterns, tracker.searches[0])
+    after, errors = companions.with_companions(solution, detections, tracker.sky)
+    assert after is solution
+    assert errors is detections
+
+
+@law(companions.prediction_by_others)
+@given(seed=some.integers(0, 10**6), count=some.integers(4, 12))
+def test_the_prediction_is_that_of_a_fit_without_the_star(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    jacobian, residual = rng.standard_normal((count, 2, 3)), rng.standard_normal((count, 2))
+    root = rng.standard_normal((count, 2, 2)) + 2 * np.eye(2)
+    information = root @ np.swapaxes(root, 1, 2)
+
+    def fit(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        weighted = np.swapaxes(jacobian[rows], 1, 2) @ information[rows]
+        normal = np.sum(weighted @ jacobian[rows], axis=0)
+        return np.linalg.solve(normal, np.einsum("nij,nj->i", weighted, residual[rows])), np.linalg.inv(normal)
+
+    every = np.arange(count)
+    at_best = residual - jacobian @ fit(every)[0]
+    alone, spread = companions.prediction_by_others(at_best, jacobian, information)
+    for k in range(count):
+        step, covariance = fit(np.delete(every, k))
+        assert alone[k] == pytest.approx(residual[k] - jacobian[k] @ step, rel=1e-3, abs=1e-3)
+        assert spread[k] == pytest.approx(jacobian[k] @ covariance @ jacobian[k].T, rel=1e-3, abs=1e-6)
+
+
+@law(companions.mean_information)
+@given(sigma=some.floats(0.02, 2.0), off=some.floats(0.0, 20.0), spread=some.floats(0.0, 2.0))
+def test_a_star_loses_information_only_by_what_companions_explain(sigma: float, off: float, spread: float) -> None:
+    """In arcseconds: between that of its centroid and that of a star with the greatest error."""
+    own = np.eye(2)[None] / (sigma * ARCSEC_RAD) ** 2
+    residual = np.array([[off, 0.0]]) * ARCSEC_RAD
+    mean = companions.mean_information(own, residual, (spread * ARCSEC_RAD) ** 2 * np.eye(2)[None])[0]
+    least = 1 / (sigma**2 + (ERROR_RAD.max() / ARCSEC_RAD) ** 2)
+    share = np.diag(mean) * (sigma * ARCSEC_RAD) ** 2
+    assert (share <= 1 + 1e-9).all()
+    assert (share >= least * sigma**2 - 1e-9).all()
+    if off > 6 * np.hypot(sigma, spread) + 3:
+        assert share[0] < 0.6
+    if off < np.hypot(sigma, spread) and np.hypot(sigma, spread) < 0.5:
+        assert share[0] > 0.6
+
+
+@pytest.mark.slow
+def test_shares_are_those_of_the_catalogs() -> None:
+    """Hipparcos' entries against the center of light of Gaia's stars: shares beyond 0.5 and 1.5 seconds of arc."""
+    entries = catalog.brighter_than(catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv"), 5.75)
+    when = catalog.on_earth(catalog.utc("2012-06-22T21:00"))
+    sky, seen = catalog.read(CATALOGS / "gaia_v8.0.ecsv"), catalog.apparent(entries, when)
+    stars, flux = catalog.apparent(sky, when), 10 ** (-0.4 * sky.v_mag)
+    off_arcsec = []
+    for vector in seen:
+        near = np.flatnonzero(stars @ vector > np.cos(40 * ARCSEC_RAD))
+        center = flux[near] @ stars[near]
+        off_arcsec.append(np.linalg.norm(center / np.linalg.norm(center) - vector) / ARCSEC_RAD)
+    for limit in (0.5, 1.5):
+        found = float(np.mean(np.array(off_arcsec) > limit))
+        told = SHARE @ np.exp(-0.5 * (limit / np.maximum(ERROR_RAD / ARCSEC_RAD, 1e-9)) ** 2)
+        assert told == pytest.approx(found, rel=0.5)
