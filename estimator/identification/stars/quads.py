@@ -18,15 +18,8 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
 from estimator.identification.chance import GATE_SIGMA, required_matches
 from estimator.identification.stars import search
-from estimator.identification.stars.evidence import (
-    Detections,
-    Hypothesis,
-    Solution,
-    evaluate,
-    field_area,
-    no_hypothesis,
-    ray,
-)
+from estimator.identification.stars.detections import Detections, changed, field_area, ray
+from estimator.identification.stars.evidence import Hypothesis, Solution, evaluate, no_hypothesis
 
 COMBINED = 24  # number of brightest detections that are combined to quads
 
@@ -48,10 +41,11 @@ def identify(
     max_checks : bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
     calibrated : whether the focal length should be right (`search.fit_with_calibration`)
     """
-    searched = search.brightest(detections, min(max_detections, len(detections.sigma)))
+    count = min(max_detections, len(detections.sigma))
+    searched = changed(detections, count, 1.0, detections.focal_uncertainty)
     best = _search(searched, quads, patterns, max_checks)
     if calibrated and best.dex >= search.DECISIVE_DEX:
-        return search.fit_with_calibration(detections, stars, best)
+        return search.fit_with_calibration(detections, stars, best, False)
     return search.fit_to_all(detections, stars, best, search.DECISIVE_DEX)
 
 

@@ -29,17 +29,16 @@ from estimator.identification.chance import (
     separation,
     squared_separation,
 )
+from estimator.identification.stars.detections import Detections, changed, field_area, ray
 from estimator.identification.stars.evidence import (
-    Detections,
     Hypothesis,
     Solution,
     build_solution,
     evaluate,
-    field_area,
+    focal_gain_dex,
     magnitude_density,
     no_hypothesis,
     prior_volume_dex,
-    ray,
 )
 
 # Least log10 Bayes factor of an accepted attitude. By Markov's inequality, random detections reach it in at most one of
@@ -58,6 +57,7 @@ FEW = 20  # number of detections of the first search
 SHORT_EFFORT, MANY_EFFORT = 1 / 16, 1 / 4  # fractions of the effort: of the first search at first, and of the second
 WRONG_FOCAL = 0.05  # greatest relative error of a calibrated focal length that is found
 WRONG_FOCAL_DEX = 2.0  # evidence by which another focal length must beat the calibrated one
+FREE_DEX = 1.0  # gain of a free focal length with the same matches below which the field is not matched with it
 MAX_MISSES = 4  # detections without a star after which the first round drops a candidate
 
 
@@ -78,15 +78,17 @@ def lost_in_space(
     few, many = min(FEW, max_detections, len(detections.sigma)), min(max_detections, len(detections.sigma))
     if many == few:
         accept_dex = ACCEPT_DEX
-        candidate = search(brightest(detections, few), patterns, max_checks)
+        candidate = search(changed(detections, few, 1.0, detections.focal_uncertainty), patterns, max_checks)
     else:
         accept_dex = ACCEPT_DEX + log10(2.0)
         for count, effort in ((few, SHORT_EFFORT), (many, MANY_EFFORT), (few, 1.0)):
-            candidate = search(brightest(detections, count), patterns, int(effort * max_checks))
+            searched = changed(detections, count, 1.0, detections.focal_uncertainty)
+            candidate = search(searched, patterns, int(effort * max_checks))
             if candidate.dex >= accept_dex:
                 break
     if detections.focal_uncertainty == 0 and candidate.dex >= accept_dex:
-        return fit_with_calibration(with_focal_uncertainty(detections, WRONG_FOCAL), stars, candidate)
+        whole = few == len(detections.sigma) and len(patterns.mag) == len(stars.mag)
+        return fit_with_calibration(changed(detections, len(detections.sigma), 1.0, WRONG_FOCAL), stars, candidate, whole)
     return fit_to_all(detections, stars, candidate, accept_dex)
 
 
@@ -114,47 +116,22 @@ def _solution_of(detections: Detections, stars: SkyIndex, candidate: Hypothesis,
 
 
 @jit
-def fit_with_calibration(detections: Detections, stars: SkyIndex, candidate: Hypothesis) -> Solution:
+def fit_with_calibration(detections: Detections, stars: SkyIndex, candidate: Hypothesis, whole: bool) -> Solution:
     """Fit a candidate to all detections and stars with the calibrated focal length and with a free one.
 
     The calibrated one is kept unless the other has WRONG_FOCAL_DEX more evidence. With a wrong focal length a part of
     the stars may still match, at a wrong attitude.
     detections : with the focal uncertainty of the free fit
+    whole : whether the candidate is the calibrated fit to all detections and stars already
     """
-    exact, gates = with_focal_uncertainty(detections, 0.0), 1.5 * GATE_SIGMA * detections.sigma
+    exact, gates = changed(detections, len(detections.sigma), 1.0, 0.0), 1.5 * GATE_SIGMA * detections.sigma
     R, ratio = candidate.R_cam_from_ref, candidate.focal_ratio
-    kept = evaluate(exact, stars, R.copy(), 1.0, gates, -np.inf)
+    kept = candidate if whole else evaluate(exact, stars, R.copy(), 1.0, gates, -np.inf)
+    if len(kept.star) == len(gates) and focal_gain_dex(detections, stars, kept) < FREE_DEX:
+        return _solution_of(exact, stars, candidate, kept)  # no detection is left that another focal length could match
     free = evaluate(detections, stars, R.copy(), ratio, gates, -np.inf)
     chosen, full = (detections, free) if free.dex > kept.dex + WRONG_FOCAL_DEX else (exact, kept)
     return _solution_of(chosen, stars, candidate, full)
-
-
-@jit
-def with_focal_uncertainty(detections: Detections, focal_uncertainty: float) -> Detections:
-    """The same detections of a camera with another uncertainty of its focal length."""
-    return Detections(
-        detections.tangent,
-        detections.sigma,
-        detections.weight,
-        detections.mag,
-        detections.mag_sigma,
-        detections.field,
-        focal_uncertainty,
-    )
-
-
-@jit
-def brightest(detections: Detections, count: int) -> Detections:
-    """The first `count` detections."""
-    return Detections(
-        detections.tangent[:count],
-        detections.sigma[:count],
-        detections.weight[:count],
-        detections.mag[:count],
-        detections.mag_sigma,
-        detections.field,
-        detections.focal_uncertainty,
-    )
 
 
 @jit
