@@ -33,7 +33,7 @@ FACE_HALF_WIDTH = 1.2
 
 
 class SkyIndex(NamedTuple):
-    """Stars and pairs in bins. A named tuple, so that compiled code accepts it.
+    """Stars, and pairs of the brightest, in bins. A named tuple, so that compiled code accepts it.
 
     vectors : (N, 3) unit vectors, brightest star first
     pair    : (P, 2) rows of stars, in bins of the angle between them
@@ -61,13 +61,13 @@ class SkyIndex(NamedTuple):
         return sum(array.nbytes for array in (*self, *self.cells) if isinstance(array, np.ndarray))
 
 
-def build(vectors: Floats, mag: Floats, max_angle_rad: float) -> SkyIndex:
+def build(vectors: Floats, mag: Floats, max_angle_rad: float, paired: int | None = None) -> SkyIndex:
     """Build the index of (N, 3) unit vectors, brightest first, with all pairs up to an angle.
 
-    Raises ImageError for fewer than 3 pairs.
+    paired : number of brightest stars that form pairs; None: all. Raises ImageError for fewer than 3 pairs.
     """
     sky = build_without_pairs(vectors, mag)
-    vectors = sky.vectors
+    vectors = sky.vectors[:paired]
     max_angle_rad = min(max_angle_rad, np.pi)
     by_z = np.argsort(vectors[:, 2])
     sorted_xyz = np.ascontiguousarray(vectors[by_z].T)

@@ -54,14 +54,15 @@ def widened(
     detections : with the errors of the model, and the focal uncertainty with which the solution was found
     """
     gates = 1.5 * GATE_SIGMA * sqrt(TRIED[-1]) * detections.sigma
-    if evidence.count_near(detections.tangent, sky, R_cam_from_ref, solution.focal_ratio, solution.observed, gates) == 0:
+    ratio = solution.focal_ratio
+    if evidence.count_near(detections.tangent, sky, R_cam_from_ref, ratio, solution.observed, gates) == 0:
         return _scaled(solution, 4 if detections.focal_uncertainty > 0 else 3)
     best, best_dex, dex = solution, solution.dex, np.empty(len(TRIED))
     dex[0] = solution.dex
     for n in range(1, len(TRIED)):
         wide = changed(detections, len(detections.sigma), TRIED[n], detections.focal_uncertainty)
         gates = 1.5 * GATE_SIGMA * wide.sigma
-        found = evidence.evaluate(wide, sky, R_cam_from_ref.copy(), solution.focal_ratio, gates, -np.inf)
+        found = evidence.evaluate(wide, sky, R_cam_from_ref.copy(), ratio, gates, -np.inf)
         dex[n] = found.dex + PRIOR_WRONG_DEX
         if dex[n] > best_dex:
             best, best_dex = evidence.build_solution(wide, sky, found), dex[n]
@@ -86,7 +87,8 @@ def _scaled(solution: Solution, parameters: int) -> tuple[Solution, float]:
     best = np.argmax(dex)
     weight = 10 ** (dex - dex[best])
     variance = np.sum(weight * TRIED) / np.sum(weight)
-    likely = with_errors(solution, variance * solution.covariance_rad2, solution.chi2 / TRIED[best], dex[best])
+    best_dex = dex[best] - (PRIOR_WRONG_DEX if best else 0.0)
+    likely = with_errors(solution, variance * solution.covariance_rad2, solution.chi2 / TRIED[best], best_dex)
     return likely, variance
 
 
@@ -107,7 +109,7 @@ def with_errors(solution: Solution, covariance_rad2: Floats, chi2: float, dex: f
 
 @jit
 def identify(
-    lights: FlatCentroids, sensor: Sensor, patterns: SkyIndex, stars: SkyIndex, max_detections: int, max_checks: int
+    lights: FlatCentroids, sensor: Sensor, stars: SkyIndex, max_detections: int, max_checks: int
 ) -> tuple[Solution, float]:
     """Search centroids of a calibrated camera by pairs, and match and scale anew where the residuals are doubtful.
 
@@ -115,7 +117,7 @@ def identify(
     It is 0 where the residuals are so great that the calibration may be wrong: the solution is then as it was found.
     """
     detections = detections_of(lights, sensor, 0.0)
-    solution = search.lost_in_space(detections, patterns, stars, max_detections, max_checks)
+    solution = search.lost_in_space(detections, stars, max_detections, max_checks)
     if residuals_too_great(solution) or solution.focal_ratio != 1:
         return solution, 0.0
     if solution.chi2 < DOUBTFUL or not len(solution.star):

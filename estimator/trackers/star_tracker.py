@@ -122,13 +122,12 @@ class StarTracker:
         longest_rad = 1.02 * camera.zoomed(1 - focal_uncertainty).diagonal_rad
         if all(model.by_quads for model in self.searches):
             longest_rad = quad_index.LONGEST * self._height_rad
-        self.sky = sky_index.build_without_pairs(self.stars.vectors, self.stars.v_mag)
-        self.patterns: sky_index.SkyIndex | None = None
         self.index: pair_index.PairIndex | None = None
         if settings.identifier == "default":
-            self.patterns = sky_index.build(index_stars.vectors, index_stars.v_mag, longest_rad)
-            self.pairs = len(self.patterns.pair)
+            self.sky = sky_index.build(self.stars.vectors, self.stars.v_mag, longest_rad, len(index_stars))
+            self.pairs = len(self.sky.pair)
         else:
+            self.sky = sky_index.build_without_pairs(self.stars.vectors, self.stars.v_mag)
             self.index = pair_index.build(index_stars.vectors, longest_rad)
             self.pairs = len(self.index.pair)
         self.field_matcher = FieldMatcher(camera, self.stars, self.sky, settings, focal_uncertainty, self.pairs)
@@ -140,9 +139,8 @@ class StarTracker:
 
     @functools.cached_property
     def quads(self) -> quad_index.QuadIndex:
-        """The quads of the pattern index, built when they are first needed."""
-        assert self.patterns is not None
-        return quad_index.build(self.patterns, self._height_rad)
+        """The quads of the stars that form pairs, built when they are first needed."""
+        return quad_index.build(self.sky, self._height_rad)
 
     @property
     def _height_rad(self) -> float:
@@ -222,7 +220,7 @@ class StarTracker:
     @property
     def efforts(self) -> int:
         """Number of searches, with different error models and efforts, that are made before a frame is given up."""
-        return len(self.searches) if self.patterns is not None else 1
+        return len(self.searches) if self.index is None else 1
 
     def solve_centroids(
         self,
@@ -258,9 +256,9 @@ class StarTracker:
 
     def _solve_global(self, centroids: Centroids, clock: Clock, effort: int | None) -> Attitude:
         """Identify and solve centroids of one time."""
-        if self.patterns is not None:
+        if self.index is None:
             searches = self.searches if effort is None else self.searches[effort : effort + 1]
-            return self._identify_by_evidence(centroids, self.patterns, searches, clock)
+            return self._identify_by_evidence(centroids, searches, clock)
         for camera, cam_from_ref in self._candidates(centroids):
             clock.lap("identify")
             attitude = self.field_matcher.refine(centroids, camera, cam_from_ref)
@@ -313,14 +311,11 @@ class StarTracker:
 
         sigma_px : (N,) total errors;  focal_uncertainty : relative, if it is greater than that of the tracker
         """
-        return detections_of(
-            _lights(centroids, sigma_px), self.sensor, max(self.focal_uncertainty, focal_uncertainty)
-        )
+        return detections_of(_lights(centroids, sigma_px), self.sensor, max(self.focal_uncertainty, focal_uncertainty))
 
     def _identify_by_evidence(
         self,
         centroids: Centroids,
-        patterns: sky_index.SkyIndex,
         searches: tuple[SearchModel, ...],
         clock: Clock,
     ) -> Attitude:
@@ -332,11 +327,11 @@ class StarTracker:
         """
         for model in searches:
             sigma_px = self.sigma_px(centroids, model.min_error_px, model.relative_error)
-            solution, variance = self._search(centroids, sigma_px, patterns, model)
+            solution, variance = self._search(centroids, sigma_px, model)
             calibrated = not (self.focal_uncertainty or model.by_quads)
             if calibrated and not variance and misfit.residuals_too_great(solution):
                 # Of a camera with a wrong focal length a part of the stars may match, at a wrong attitude.
-                other, _ = self._search(centroids, sigma_px, patterns, WRONG_FOCAL_SEARCH)
+                other, _ = self._search(centroids, sigma_px, WRONG_FOCAL_SEARCH)
                 solution = other if other.dex > solution.dex + search.WRONG_FOCAL_DEX else solution
             clock.lap("identify")
             if not len(solution.star):
@@ -360,19 +355,17 @@ class StarTracker:
                 return attitude
         return Attitude(NO_MATCH)
 
-    def _search(
-        self, centroids: Centroids, sigma_px: Floats, patterns: sky_index.SkyIndex, model: SearchModel
-    ) -> tuple[Solution, float]:
+    def _search(self, centroids: Centroids, sigma_px: Floats, model: SearchModel) -> tuple[Solution, float]:
         """One search of the default identifier, and the factor of the variances if it is known, else 0."""
         most = self.settings.searched_stars
         if not (model.by_quads or self.focal_uncertainty or self.camera.row_time_s):
             lights = _lights(centroids, sigma_px)
-            return misfit.identify(lights, self.sensor, patterns, self.sky, most, model.max_checks)
+            return misfit.identify(lights, self.sensor, self.sky, most, model.max_checks)
         detections = self.detections(centroids, sigma_px, model.focal_uncertainty)
         if not model.by_quads:
-            return search.lost_in_space(detections, patterns, self.sky, most, model.max_checks), 0.0
+            return search.lost_in_space(detections, self.sky, most, model.max_checks), 0.0
         known = not self.focal_uncertainty
-        return quads.identify(detections, self.quads, patterns, self.sky, most, model.max_checks, known), 0.0
+        return quads.identify(detections, self.quads, self.sky, most, model.max_checks, known), 0.0
 
     def refit(self, centroids: Centroids, solution: Solution, sigma_px: Floats, variance: float = 0.0) -> Refit:
         """A solution with the errors and, of a calibrated global shutter, the lens that its residuals tell.

@@ -108,7 +108,8 @@ def evaluate(
     R_cam_from_ref is changed in place by the fit. Returns the empty hypothesis if fewer than
     MIN_EVIDENCE_MATCHES stars match, the focal ratio leaves its interval, or the evidence is below min_dex. The last
     test is made early with an upper bound of the evidence (exact matches, no missing star), which rejects most false
-    candidates before the full evaluation. A fit that has converged on the same matches is not repeated.
+    candidates before the full evaluation. A fit that has converged is not
+    repeated, nor are its matches.
     """
     R, info = R_cam_from_ref, np.zeros((4, 4))
     max_sigma, fall = np.inf, np.inf
@@ -124,28 +125,19 @@ def evaluate(
             upper_bound_dex = _evidence(detections, sky, R, focal_ratio, observed, star, info, False)
             if upper_bound_dex + counts_dex(len(observed), 0) < min_dex:
                 return no_hypothesis()
-        if fall < CONVERGED_CHI2 and _same(observed, before[0]) and _same(star, before[1]):
+        if fall < CONVERGED_CHI2 and np.array_equal(observed, before[0]) and np.array_equal(star, before[1]):
             break
         if iteration < 2:
             focal_ratio, fall = _fit(detections, sky, R, focal_ratio, observed, star, info)
             if abs(focal_ratio - 1) > 1.2 * detections.focal_uncertainty + 1e-12:
                 return no_hypothesis()
+            if iteration == 1 and fall < CONVERGED_CHI2:
+                break
     dex, matched = _evidence(detections, sky, R, focal_ratio, observed, star, info, True), len(observed)
     if dex + counts_dex(matched, 0) < min_dex:
         return no_hypothesis()
     dex += counts_dex(matched, _count_missing(detections, sky, R, focal_ratio, star))
     return Hypothesis(observed, star, R, focal_ratio, info, dex)
-
-
-@jit
-def _same(one: NDArray, other: NDArray) -> bool:
-    """Whether two arrays of rows are equal."""
-    if len(one) != len(other):
-        return False
-    for k in range(len(one)):
-        if one[k] != other[k]:
-            return False
-    return True
 
 
 @jit
@@ -334,9 +326,9 @@ def _evidence(
     """log10 of the Bayes factor of this attitude over detections at random positions, without the term `counts_dex`.
 
     Each match contributes N(residual) / rho, rho the density of detections on the sensor, and the ratio of
-    `_magnitude_ratio`. The attitude and the focal ratio contribute sqrt(2 pi)^n / sqrt(det info) over their prior volume
-    (Laplace's approximation). Unmatched detections cost nothing as long as they are no more than the matches; each one
-    above that, among the detections brighter than the faintest match, costs UNMATCHED_PENALTY_DEX.
+    `_magnitude_ratio`. The attitude and the focal ratio contribute sqrt(2 pi)^n / sqrt(det info) over their prior
+    volume (Laplace's approximation). Unmatched detections cost nothing as long as they are no more than the matches;
+    each one above that, among the detections brighter than the faintest match, costs UNMATCHED_PENALTY_DEX.
     with_residuals : include the residuals; without them the result is an upper bound for these matches
     """
     count = 4 if detections.focal_uncertainty > 0 else 3
