@@ -5,10 +5,17 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from typing import Any
 
 from benchmarks import attitude, detect, dynamics, identify, instrument, nees, rate, rolling, start
+
+
+def _later(module: str) -> Callable[[], list[dict[str, Any]]]:
+    """`measure` of a module that is also a program of its own, and is therefore imported when it is used."""
+    return lambda: importlib.import_module(f"benchmarks.{module}").measure()
+
 
 AREAS: dict[str, Callable[[], list[dict[str, Any]]]] = {
     "instrument": instrument.measure,
@@ -20,6 +27,8 @@ AREAS: dict[str, Callable[[], list[dict[str, Any]]]] = {
     "rolling": rolling.measure,
     "rate": rate.measure,
     "nees": nees.measure,
+    "lost_in_space": _later("lost_in_space"),
+    "frames": _later("frames"),
 }
 
 
