@@ -7,14 +7,17 @@ and of wrong ones for three kinds of frames:
     mirrored  : a workload's field with its columns reversed, which no rotation of the sky gives; FRAMES / 10
     few stars : 3 to 5 stars of a field among 30 false lights; FRAMES / 10. An answer may be right
 
-A hundred thousand frames take a quarter of an hour.
+The counts so far are printed after every thousand frames, so that a run in the background can be read at any time.
 """
 
 from __future__ import annotations
 
+import functools
+import multiprocessing
 import sys
+import time
 from collections.abc import Callable
-from itertools import cycle
+from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,6 +30,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.results.metrics import WRONG_RAD
 
 LIGHTS, FALSE_LIGHTS, STARS = (3, 30), 30, (3, 5)
+PROCESSES, BATCH = 2, 1000  # frames between two lines of the counts so far
 Frame = tuple[Centroids, Rotation | None]  # with the true attitude, if it has one
 
 
@@ -68,33 +72,56 @@ KINDS: dict[str, tuple[Callable[[Workload, StarCatalog, np.random.Generator], Fr
 }
 
 
-def count_answers(kind: str, count: int, seed: int) -> dict[str, list[int]]:
-    """Number of frames, of answers and of wrong answers, by workload."""
-    make = KINDS[kind][0]
+@functools.cache
+def trackers() -> list[tuple[Workload, StarCatalog, StarTracker]]:
+    """A tracker of each workload, with its sky, built once in each process."""
     settings = Settings(centroid_sigma_px=0.0, field_stars=1e9, merge_px=0.0, zero_point_mag=0.0)
     skies = {work.limit_mag: sky(work.limit_mag) for work in WORKLOADS}
-    trackers = []
+    out = []
     for work in WORKLOADS:
         stars, uncertainty = skies[work.limit_mag], 1.05 * work.focal_uncertainty
         camera = work.camera.zoomed(1 + work.focal_error)
-        trackers.append((work, stars, StarTracker(camera, stars, stars.vectors, settings, uncertainty)))
-    out = {work.name: [0, 0, 0] for work in WORKLOADS}
-    for n, (work, stars, tracker) in zip(range(count), cycle(trackers), strict=False):
-        centroids, truth = make(work, stars, np.random.default_rng([seed, n]))
-        answer = tracker.solve_centroids(centroids).cam_from_ref
-        right = answer is not None and truth is not None and (answer * truth.inv()).magnitude() < WRONG_RAD
-        out[work.name] = [
-            a + b
-            for a, b in zip(out[work.name], (1, answer is not None, answer is not None and not right), strict=True)
-        ]
+        out.append((work, stars, StarTracker(camera, stars, stars.vectors, settings, uncertainty)))
     return out
 
 
+def count_answers(kind: str, first: int, count: int, seed: int) -> dict[str, list[int]]:
+    """Number of frames, of answers and of wrong answers, by workload, of the frames from `first` on."""
+    make, every = KINDS[kind][0], trackers()
+    out = {f"{work.name} ({work.focal_uncertainty:g})": [0, 0, 0] for work in WORKLOADS}
+    for n in range(first, first + count):
+        work, stars, tracker = every[n % len(every)]
+        centroids, truth = make(work, stars, np.random.default_rng([seed, n]))
+        answer = tracker.solve_centroids(centroids).cam_from_ref
+        right = answer is not None and truth is not None and (answer * truth.inv()).magnitude() < WRONG_RAD
+        found = (1, answer is not None, answer is not None and not right)
+        row = out[f"{work.name} ({work.focal_uncertainty:g})"]
+        row[:] = [a + b for a, b in zip(row, found, strict=True)]
+        if found[2]:
+            print(f"{kind}: wrong answer in frame {n} of seed {seed}, {work.name}", flush=True)
+    return out
+
+
+def run(count: int, seed: int) -> None:
+    """Count all kinds in PROCESSES processes, and print the counts so far after every BATCH frames."""
+    with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("spawn")) as pool:
+        for kind, (_, share) in KINDS.items():
+            frames, rows, begin = round(share * count), {}, time.perf_counter()
+            firsts = range(0, frames, BATCH)
+            sizes = [min(BATCH, frames - first) for first in firsts]
+            batches = pool.map(count_answers, [kind] * len(sizes), firsts, sizes, [seed] * len(sizes))
+            for batch in batches:
+                rows = {name: np.add(rows.get(name, 0), row) for name, row in batch.items()}
+                done, answers, wrong = np.sum(list(rows.values()), axis=0)
+                speed = done / (time.perf_counter() - begin)
+                print(
+                    f"{kind:10s} seed {seed}: {done:7d} of {frames} frames, {answers} answered, {wrong} wrong,"
+                    f" {done - answers} refused; {speed:.0f} frames/s",
+                    flush=True,
+                )
+            for name, (done, answers, wrong) in rows.items():
+                print(f"{kind:10s} {name:43s} {done:7d} frames, {answers} answered, {wrong} wrong", flush=True)
+
+
 if __name__ == "__main__":
-    count, seed = (int(one) for one in (sys.argv[1:3] + ["100000", "1"][len(sys.argv[1:3]) :]))
-    for kind, (_, share) in KINDS.items():
-        rows = count_answers(kind, round(share * count), seed)
-        for name, (frames, answers, wrong) in rows.items():
-            print(f"{kind:10s} {name:36s} {frames:7d} frames, {answers} answered, {wrong} wrong", flush=True)
-        frames, answers, wrong = np.sum(list(rows.values()), axis=0)
-        print(f"{kind:10s} {'all':36s} {frames:7d} frames, {answers} answered, {wrong} wrong", flush=True)
+    run(*(int(one) for one in (sys.argv[1:3] + ["100000", "1"][len(sys.argv[1:3]) :])))

@@ -40,8 +40,8 @@ def measured() -> Iterator[str]:
     begin = time.perf_counter()
     tracker = StarTracker.for_sky(camera)
     yield f"tracker of {len(tracker.stars)} stars built: {time.perf_counter() - begin:.2f} s, {rss_mb():.0f} MB"
-    assert tracker.patterns is not None
-    yield f"index of pairs: {tracker.patterns.bytes / 1e6:.1f} MB, of stars: {tracker.sky.bytes / 1e6:.1f} MB"
+    pairs_mb = (tracker.sky.pair.nbytes + tracker.sky.first.nbytes) / 1e6
+    yield f"index of pairs: {pairs_mb:.1f} MB, of stars: {tracker.sky.bytes / 1e6 - pairs_mb:.1f} MB"
     follower = TrackingMode(tracker)
     begin = time.perf_counter()
     follower.warm_up()

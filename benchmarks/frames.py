@@ -1,7 +1,7 @@
-"""Time and error from image to attitude, lost in space, compared with tetra3rs.
+"""Time and error from image to attitude, lost in space, compared with tetra3rs and cedar-solve.
 
 `python -m benchmarks.frames [FRAMES] [SEED]`. The frames are drawn by this module, independently of skysim's camera:
-Gaussian stars of the Hipparcos catalog along a streak, with photon and read noise. Both solvers process one frame at a
+Gaussian stars of the Hipparcos catalog along a streak, with photon and read noise. All solvers process one frame at a
 time on one core. Errors are those of the boresight direction in arcseconds, over correctly solved frames.
 """
 
@@ -10,16 +10,20 @@ from __future__ import annotations
 import importlib.util
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from benchmarks import peers
+from benchmarks.timing import verdict
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
+from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.paths import CATALOGS
@@ -147,8 +151,25 @@ def tetra3rs(setup: CameraSetup, stars: catalog.StarCatalog, fast: bool) -> Solv
     return solve
 
 
-def compare(setup: CameraSetup, solvers: dict[str, Solve | None], frames: list[tuple[NDArray, Rotation]]) -> None:
-    """Run all solvers frame by frame and print one line per solver."""
+def cedar(setup: CameraSetup) -> Solve | None:
+    """cedar-solve with its own centroids (tetra3's) and catalog; None if it is not installed (`peers`)."""
+    identify = peers.cedar(setup.camera)
+    if identify is None:
+        return None
+    from tetra3 import get_centroids_from_image
+
+    def solve(image: NDArray) -> Rotation | None:
+        yx_px = get_centroids_from_image(image, max_returned=40)
+        ones = np.ones(len(yx_px))
+        return identify(Centroids(yx_px[:, ::-1] - 0.5, ones, ones))
+
+    return solve
+
+
+def compare(
+    setup: CameraSetup, solvers: dict[str, Solve | None], frames: list[tuple[NDArray, Rotation]]
+) -> dict[str, dict[str, float]]:
+    """Run all solvers frame by frame: percent solved and wrong, ms, and errors across the boresight in arcseconds."""
     available = {name: solve for name, solve in solvers.items() if solve is not None}
     ms: dict[str, list[float]] = {name: [] for name in available}
     errors: dict[str, list[NDArray]] = {name: [] for name in available}
@@ -163,22 +184,20 @@ def compare(setup: CameraSetup, solvers: dict[str, Solve | None], frames: list[t
             ms[name].append(1e3 * (time.perf_counter() - begin))
             if attitude is not None:
                 errors[name].append((attitude * truth.inv()).as_rotvec())
+    out = {}
     for name in available:
         error = np.array(errors[name]).reshape(-1, 3)
         right = np.linalg.norm(error, axis=1) < WRONG_RAD
-        cross = np.hypot(error[right, 0], error[right, 1]) / ARCSEC_RAD
+        cross = np.hypot(error[right, 0], error[right, 1]) / ARCSEC_RAD if right.any() else np.full(1, np.nan)
         solved, wrong = (100 * part.sum() / len(frames) for part in (right, ~right))
-        print(
-            f"{setup.name:28s} {name:14s} {solved:8.2f} {wrong:7.2f}"
-            f" {np.median(ms[name]):8.3f} {np.percentile(ms[name], 99):8.2f}"
-            f" {np.median(cross):8.2f} {np.sqrt(np.mean(cross**2)):8.2f}",
-            flush=True,
-        )
+        middle, late = np.percentile(ms[name], [50, 99])
+        rms = np.sqrt(np.mean(cross**2))
+        out[name] = {"solved": solved, "wrong": wrong, "ms": middle, "p99": late, "cross": np.median(cross), "rms": rms}
+    return out
 
 
-if __name__ == "__main__":
-    count, seed = (int(one) for one in (sys.argv[1:3] + ["300", "1"][len(sys.argv[1:3]) :]))
-    print(f'{"":28s} {"":14s} solved %  wrong %       ms   p99 ms   cross"    rms"')
+def scores(count: int, seed: int) -> Iterator[tuple[CameraSetup, dict[str, dict[str, float]]]]:
+    """Each set-up with the scores of its solvers."""
     stars = catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv")
     for setup in SETUPS:
         deep = catalog.brighter_than(stars, setup.deepest)
@@ -187,5 +206,32 @@ if __name__ == "__main__":
             "ours": ours(setup, deep),
             "tetra3rs fast": tetra3rs(setup, deep, True),
             "tetra3rs": tetra3rs(setup, deep, False),
+            "cedar": cedar(setup),
         }
-        compare(setup, solvers, frames)
+        yield setup, compare(setup, solvers, frames)
+
+
+def measure(count: int = 100, seed: int = 1) -> list[dict[str, Any]]:
+    """Frames solved, wrong answers, median time and error of ours beside the peer that solves most."""
+    rows = []
+    for setup, scored in scores(count, seed):
+        mine = scored.pop("ours")
+        best = max(scored, key=lambda name: scored[name]["solved"], default=None)
+        for key, unit, bar, least in (
+            ("solved", "%", 99.0, True),
+            ("wrong", "%", 0.0, False),
+            ("ms", "ms", np.inf, False),
+            ("cross", "arcsec", np.inf, False),
+        ):
+            row = verdict(f"{setup.name}: {key}", mine[key], unit, best or "-", bar, least)
+            rows.append(row | {"peer_value": scored[best][key] if best else None})
+    return rows
+
+
+if __name__ == "__main__":
+    count, seed = (int(one) for one in (sys.argv[1:3] + ["300", "1"][len(sys.argv[1:3]) :]))
+    print(f'{"":28s} {"":14s} solved %  wrong %       ms   p99 ms   cross"    rms"')
+    for setup, scored in scores(count, seed):
+        for name, found in scored.items():
+            numbers = "{solved:8.2f} {wrong:7.2f} {ms:8.3f} {p99:8.2f} {cross:8.2f} {rms:8.2f}".format(**found)
+            print(f"{setup.name:28s} {name:14s} {numbers}", flush=True)

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.catalog import spatial_grid
 from estimator.catalog.spatial_grid import cell_of
 from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
@@ -32,7 +33,7 @@ FACE_HALF_WIDTH = 1.2
 
 
 class SkyIndex(NamedTuple):
-    """Stars and pairs in bins. A named tuple, so that compiled code accepts it.
+    """Stars, and pairs of the brightest, in bins. A named tuple, so that compiled code accepts it.
 
     vectors : (N, 3) unit vectors, brightest star first
     pair    : (P, 2) rows of stars, in bins of the angle between them
@@ -40,6 +41,7 @@ class SkyIndex(NamedTuple):
     mag     : (N,) magnitudes, increasing;  share : their density per magnitude, from mag[0] in steps of MAG_STEP
     cell_first, cell_star : the stars of cell c are cell_star[cell_first[c] : cell_first[c + 1]]; each face of the
         cube has side x side cells
+    cells   : the stars in the cells of `spatial_grid`, for wide searches
     """
 
     vectors: Floats
@@ -51,20 +53,21 @@ class SkyIndex(NamedTuple):
     cell_first: NDArray[np.int32]
     cell_star: NDArray[np.int32]
     side: int
+    cells: spatial_grid.Cells
 
     @property
     def bytes(self) -> int:
         """Memory of the arrays, bytes."""
-        return sum(array.nbytes for array in self if isinstance(array, np.ndarray))
+        return sum(array.nbytes for array in (*self, *self.cells) if isinstance(array, np.ndarray))
 
 
-def build(vectors: Floats, mag: Floats, max_angle_rad: float) -> SkyIndex:
+def build(vectors: Floats, mag: Floats, max_angle_rad: float, paired: int | None = None) -> SkyIndex:
     """Build the index of (N, 3) unit vectors, brightest first, with all pairs up to an angle.
 
-    Raises ImageError for fewer than 3 pairs.
+    paired : number of brightest stars that form pairs; None: all. Raises ImageError for fewer than 3 pairs.
     """
     sky = build_without_pairs(vectors, mag)
-    vectors = sky.vectors
+    vectors = sky.vectors[:paired]
     max_angle_rad = min(max_angle_rad, np.pi)
     by_z = np.argsort(vectors[:, 2])
     sorted_xyz = np.ascontiguousarray(vectors[by_z].T)
@@ -91,7 +94,8 @@ def build_without_pairs(vectors: Floats, mag: Floats) -> SkyIndex:
     vectors, mag = np.ascontiguousarray(vectors, dtype=float), np.ascontiguousarray(mag, dtype=float)
     side = max(int(np.sqrt(len(vectors) / STARS_PER_CELL / 6)), 1)
     empty_pairs = np.empty((0, 2), np.int32), np.zeros(2, np.int32), np.pi
-    return SkyIndex(vectors, *empty_pairs, mag, _magnitude_density(mag), *_cells(vectors, side), side)
+    faces, cells = _cells(vectors, side), spatial_grid.build(vectors)
+    return SkyIndex(vectors, *empty_pairs, mag, _magnitude_density(mag), *faces, side, cells)
 
 
 def _magnitude_density(mag: Floats) -> Floats:

@@ -46,7 +46,7 @@ def _sorted(vectors: Floats, side: int) -> tuple[NDArray, NDArray]:
     row, cell = np.empty(len(vectors), np.int32), np.empty(len(vectors), np.int64)
     for n in range(len(vectors)):
         x, y, z = vectors[n]
-        cell[n] = (_edge_cell(x, side) * side + _edge_cell(y, side)) * side + _edge_cell(z, side)
+        cell[n] = (edge_cell(x, side) * side + edge_cell(y, side)) * side + edge_cell(z, side)
         first[cell[n] + 1] += 1
     for c in range(side**3):
         first[c + 1] += first[c]
@@ -69,7 +69,7 @@ def cell_of(position: float, last: int) -> int:
 
 
 @jit
-def _edge_cell(x: float, side: int) -> int:
+def edge_cell(x: float, side: int) -> int:
     """Return the cell along an edge that holds a coordinate in [-1, 1]."""
     return cell_of((x + 1) / 2 * side, side - 1)
 
@@ -78,11 +78,11 @@ def _edge_cell(x: float, side: int) -> int:
 def within(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float, out: NDArray) -> int:
     """Count the stars within a straight-line distance `chord` of (x, y, z); writes the first len(out) rows to `out`."""
     count, side = 0, cells.side
-    for i in range(_edge_cell(x - chord, side), _edge_cell(x + chord, side) + 1):
-        for j in range(_edge_cell(y - chord, side), _edge_cell(y + chord, side) + 1):
+    for i in range(edge_cell(x - chord, side), edge_cell(x + chord, side) + 1):
+        for j in range(edge_cell(y - chord, side), edge_cell(y + chord, side) + 1):
             low = (i * side + j) * side
-            begin = cells.first[low + _edge_cell(z - chord, side)]
-            end = cells.first[low + _edge_cell(z + chord, side) + 1]
+            begin = cells.first[low + edge_cell(z - chord, side)]
+            end = cells.first[low + edge_cell(z + chord, side) + 1]
             for entry in range(begin, end):
                 s = cells.row[entry]
                 dx, dy, dz = vectors[s, 0] - x, vectors[s, 1] - y, vectors[s, 2] - z
@@ -97,11 +97,11 @@ def within(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: f
 def nearest(cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float) -> int:
     """Return the row of the star nearest to (x, y, z) within a straight-line distance `chord`; -1 if there is none."""
     best, least2, side = -1, chord * chord, cells.side
-    for i in range(_edge_cell(x - chord, side), _edge_cell(x + chord, side) + 1):
-        for j in range(_edge_cell(y - chord, side), _edge_cell(y + chord, side) + 1):
+    for i in range(edge_cell(x - chord, side), edge_cell(x + chord, side) + 1):
+        for j in range(edge_cell(y - chord, side), edge_cell(y + chord, side) + 1):
             low = (i * side + j) * side
-            begin = cells.first[low + _edge_cell(z - chord, side)]
-            end = cells.first[low + _edge_cell(z + chord, side) + 1]
+            begin = cells.first[low + edge_cell(z - chord, side)]
+            end = cells.first[low + edge_cell(z + chord, side) + 1]
             for entry in range(begin, end):
                 s = cells.row[entry]
                 dx, dy, dz = vectors[s, 0] - x, vectors[s, 1] - y, vectors[s, 2] - z

@@ -174,18 +174,6 @@ class Centroids:
         taken = (None if array is None else array[which] for array in optional)
         return Centroids(self.xy_px[which], self.sigma_px[which], self.flux[which], *taken)
 
-    def weights_per_px2(self, sigma_px: Floats) -> Floats:
-        """Return (N, 3) xx, yy, xy of the inverse covariances for total errors sigma_px (N,).
-
-        The excess of sigma_px over the centroids' own sigma is added to the covariance as isotropic variance.
-        """
-        isotropic = 1 / sigma_px**2
-        if self.covariance_px2 is None:
-            return np.stack([isotropic, isotropic, 0 * isotropic], axis=1)
-        excess = sigma_px**2 - self.sigma_px**2
-        xx, yy, xy = (self.covariance_px2[:, i, j] + excess * (i == j) for i, j in ((0, 0), (1, 1), (0, 1)))
-        return np.stack([yy, xx, -xy], axis=1) / (xx * yy - xy**2)[:, None]
-
 
 NO_SPREAD = np.empty((0, 2, 2))
 MAX_SIGMA_PX = 20.0  # with less accurate lights every star is a candidate for each: a search would take minutes

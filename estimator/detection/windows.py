@@ -56,6 +56,7 @@ def _brightest(
 ) -> tuple[Ints, Floats, int]:
     """Return boxes (N, 4), sums (N, 5: area, flux, flux x, flux y, peak) and the number of blobs."""
     height, width = image.shape
+    darkest, least = level.min(), max(noise.min(), 1e-12)  # bounds of the interpolated sky: most pixels need no more
     boxes, sums, count = np.empty((len(center_px), 4), np.int64), np.zeros((len(center_px), 5)), 0
     for n in range(len(center_px)):
         x0, x1 = _span(center_px[n, 0], half_px, width)
@@ -63,8 +64,11 @@ def _brightest(
         best, at_x, at_y = threshold_sigma, -1, -1
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
-                spread = interpolate(noise, height, width, y, x)
-                above = (filtered(image, y, x) - interpolate(level, height, width, y, x)) / max(spread, 1e-12)
+                light = filtered(image, y, x)
+                if light - darkest <= best * least:
+                    continue
+                spread = max(interpolate(noise, height, width, y, x), 1e-12)
+                above = (light - interpolate(level, height, width, y, x)) / spread
                 if above > best:
                     best, at_x, at_y = above, x, y
         # A peak inside the box of an earlier blob is taken to be that blob.

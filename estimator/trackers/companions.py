@@ -18,7 +18,8 @@ from estimator.catalog.sky_index import SkyIndex
 from estimator.core.arrays import Floats
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.stars import evidence
-from estimator.identification.stars.evidence import Detections, Solution
+from estimator.identification.stars.detections import Detections
+from estimator.identification.stars.evidence import Solution
 
 ARCSEC_RAD = np.pi / 180 / 3600
 # Of the entries of Hipparcos to V = 5.75: their distances from the center of light of Gaia's stars within 40".
@@ -29,12 +30,17 @@ ROUNDS = 4
 CHANGED = 0.9  # share of a star's information below which the field is fitted again
 
 
+def are_small(sigma_rad: Floats) -> bool:
+    """Whether the errors of all centroids are greater than those of any companion, so that none can show."""
+    return bool(sigma_rad.min(initial=np.inf) > ERROR_RAD.max())
+
+
 def with_companions(solution: Solution, detections: Detections, sky: SkyIndex) -> tuple[Solution, Detections]:
     """The solution and its detections, with the errors of the stars whose residuals tell of a companion.
 
     Unchanged where every centroid's own error is greater than any companion's.
     """
-    if len(solution.star) < MIN_STARS or detections.sigma.min() > ERROR_RAD.max():
+    if len(solution.star) < MIN_STARS or are_small(detections.sigma):
         return solution, detections
     best, changed = solution, detections
     for _ in range(ROUNDS):

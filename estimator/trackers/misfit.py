@@ -10,21 +10,23 @@ residuals still exceed multiplies the covariance (`least_squares.variance_factor
 from __future__ import annotations
 
 from dataclasses import replace
-from math import log10, sqrt
+from math import log, log10, sqrt
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.systematic import geometry
+from estimator.attitude.wahba import matrix_of
 from estimator.catalog.sky_index import SkyIndex
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.jit import jit
 from estimator.core.least_squares import PRIOR_RIGHT, variance_factor
 from estimator.identification.chance import GATE_SIGMA
-from estimator.identification.stars import evidence
-from estimator.identification.stars.evidence import Detections, Solution
+from estimator.identification.stars import evidence, search
+from estimator.identification.stars.detections import Detections, FlatCentroids, Sensor, changed, detections_of
+from estimator.identification.stars.evidence import Solution
 
 TELLING = 1.5  # variance factor above which matches and lens are tried anew
 DOUBTFUL = 0.7  # reduced chi-square above which greater errors are tried, also where every centroid is matched
@@ -51,32 +53,48 @@ def widened(
     prior of `least_squares.variance_factor`, are their weights. The covariance is multiplied by the factor.
     detections : with the errors of the model, and the focal uncertainty with which the solution was found
     """
+    gates = 1.5 * GATE_SIGMA * sqrt(TRIED[-1]) * detections.sigma
+    ratio = solution.focal_ratio
+    if evidence.count_near(detections.tangent, sky, R_cam_from_ref, ratio, solution.observed, gates) == 0:
+        return _scaled(solution, 4 if detections.focal_uncertainty > 0 else 3)
     best, best_dex, dex = solution, solution.dex, np.empty(len(TRIED))
     dex[0] = solution.dex
     for n in range(1, len(TRIED)):
-        wide = Detections(
-            detections.tangent,
-            detections.sigma * sqrt(TRIED[n]),
-            detections.weight / TRIED[n],
-            detections.mag,
-            detections.mag_sigma,
-            detections.field,
-            detections.focal_uncertainty,
-        )
+        wide = changed(detections, len(detections.sigma), TRIED[n], detections.focal_uncertainty)
         gates = 1.5 * GATE_SIGMA * wide.sigma
-        found = evidence.evaluate(wide, sky, R_cam_from_ref.copy(), solution.focal_ratio, gates, -np.inf)
+        found = evidence.evaluate(wide, sky, R_cam_from_ref.copy(), ratio, gates, -np.inf)
         dex[n] = found.dex + PRIOR_WRONG_DEX
         if dex[n] > best_dex:
             best, best_dex = evidence.build_solution(wide, sky, found), dex[n]
     weight = 10 ** (dex - best_dex)
     variance = np.sum(weight * TRIED) / np.sum(weight)
     covariance = best.covariance_rad2 * (variance / TRIED[np.argmax(dex)])
-    return with_covariance(best, covariance), variance
+    return with_errors(best, covariance, best.chi2, best.dex), variance
 
 
 @jit
-def with_covariance(solution: Solution, covariance_rad2: Floats) -> Solution:
-    """The solution with another covariance."""
+def _scaled(solution: Solution, parameters: int) -> tuple[Solution, float]:
+    """As `widened`, where no factor changes the matches.
+
+    With n matches, p parameters and the variances times v, chi-square is divided by v, the density of each match by v,
+    and the posterior's volume is multiplied by v^(p/2).
+    """
+    count, dex = len(solution.star), np.empty(len(TRIED))
+    chi2 = solution.chi2 * max(2 * count - parameters, 1)
+    for n in range(len(TRIED)):
+        gain_dex = chi2 / 2 / log(10.0) * (1 - 1 / TRIED[n]) + (parameters / 2 - count) * log10(TRIED[n])
+        dex[n] = solution.dex + gain_dex + (PRIOR_WRONG_DEX if n else 0.0)
+    best = np.argmax(dex)
+    weight = 10 ** (dex - dex[best])
+    variance = np.sum(weight * TRIED) / np.sum(weight)
+    best_dex = dex[best] - (PRIOR_WRONG_DEX if best else 0.0)
+    likely = with_errors(solution, variance * solution.covariance_rad2, solution.chi2 / TRIED[best], best_dex)
+    return likely, variance
+
+
+@jit
+def with_errors(solution: Solution, covariance_rad2: Floats, chi2: float, dex: float) -> Solution:
+    """The solution with another covariance, chi-square and evidence."""
     return Solution(
         solution.observed,
         solution.star,
@@ -84,9 +102,37 @@ def with_covariance(solution: Solution, covariance_rad2: Floats) -> Solution:
         covariance_rad2,
         solution.focal_ratio,
         solution.rms,
-        solution.chi2,
-        solution.dex,
+        chi2,
+        dex,
     )
+
+
+@jit
+def identify(
+    lights: FlatCentroids, sensor: Sensor, stars: SkyIndex, max_detections: int, max_checks: int
+) -> tuple[Solution, float]:
+    """Search centroids of a calibrated camera by pairs, and match and scale anew where the residuals are doubtful.
+
+    Returns the solution of `search.lost_in_space`, and the factor of the variances: that of `widened`, 1 without doubt.
+    It is 0 where the residuals are so great that the calibration may be wrong: the solution is then as it was found.
+    """
+    detections = detections_of(lights, sensor, 0.0)
+    solution = search.lost_in_space(detections, stars, max_detections, max_checks)
+    if residuals_too_great(solution) or solution.focal_ratio != 1:
+        return solution, 0.0
+    if not len(solution.star):
+        return solution, 1.0
+    # A few stars may fit by luck within gates that are too narrow for the others.
+    if len(solution.star) == len(detections.sigma) and solution.chi2 < DOUBTFUL:
+        return solution, 1.0
+    x, y, z, w = solution.cam_from_ref_xyzw
+    return widened(solution, matrix_of((x, y, z, w)), detections, stars)
+
+
+@jit
+def residuals_too_great(solution: Solution) -> bool:
+    """Whether the residuals of a solution exceed their errors by more than three standard deviations of chi-square."""
+    return solution.chi2 > 1 + 3 / sqrt(max(len(solution.star), 1))
 
 
 class Refit(NamedTuple):
@@ -104,15 +150,23 @@ class Refit(NamedTuple):
 
 
 def refit(
-    solution: Solution, detections: Detections, sky: SkyIndex, camera: Camera, xy_px: Floats, fit_lens: bool
+    solution: Solution,
+    detections: Detections,
+    sky: SkyIndex,
+    camera: Camera,
+    xy_px: Floats,
+    fit_lens: bool,
+    variance: float = 0.0,
 ) -> Refit:
     """The solution matched, fitted and scaled anew by its residuals.
 
     detections : with the errors of the model, and the focal uncertainty with which the solution was found
     camera     : of the solution;  xy_px : (N, 2) centroids
+    variance   : factor of the variances if the solution has been matched anew (`widened`); else 0
     """
-    R_cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw).as_matrix()
-    solution, variance = widened(solution, R_cam_from_ref, detections, sky)
+    if not variance:
+        R_cam_from_ref = matrix_of(tuple(solution.cam_from_ref_xyzw.tolist()))
+        solution, variance = widened(solution, R_cam_from_ref, detections, sky)
     if fit_lens and variance >= TELLING and len(solution.star) >= LENS_MATCHES:
         return with_lens(solution, detections, sky, camera, xy_px, variance)
     return Refit(solution, camera, variance)

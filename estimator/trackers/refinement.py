@@ -173,10 +173,10 @@ class FieldMatcher:
     def near_misses(self, solution: Solution, centroids: Centroids) -> tuple[int, float]:
         """Number of unmatched detections beside a star, and how many are expected by chance."""
         gate_rad = min(self.lens_radii_px[0] / self.camera.focal_px, 0.05)
-        tangent = self.camera.tangents(np.delete(centroids.xy_px, solution.observed, axis=0))
+        tangent, gates = self.camera.tangents(centroids.xy_px), np.full(len(centroids), gate_rad)
         R = Rotation.from_quat(solution.cam_from_ref_xyzw).as_matrix()
-        near = evidence.count_near(tangent, self.sky, R, solution.focal_ratio, gate_rad)
-        return near, len(tangent) * min(len(self.stars) * gate_rad**2 / 4, 1.0)
+        near = evidence.count_near(tangent, self.sky, R, solution.focal_ratio, solution.observed, gates)
+        return near, (len(centroids) - len(solution.star)) * min(len(self.stars) * gate_rad**2 / 4, 1.0)
 
 
 def log10_chance(

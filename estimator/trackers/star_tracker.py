@@ -28,12 +28,13 @@ from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
 from estimator.core.least_squares import variance_factor
-from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
+from estimator.core.types import NO_SPREAD, Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification.chance import (
     MIN_EVIDENCE_MATCHES,
 )
 from estimator.identification.stars import quads, search
-from estimator.identification.stars.evidence import Detections, Solution
+from estimator.identification.stars.detections import Detections, FlatCentroids, Sensor, detections_of
+from estimator.identification.stars.evidence import Solution
 from estimator.trackers import companions, misfit, warm_up
 from estimator.trackers.misfit import Refit
 from estimator.trackers.pipeline import Clock, Report, Settings, brightest, check_algorithms, process_frame
@@ -121,24 +122,25 @@ class StarTracker:
         longest_rad = 1.02 * camera.zoomed(1 - focal_uncertainty).diagonal_rad
         if all(model.by_quads for model in self.searches):
             longest_rad = quad_index.LONGEST * self._height_rad
-        self.sky = sky_index.build_without_pairs(self.stars.vectors, self.stars.v_mag)
-        self.patterns: sky_index.SkyIndex | None = None
         self.index: pair_index.PairIndex | None = None
         if settings.identifier == "default":
-            self.patterns = sky_index.build(index_stars.vectors, index_stars.v_mag, longest_rad)
-            self.pairs = len(self.patterns.pair)
+            self.sky = sky_index.build(self.stars.vectors, self.stars.v_mag, longest_rad, len(index_stars))
+            self.pairs = len(self.sky.pair)
         else:
+            self.sky = sky_index.build_without_pairs(self.stars.vectors, self.stars.v_mag)
             self.index = pair_index.build(index_stars.vectors, longest_rad)
             self.pairs = len(self.index.pair)
         self.field_matcher = FieldMatcher(camera, self.stars, self.sky, settings, focal_uncertainty, self.pairs)
         corners = camera.tangents(CORNERS * [camera.width_px, camera.height_px] - 0.5)
         self.field = np.array([corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max()])
+        zero_point_mag = np.nan if settings.zero_point_mag is None else settings.zero_point_mag
+        lens = camera.focal_px, camera.center_px, camera.distortion
+        self.sensor = Sensor(*lens, self.field, zero_point_mag, settings.magnitude_sigma)
 
     @functools.cached_property
     def quads(self) -> quad_index.QuadIndex:
-        """The quads of the pattern index, built when they are first needed."""
-        assert self.patterns is not None
-        return quad_index.build(self.patterns, self._height_rad)
+        """The quads of the stars that form pairs, built when they are first needed."""
+        return quad_index.build(self.sky, self._height_rad)
 
     @property
     def _height_rad(self) -> float:
@@ -218,7 +220,7 @@ class StarTracker:
     @property
     def efforts(self) -> int:
         """Number of searches, with different error models and efforts, that are made before a frame is given up."""
-        return len(self.searches) if self.patterns is not None else 1
+        return len(self.searches) if self.index is None else 1
 
     def solve_centroids(
         self,
@@ -254,9 +256,9 @@ class StarTracker:
 
     def _solve_global(self, centroids: Centroids, clock: Clock, effort: int | None) -> Attitude:
         """Identify and solve centroids of one time."""
-        if self.patterns is not None:
+        if self.index is None:
             searches = self.searches if effort is None else self.searches[effort : effort + 1]
-            return self._identify_by_evidence(centroids, self.patterns, searches, clock)
+            return self._identify_by_evidence(centroids, searches, clock)
         for camera, cam_from_ref in self._candidates(centroids):
             clock.lap("identify")
             attitude = self.field_matcher.refine(centroids, camera, cam_from_ref)
@@ -309,27 +311,11 @@ class StarTracker:
 
         sigma_px : (N,) total errors;  focal_uncertainty : relative, if it is greater than that of the tracker
         """
-        settings = self.settings
-        mag = np.full(len(centroids), np.nan)
-        if settings.zero_point_mag is not None:
-            mag = settings.zero_point_mag - 2.5 * np.log10(centroids.flux)
-        weight = centroids.weights_per_px2(sigma_px) * self.camera.focal_px**2
-        xx, yy, xy = weight.T
-        # The smaller eigenvalue of the inverse covariance belongs to the axis of the greatest error.
-        return Detections(
-            self.camera.tangents(centroids.xy_px),
-            1 / np.sqrt((xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)),
-            weight,
-            mag,
-            settings.magnitude_sigma,
-            self.field,
-            max(self.focal_uncertainty, focal_uncertainty),
-        )
+        return detections_of(_lights(centroids, sigma_px), self.sensor, max(self.focal_uncertainty, focal_uncertainty))
 
     def _identify_by_evidence(
         self,
         centroids: Centroids,
-        patterns: sky_index.SkyIndex,
         searches: tuple[SearchModel, ...],
         clock: Clock,
     ) -> Attitude:
@@ -341,15 +327,16 @@ class StarTracker:
         """
         for model in searches:
             sigma_px = self.sigma_px(centroids, model.min_error_px, model.relative_error)
-            solution = self._search(centroids, sigma_px, patterns, model)
-            if not (self.focal_uncertainty or model.by_quads) and _residuals_too_great(solution):
+            solution, variance = self._search(centroids, sigma_px, model)
+            calibrated = not (self.focal_uncertainty or model.by_quads)
+            if calibrated and not variance and misfit.residuals_too_great(solution):
                 # Of a camera with a wrong focal length a part of the stars may match, at a wrong attitude.
-                other = self._search(centroids, sigma_px, patterns, WRONG_FOCAL_SEARCH)
+                other, _ = self._search(centroids, sigma_px, WRONG_FOCAL_SEARCH)
                 solution = other if other.dex > solution.dex + search.WRONG_FOCAL_DEX else solution
             clock.lap("identify")
             if not len(solution.star):
                 continue
-            refitted = self.refit(centroids, solution, sigma_px)
+            refitted = self.refit(centroids, solution, sigma_px, variance)
             partial = not self.focal_uncertainty and self.field_matcher.misfits(refitted.solution, centroids)
             if partial or refitted.sheared:
                 continue
@@ -368,49 +355,57 @@ class StarTracker:
                 return attitude
         return Attitude(NO_MATCH)
 
-    def _search(
-        self, centroids: Centroids, sigma_px: Floats, patterns: sky_index.SkyIndex, model: SearchModel
-    ) -> Solution:
-        """One search of the default identifier."""
-        detections, most = self.detections(centroids, sigma_px, model.focal_uncertainty), self.settings.searched_stars
+    def _search(self, centroids: Centroids, sigma_px: Floats, model: SearchModel) -> tuple[Solution, float]:
+        """One search of the default identifier, and the factor of the variances if it is known, else 0."""
+        most = self.settings.searched_stars
+        at_once = not (model.by_quads or self.focal_uncertainty or self.camera.row_time_s)
+        if at_once and companions.are_small(sigma_px / self.camera.focal_px):
+            lights = _lights(centroids, sigma_px)
+            return misfit.identify(lights, self.sensor, self.sky, most, model.max_checks)
+        detections = self.detections(centroids, sigma_px, model.focal_uncertainty)
         if not model.by_quads:
-            return search.lost_in_space(detections, patterns, self.sky, most, model.max_checks)
+            return search.lost_in_space(detections, self.sky, most, model.max_checks), 0.0
         known = not self.focal_uncertainty
-        return quads.identify(detections, self.quads, patterns, self.sky, most, model.max_checks, known)
+        return quads.identify(detections, self.quads, self.sky, most, model.max_checks, known), 0.0
 
-    def refit(self, centroids: Centroids, solution: Solution, sigma_px: Floats) -> Refit:
-        """A solution with the errors and, of a calibrated global shutter, the lens that its residuals tell."""
+    def refit(self, centroids: Centroids, solution: Solution, sigma_px: Floats, variance: float = 0.0) -> Refit:
+        """A solution with the errors and, of a calibrated global shutter, the lens that its residuals tell.
+
+        variance : factor of the variances if the solution has been matched anew already; else 0
+        """
         camera = self.camera if solution.focal_ratio == 1 else self.camera.zoomed(solution.focal_ratio)
-        if not len(solution.star):
-            return Refit(solution, camera, 1.0)
+        if not len(solution.star) or 0 < variance < misfit.TELLING:
+            return Refit(solution, camera, variance or 1.0)
         detections = self.detections(centroids, sigma_px, 0.0 if solution.focal_ratio == 1 else search.WRONG_FOCAL)
-        solution, detections = companions.with_companions(solution, detections, self.sky)
-        # A few stars may fit by luck within gates that are too narrow for the others.
-        if len(solution.star) == len(centroids) and solution.chi2 < misfit.DOUBTFUL:
-            return Refit(solution, camera, 1.0)
+        if not variance:
+            solution, detections = companions.with_companions(solution, detections, self.sky)
+            # A few stars may fit by luck within gates that are too narrow for the others.
+            if len(solution.star) == len(centroids) and solution.chi2 < misfit.DOUBTFUL:
+                return Refit(solution, camera, 1.0)
         if self.focal_uncertainty or self.camera.row_time_s:
             # The lens or the rate is fitted afterwards: matches beyond the gate belong to it.
             dof = max(2 * len(solution.star) - 4, 1)
             variance = variance_factor(dof * solution.chi2, dof)
             return Refit(solution._replace(covariance_rad2=variance * solution.covariance_rad2), camera, variance)
-        return misfit.refit(solution, detections, self.sky, camera, centroids.xy_px, not self.camera.focal_sigma)
+        fit_lens = not self.camera.focal_sigma
+        return misfit.refit(solution, detections, self.sky, camera, centroids.xy_px, fit_lens, variance)
 
     def attitude_of(self, centroids: Centroids, refitted: Refit, sigma_px: Floats) -> Attitude:
         """The attitude of a solution; solved again from its matches if the settings name another solver."""
         solution, camera, variance, _ = refitted
         cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
-        covariance_rad2 = solution.covariance_rad2
-        sigma_rad = np.sqrt(variance) * sigma_px[solution.observed] / camera.focal_px
-        solver = self.settings.solver
-        if solver != "default":
-            rays, vectors = camera.rays(centroids.xy_px[solution.observed]), self.stars.vectors[solution.star]
-            cam_from_ref = SOLVERS[solver](rays, vectors, sigma_rad)
-            covariance_rad2 = covariance(rays, sigma_rad, solver)
+        covariance_rad2, common_rad2, solver = solution.covariance_rad2, None, self.settings.solver
+        if solver != "default" or camera.focal_sigma:
+            xy_px, vectors = centroids.xy_px[solution.observed], self.stars.vectors[solution.star]
+            sigma_rad = np.sqrt(variance) * sigma_px[solution.observed] / camera.focal_px
+            if solver != "default":
+                rays = camera.rays(xy_px)
+                cam_from_ref = SOLVERS[solver](rays, vectors, sigma_rad)
+                covariance_rad2 = covariance(rays, sigma_rad, solver)
+            seen_cam = cam_from_ref.apply(vectors)
+            covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, camera, xy_px, seen_cam, sigma_rad)
         match = StarMatch(solution.observed, solution.star, cam_from_ref, -solution.dex)
         rms_px = solution.rms * self.camera.focal_px
-        seen_cam = cam_from_ref.apply(self.stars.vectors[solution.star])
-        xy_px = centroids.xy_px[solution.observed]
-        covariance_rad2, common_rad2 = with_focal_error(covariance_rad2, camera, xy_px, seen_cam, sigma_rad)
         return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2)
 
     def _candidates(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
@@ -442,9 +437,10 @@ class StarTracker:
                     yield camera, match.cam_from_ref
 
 
-def _residuals_too_great(solution: Solution) -> bool:
-    """Whether the residuals of a solution exceed their errors by more than three standard deviations of chi-square."""
-    return bool(solution.chi2 > 1 + 3 / np.sqrt(max(len(solution.star), 1)))
+def _lights(centroids: Centroids, sigma_px: Floats) -> FlatCentroids:
+    """Centroids as compiled code takes them, with their total errors (N,)."""
+    spread_px2 = NO_SPREAD if centroids.covariance_px2 is None else centroids.covariance_px2
+    return FlatCentroids(centroids.xy_px, centroids.sigma_px, centroids.flux, spread_px2, sigma_px)
 
 
 def _published() -> Mapping[str, Callable[..., StarMatch | None]]:

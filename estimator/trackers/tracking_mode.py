@@ -203,9 +203,11 @@ class TrackingMode:
         if hypothesis.dex + prior_gain_dex < ACCEPT_DEX:
             return None
         solution = evidence.build_solution(detections, tracker.sky, hypothesis)
-        refitted = tracker.refit(centroids, solution._replace(dex=hypothesis.dex + prior_gain_dex), sigma_px)
+        refitted = tracker.refit(centroids, solution, sigma_px)
         if refitted.sheared:
             return None
+        found = refitted.solution
+        refitted = refitted._replace(solution=found._replace(dex=found.dex + prior_gain_dex))
         attitude = tracker.attitude_of(centroids, refitted, sigma_px)
         clock.lap("solve")
         return self._report(attitude, centroids, sigma_px, clock, len(window_centers_px), saturated, streak_px)

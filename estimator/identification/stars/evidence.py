@@ -21,11 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.catalog.sky_index import MAG_SMOOTHING, MAG_STEP, SkyIndex, nearest
-from estimator.catalog.spatial_grid import cell_of
+from estimator.catalog.spatial_grid import cell_of, edge_cell
 from estimator.core import least_squares, vectors
 from estimator.core.arrays import Floats
 from estimator.core.jit import jit
+from estimator.core.least_squares import CONVERGED_CHI2
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES, counts_dex
+from estimator.identification.stars.detections import Detections, field_area, ray
 
 # Fraction of stars whose magnitude disagrees with the catalog: variable stars, doubles, an unusual passband.
 MAG_OUTLIER_FRACTION = 0.05
@@ -33,26 +35,6 @@ MAG_OUTLIER_FRACTION = 0.05
 UNMATCHED_PENALTY_DEX = 0.5
 # Fraction of the field in which an unmatched source counts as missing; the border may cut it off.
 INNER_FRACTION = 0.97
-
-
-class Detections(NamedTuple):
-    """The detections of one frame. A named tuple, because numba can compile functions that take one.
-
-    tangent : (N, 2) x / z and y / z in camera axes, brightest first
-    sigma   : (N,) standard deviation of a tangent along the major axis of its error ellipse
-    weight  : (N, 3) inverse covariance of the tangents: xx, yy, xy
-    mag     : (N,) magnitudes on the catalog's scale, NaN if unknown;  mag_sigma : their standard deviation
-    field   : (4,) tangents left, right, top, bottom of the sensor's edges
-    focal_uncertainty : relative uncertainty of the focal length; 0 for a calibrated camera
-    """
-
-    tangent: Floats
-    sigma: Floats
-    weight: Floats
-    mag: Floats
-    mag_sigma: float
-    field: Floats
-    focal_uncertainty: float
 
 
 class Hypothesis(NamedTuple):
@@ -105,23 +87,10 @@ def magnitude_density(sky: SkyIndex, mag: float) -> float:
 
 
 @jit
-def ray(tangent: Floats, n: int, focal_ratio: float) -> vectors.Vector:
-    """Unit vector of detection n in camera axes, for a focal length `focal_ratio` times the assumed one."""
-    x, y = tangent[n, 0] / focal_ratio, tangent[n, 1] / focal_ratio
-    inverse = 1 / sqrt(x * x + y * y + 1)
-    return x * inverse, y * inverse, inverse
-
-
-@jit
 def prior_volume_dex(detections: Detections) -> float:
     """log10 of the prior volume: 8 pi^2 of attitudes times the width of the interval of log focal_ratio."""
     width = 2 * detections.focal_uncertainty
     return log10(8 * pi * pi) + (log10(width) if width > 0 else 0.0)
-
-
-@jit
-def field_area(detections: Detections) -> float:
-    return (detections.field[1] - detections.field[0]) * (detections.field[3] - detections.field[2])
 
 
 @jit
@@ -139,24 +108,31 @@ def evaluate(
     R_cam_from_ref is changed in place by the fit. Returns the empty hypothesis if fewer than
     MIN_EVIDENCE_MATCHES stars match, the focal ratio leaves its interval, or the evidence is below min_dex. The last
     test is made early with an upper bound of the evidence (exact matches, no missing star), which rejects most false
-    candidates before the full evaluation.
+    candidates before the full evaluation. A fit that has converged is not
+    repeated, nor are its matches.
     """
     R, info = R_cam_from_ref, np.zeros((4, 4))
-    max_sigma = np.inf
+    max_sigma, fall = np.inf, np.inf
+    observed, star = np.empty(0, np.int64), np.empty(0, np.int64)
     for iteration in range(3):
+        before = observed, star
         observed, star = _match(detections, sky, R, focal_ratio, gates, max_sigma)
         gates, max_sigma = GATE_SIGMA * detections.sigma, GATE_SIGMA
         if len(observed) < MIN_EVIDENCE_MATCHES:
             return no_hypothesis()
-        if iteration == 1:
+        if iteration == 1 and min_dex > -np.inf:
             # `info` is that of the first fit; without the residuals the evidence is an upper bound.
             upper_bound_dex = _evidence(detections, sky, R, focal_ratio, observed, star, info, False)
             if upper_bound_dex + counts_dex(len(observed), 0) < min_dex:
                 return no_hypothesis()
+        if fall < CONVERGED_CHI2 and np.array_equal(observed, before[0]) and np.array_equal(star, before[1]):
+            break
         if iteration < 2:
-            focal_ratio = _fit(detections, sky, R, focal_ratio, observed, star, info)
+            focal_ratio, fall = _fit(detections, sky, R, focal_ratio, observed, star, info)
             if abs(focal_ratio - 1) > 1.2 * detections.focal_uncertainty + 1e-12:
                 return no_hypothesis()
+            if iteration == 1 and fall < CONVERGED_CHI2:
+                break
     dex, matched = _evidence(detections, sky, R, focal_ratio, observed, star, info, True), len(observed)
     if dex + counts_dex(matched, 0) < min_dex:
         return no_hypothesis()
@@ -197,13 +173,29 @@ def _match(
 
 
 @jit
-def count_near(tangent: Floats, sky: SkyIndex, R_cam_from_ref: Floats, focal_ratio: float, gate_rad: float) -> int:
-    """Number of detections with a star within a gate."""
+def count_near(
+    tangent: Floats, sky: SkyIndex, R_cam_from_ref: Floats, focal_ratio: float, observed: NDArray, gates: Floats
+) -> int:
+    """Number of detections beside those `observed` that have a star within their gate (N,), at most 0.05 rad."""
     R_ref_from_cam, count = R_cam_from_ref.T.copy(), 0
-    for n in range(len(tangent)):
+    others = np.ones(len(gates), np.bool_)
+    others[observed] = False
+    for n in np.flatnonzero(others):
         x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
-        count += nearest(sky.vectors, sky.cell_first, sky.cell_star, sky.side, x, y, z, gate_rad)[0] >= 0
+        count += nearest(sky.vectors, sky.cell_first, sky.cell_star, sky.side, x, y, z, min(gates[n], 0.05))[0] >= 0
     return count
+
+
+@jit
+def focal_gain_dex(detections: Detections, sky: SkyIndex, hypothesis: Hypothesis) -> float:
+    """log10 of the Bayes factor of a free focal length over that of a hypothesis, with the same matches.
+
+    The fall of chi-square by a step of the fit, and the posterior width of log focal_ratio over its prior width.
+    """
+    info, R = np.zeros((4, 4)), hypothesis.R_cam_from_ref.copy()
+    _, fall = _fit(detections, sky, R, hypothesis.focal_ratio, hypothesis.observed, hypothesis.star, info)
+    cholesky_solve(info, np.zeros(4))
+    return fall / 2 / log(10.0) + log10(sqrt(2 * pi) / info[3, 3] / (2 * detections.focal_uncertainty))
 
 
 @jit
@@ -234,8 +226,10 @@ def _fit(
     observed: NDArray,
     star: NDArray,
     info: Floats,
-) -> float:
-    """One weighted Gauss-Newton step of the attitude R (in place) and of the focal ratio f (returned).
+) -> tuple[float, float]:
+    """One weighted Gauss-Newton step of the attitude R (in place) and of the focal ratio f.
+
+    Returns the new ratio and the fall of chi-square, which is the squared length of the step in standard deviations.
 
     With t = f (x, y) / z and a small rotation q <- q + w x q, the derivative of t_x with respect to w is
     f (-x y / z^2, 1 + x^2 / z^2, -y / z), that of t_y is f (-1 - y^2 / z^2, x y / z^2, x / z), and that of t with
@@ -263,7 +257,10 @@ def _fit(
         for j in range(i):
             info[j, i] = info[i, j]
     vectors.rotate_in_place(step[:3], R)
-    return f * np.exp(step[3]) if count == 4 else f
+    fall = 0.0
+    for i in range(count):
+        fall += gradient[i] * step[i]
+    return (f * np.exp(step[3]) if count == 4 else f), fall
 
 
 @jit
@@ -285,20 +282,34 @@ def cholesky_solve(a: Floats, b: Floats) -> Floats:
 @jit
 def _count_missing(detections: Detections, sky: SkyIndex, R: Floats, focal_ratio: float, star: NDArray) -> int:
     """Number of missing stars: brighter than the faintest matched star, well inside the field, and not matched."""
-    left, right, top, bottom = detections.field * (INNER_FRACTION / focal_ratio)
-    vectors_ref, inside = sky.vectors, 0
-    # Cosine of the angle from the boresight to the farthest corner: it rejects most stars with one dot product.
-    corner = 1 / sqrt(1 + max(left * left, right * right) + max(top * top, bottom * bottom))
-    for s in range(star.max() + 1):  # stars are sorted by brightness
-        x, y, z = vectors.row(vectors_ref, s)
-        if R[2, 0] * x + R[2, 1] * y + R[2, 2] * z > corner:
-            x, y, z = vectors.rotate(R, (x, y, z))
-            inside += left * z < x < right * z and top * z < y < bottom * z
+    field = detections.field * (INNER_FRACTION / focal_ratio)
+    left, right, top, bottom = field
     matched = 0
     for s in star:
-        x, y, _ = project(vectors_ref, R, s)
+        x, y, _ = project(sky.vectors, R, s)
         matched += left < x < right and top < y < bottom
-    return inside - matched
+    return _count_inside(sky, R, field, star.max()) - matched
+
+
+@jit
+def _count_inside(sky: SkyIndex, R: Floats, field: Floats, faintest: int) -> int:
+    """Number of stars inside a field (4,), up to a row: the stars are sorted by brightness."""
+    left, right, top, bottom = field
+    # Chord of the angle from the boresight to the farthest corner.
+    corner2 = max(left * left, right * right) + max(top * top, bottom * bottom)
+    chord, (bx, by, bz) = sqrt(2 - 2 / sqrt(1 + corner2)), vectors.row(R, 2)
+    side, first, row = sky.cells.side, sky.cells.first, sky.cells.row
+    vectors_ref, inside = sky.vectors, 0
+    low, high = edge_cell(bz - chord, side), edge_cell(bz + chord, side) + 1
+    for i in range(edge_cell(bx - chord, side), edge_cell(bx + chord, side) + 1):
+        for j in range(edge_cell(by - chord, side), edge_cell(by + chord, side) + 1):
+            column = (i * side + j) * side
+            for entry in range(first[column + low], first[column + high]):
+                if row[entry] > faintest:
+                    continue
+                x, y, z = vectors.rotate(R, vectors.row(vectors_ref, row[entry]))
+                inside += left * z < x < right * z and top * z < y < bottom * z
+    return inside
 
 
 @jit
@@ -315,9 +326,9 @@ def _evidence(
     """log10 of the Bayes factor of this attitude over detections at random positions, without the term `counts_dex`.
 
     Each match contributes N(residual) / rho, rho the density of detections on the sensor, and the ratio of
-    `_magnitude_dex`. The attitude and the focal ratio contribute sqrt(2 pi)^n / sqrt(det info) over their prior volume
-    (Laplace's approximation). Unmatched detections cost nothing as long as they are no more than the matches; each one
-    above that, among the detections brighter than the faintest match, costs UNMATCHED_PENALTY_DEX.
+    `_magnitude_ratio`. The attitude and the focal ratio contribute sqrt(2 pi)^n / sqrt(det info) over their prior
+    volume (Laplace's approximation). Unmatched detections cost nothing as long as they are no more than the matches;
+    each one above that, among the detections brighter than the faintest match, costs UNMATCHED_PENALTY_DEX.
     with_residuals : include the residuals; without them the result is an upper bound for these matches
     """
     count = 4 if detections.focal_uncertainty > 0 else 3
@@ -332,11 +343,11 @@ def _evidence(
         # ratio n! / (n - m)!: the density drops by one detection per match.
         density = (len(detections.sigma) - k) / field_area(detections)
         xx, yy, xy = vectors.row(detections.weight, observed[k])
-        total -= log10(2 * pi * density / sqrt(xx * yy - xy * xy))
+        ratio = _magnitude_ratio(detections, sky, observed[k], star[k], fraction_brighter)
+        total += log10(ratio * sqrt(xx * yy - xy * xy) / (2 * pi * density))
         if with_residuals:
             distance2 = squared_mahalanobis(detections, sky, R, focal_ratio, observed[k], star[k])
             total -= distance2 / 2 / log(10.0)
-        total += _magnitude_dex(detections, sky, observed[k], star[k], fraction_brighter)
     return total - UNMATCHED_PENALTY_DEX * max(observed.max() + 1 - 2.0 * len(observed), 0.0)
 
 
@@ -352,18 +363,20 @@ def _fraction_brighter(sky: SkyIndex, mag: Floats) -> float:
 
 
 @jit
-def _magnitude_dex(detections: Detections, sky: SkyIndex, detection: int, star: int, fraction_brighter: float) -> float:
-    """log10 of the likelihood ratio of a detection's magnitude: given its star, over a random star as bright as these.
+def _magnitude_ratio(
+    detections: Detections, sky: SkyIndex, detection: int, star: int, fraction_brighter: float
+) -> float:
+    """Likelihood ratio of a detection's magnitude: given its star, over a random star as bright as these.
 
     A fraction MAG_OUTLIER_FRACTION of the stars is taken to have any magnitude, so that one outlier costs at most
-    log10(MAG_OUTLIER_FRACTION). Returns 0 if the magnitude is unknown.
+    that factor. Returns 1 if the magnitude is unknown.
     """
     difference = detections.mag[detection] - sky.mag[star]
     if not np.isfinite(difference):
-        return 0.0
+        return 1.0
     relative_density = magnitude_density(sky, detections.mag[detection]) / fraction_brighter
     likelihood = np.exp(-0.5 * (difference / detections.mag_sigma) ** 2) / detections.mag_sigma / sqrt(2 * pi)
-    return log10(MAG_OUTLIER_FRACTION + (1 - MAG_OUTLIER_FRACTION) * likelihood / relative_density)
+    return MAG_OUTLIER_FRACTION + (1 - MAG_OUTLIER_FRACTION) * likelihood / relative_density
 
 
 @jit

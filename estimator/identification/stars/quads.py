@@ -16,17 +16,10 @@ from estimator.catalog.sky_index import SkyIndex
 from estimator.core import vectors
 from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
-from estimator.identification.chance import GATE_SIGMA, required_matches
+from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.stars import search
-from estimator.identification.stars.evidence import (
-    Detections,
-    Hypothesis,
-    Solution,
-    evaluate,
-    field_area,
-    no_hypothesis,
-    ray,
-)
+from estimator.identification.stars.detections import Detections, changed, ray
+from estimator.identification.stars.evidence import Hypothesis, Solution, evaluate, no_hypothesis
 
 COMBINED = 24  # number of brightest detections that are combined to quads
 
@@ -35,7 +28,6 @@ COMBINED = 24  # number of brightest detections that are combined to quads
 def identify(
     detections: Detections,
     quads: QuadIndex,
-    patterns: SkyIndex,
     stars: SkyIndex,
     max_detections: int,
     max_checks: int,
@@ -43,15 +35,15 @@ def identify(
 ) -> Solution:
     """Identify the detections and solve attitude and focal length; an empty solution below DECISIVE_DEX.
 
-    The candidates are tested on the `max_detections` brightest; the attitude is then fitted to all detections and all
-    `stars`.
+    The candidates are tested on the `max_detections` brightest; the attitude is then fitted to all detections.
     max_checks : bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
     calibrated : whether the focal length should be right (`search.fit_with_calibration`)
     """
-    searched = search.brightest(detections, min(max_detections, len(detections.sigma)))
-    best = _search(searched, quads, patterns, max_checks)
+    count = min(max_detections, len(detections.sigma))
+    searched = changed(detections, count, 1.0, detections.focal_uncertainty)
+    best = _search(searched, quads, stars, max_checks)
     if calibrated and best.dex >= search.DECISIVE_DEX:
-        return search.fit_with_calibration(detections, stars, best)
+        return search.fit_with_calibration(detections, stars, best, False)
     return search.fit_to_all(detections, stars, best, search.DECISIVE_DEX)
 
 
@@ -162,22 +154,10 @@ def _test_match(
     vectors.pair_frame(ray(tangent, a, ratio), ray(tangent, b, ratio), in_cam)
     vectors.pair_frame(star_a, star_b, in_ref)
     vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
-    gates, total = search.pair_gates(detections, a, b), len(detections.sigma)
-    required = required_matches(
-        detections.sigma, field_area(detections), search.attitude_dex(detections, a, b), search.DECISIVE_DEX
-    )
+    gates, order, required = search.trial(detections, a, b, 0, search.DECISIVE_DEX)
+    grid = sky.cell_first, sky.cell_star, sky.side
     lookups, fits = search.quick_check(
-        tangent,
-        sky.vectors,
-        sky.cell_first,
-        sky.cell_star,
-        sky.side,
-        R_ref_from_cam,
-        ratio,
-        gates,
-        search.other_detections(total, a, b, 0),
-        required,
-        total,
+        tangent, sky.vectors, *grid, R_ref_from_cam, ratio, gates, order, required, len(gates)
     )
     checks[0] += 1 + lookups
     if not fits:

@@ -29,17 +29,16 @@ from estimator.identification.chance import (
     separation,
     squared_separation,
 )
+from estimator.identification.stars.detections import Detections, changed, field_area, ray
 from estimator.identification.stars.evidence import (
-    Detections,
     Hypothesis,
     Solution,
     build_solution,
     evaluate,
-    field_area,
+    focal_gain_dex,
     magnitude_density,
     no_hypothesis,
     prior_volume_dex,
-    ray,
 )
 
 # Least log10 Bayes factor of an accepted attitude. By Markov's inequality, random detections reach it in at most one of
@@ -58,35 +57,37 @@ FEW = 20  # number of detections of the first search
 SHORT_EFFORT, MANY_EFFORT = 1 / 16, 1 / 4  # fractions of the effort: of the first search at first, and of the second
 WRONG_FOCAL = 0.05  # greatest relative error of a calibrated focal length that is found
 WRONG_FOCAL_DEX = 2.0  # evidence by which another focal length must beat the calibrated one
+FREE_DEX = 1.0  # gain of a free focal length with the same matches below which the field is not matched with it
 MAX_MISSES = 4  # detections without a star after which the first round drops a candidate
 
 
 @jit
-def lost_in_space(
-    detections: Detections, patterns: SkyIndex, stars: SkyIndex, max_detections: int, max_checks: int
-) -> Solution:
+def lost_in_space(detections: Detections, stars: SkyIndex, max_detections: int, max_checks: int) -> Solution:
     """Identify the detections and solve the attitude.
 
     The search uses the FEW brightest detections and, if it fails, the `max_detections` brightest, with the pairs of
-    `patterns`: a few bright stars among many faint false lights are found by the first, stars among brighter false
+    `stars`: a few bright stars among many faint false lights are found by the first, stars among brighter false
     lights by the second. The first is short; it is repeated with the whole effort if the second fails too. Each of the
     two must have twice the evidence, so that together they accept a chance match as rarely as one. The attitude found
-    is then fitted to all detections and all `stars`. Returns an empty solution if the search finds nothing beyond
+    is then fitted to all detections. Returns an empty solution if the search finds nothing beyond
     chance, or if the full field keeps no more than half of its matches.
     max_checks : bound on the effort (see `search`)
     """
     few, many = min(FEW, max_detections, len(detections.sigma)), min(max_detections, len(detections.sigma))
     if many == few:
         accept_dex = ACCEPT_DEX
-        candidate = search(brightest(detections, few), patterns, max_checks)
+        candidate = search(changed(detections, few, 1.0, detections.focal_uncertainty), stars, max_checks)
     else:
         accept_dex = ACCEPT_DEX + log10(2.0)
         for count, effort in ((few, SHORT_EFFORT), (many, MANY_EFFORT), (few, 1.0)):
-            candidate = search(brightest(detections, count), patterns, int(effort * max_checks))
+            searched = changed(detections, count, 1.0, detections.focal_uncertainty)
+            candidate = search(searched, stars, int(effort * max_checks))
             if candidate.dex >= accept_dex:
                 break
     if detections.focal_uncertainty == 0 and candidate.dex >= accept_dex:
-        return fit_with_calibration(with_focal_uncertainty(detections, WRONG_FOCAL), stars, candidate)
+        whole = few == len(detections.sigma)
+        free = changed(detections, len(detections.sigma), 1.0, WRONG_FOCAL)
+        return fit_with_calibration(free, stars, candidate, whole)
     return fit_to_all(detections, stars, candidate, accept_dex)
 
 
@@ -114,47 +115,22 @@ def _solution_of(detections: Detections, stars: SkyIndex, candidate: Hypothesis,
 
 
 @jit
-def fit_with_calibration(detections: Detections, stars: SkyIndex, candidate: Hypothesis) -> Solution:
+def fit_with_calibration(detections: Detections, stars: SkyIndex, candidate: Hypothesis, whole: bool) -> Solution:
     """Fit a candidate to all detections and stars with the calibrated focal length and with a free one.
 
     The calibrated one is kept unless the other has WRONG_FOCAL_DEX more evidence. With a wrong focal length a part of
     the stars may still match, at a wrong attitude.
     detections : with the focal uncertainty of the free fit
+    whole : whether the candidate is the calibrated fit to all detections already
     """
-    exact, gates = with_focal_uncertainty(detections, 0.0), 1.5 * GATE_SIGMA * detections.sigma
+    exact, gates = changed(detections, len(detections.sigma), 1.0, 0.0), 1.5 * GATE_SIGMA * detections.sigma
     R, ratio = candidate.R_cam_from_ref, candidate.focal_ratio
-    kept = evaluate(exact, stars, R.copy(), 1.0, gates, -np.inf)
+    kept = candidate if whole else evaluate(exact, stars, R.copy(), 1.0, gates, -np.inf)
+    if len(kept.star) == len(gates) and focal_gain_dex(detections, stars, kept) < FREE_DEX:
+        return _solution_of(exact, stars, candidate, kept)  # no detection is left that another focal length could match
     free = evaluate(detections, stars, R.copy(), ratio, gates, -np.inf)
     chosen, full = (detections, free) if free.dex > kept.dex + WRONG_FOCAL_DEX else (exact, kept)
     return _solution_of(chosen, stars, candidate, full)
-
-
-@jit
-def with_focal_uncertainty(detections: Detections, focal_uncertainty: float) -> Detections:
-    """The same detections of a camera with another uncertainty of its focal length."""
-    return Detections(
-        detections.tangent,
-        detections.sigma,
-        detections.weight,
-        detections.mag,
-        detections.mag_sigma,
-        detections.field,
-        focal_uncertainty,
-    )
-
-
-@jit
-def brightest(detections: Detections, count: int) -> Detections:
-    """The first `count` detections."""
-    return Detections(
-        detections.tangent[:count],
-        detections.sigma[:count],
-        detections.weight[:count],
-        detections.mag[:count],
-        detections.mag_sigma,
-        detections.field,
-        detections.focal_uncertainty,
-    )
 
 
 @jit
@@ -259,24 +235,20 @@ def _test_pair(
     start  : the other detections are looked up from this one on
     checks : (1,) effort so far, increased in place
     """
-    gates, order = pair_gates(detections, a, b), other_detections(len(detections.sigma), a, b, start)
-    required = required_matches(detections.sigma, field_area(detections), attitude_dex(detections, a, b), ACCEPT_DEX)
-    in_cam, in_ref = np.empty((3, 3)), np.empty((3, 3))
-    R = np.empty((3, 3))  # R_ref_from_cam
+    gates, order, required = trial(detections, a, b, start, ACCEPT_DEX)
+    in_cam, in_ref, R_ref_from_cam = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     best, focal_ratio = no_hypothesis(), 1.0
     begin, end, chord, gate = _pair_range(detections, sky, a, b)
     # Tuple members are unpacked here: in the loop each access would cost two updates of a reference count.
     tangent, focal_uncertainty = detections.tangent, detections.focal_uncertainty
-    pair, star, mag = sky.pair, sky.vectors, sky.mag
-    cell_first, cell_star, side = sky.cell_first, sky.cell_star, sky.side
+    pair, star, mag, grid = sky.pair, sky.vectors, sky.mag, (sky.cell_first, sky.cell_star, sky.side)
     vectors.pair_frame(ray(tangent, a, 1.0), ray(tangent, b, 1.0), in_cam)
     mag_a, mag_b = detections.mag[a], detections.mag[b]
     mag_gate = MAG_GATE_SIGMA * detections.mag_sigma if max_misses == MAX_MISSES else np.inf
     for p in range(begin, end):
         i, j = pair[p, 0], pair[p, 1]
-        # Written with `not ... >`, so that an unknown magnitude (NaN) passes.
-        forward = not (abs(mag_a - mag[i]) > mag_gate or abs(mag_b - mag[j]) > mag_gate)
-        backward = not (abs(mag_a - mag[j]) > mag_gate or abs(mag_b - mag[i]) > mag_gate)
+        forward = _alike(mag_a - mag[i], mag_b - mag[j], mag_gate)
+        backward = _alike(mag_a - mag[j], mag_b - mag[i], mag_gate)
         if not (forward or backward):
             continue
         star_i, star_j = vectors.row(star, i), vectors.row(star, j)
@@ -291,23 +263,38 @@ def _test_pair(
         vectors.pair_frame(star_i, star_j, in_ref)
         for flip in range(2):
             if flip:  # the star pair in reverse order: a half turn about its first axis
-                for k in range(3):
-                    in_ref[k, 1], in_ref[k, 2] = -in_ref[k, 1], -in_ref[k, 2]
+                in_ref[:, 1:] *= -1
             if not (backward if flip else forward):
                 continue
-            vectors.multiply_transposed(in_ref, in_cam, R)
+            vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
             lookups, fits = quick_check(
-                tangent, star, cell_first, cell_star, side, R, focal_ratio, gates, order, required, max_misses
+                tangent, star, *grid, R_ref_from_cam, focal_ratio, gates, order, required, max_misses
             )
             checks[0] += 1 + lookups
             if fits:
                 checks[0] += EVALUATION_COST
-                candidate = evaluate(detections, sky, R.T.copy(), focal_ratio, gates, NO_RIVAL_DEX)
+                candidate = evaluate(detections, sky, R_ref_from_cam.T.copy(), focal_ratio, gates, NO_RIVAL_DEX)
                 if candidate.dex >= ACCEPT_DEX and not _same_attitude(candidate, previous):
                     return candidate
-                if candidate.dex > best.dex:
-                    best = candidate
+                best = candidate if candidate.dex > best.dex else best
     return best
+
+
+@jit
+def trial(detections: Detections, a: int, b: int, start: int, min_dex: float) -> tuple[Floats, NDArray[np.int64], int]:
+    """What a quick check of an attitude by two detections takes: gates, the other detections, and matches required.
+
+    start : the other detections are looked up from this one on;  min_dex : least evidence of interest
+    """
+    gates, order = pair_gates(detections, a, b), other_detections(len(detections.sigma), a, b, start)
+    pair_dex = attitude_dex(detections, a, b)
+    return gates, order, required_matches(detections.sigma, field_area(detections), pair_dex, min_dex)
+
+
+@jit
+def _alike(difference_a: float, difference_b: float, gate: float) -> bool:
+    """Whether two differences of magnitudes are together within a gate; an unknown magnitude (NaN) passes."""
+    return not difference_a * difference_a + difference_b * difference_b > gate * gate
 
 
 @jit

@@ -20,10 +20,11 @@ from estimator.core import camera
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
-from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, ra_dec_roll_rad
+from estimator.core.types import NO_SPREAD, Attitude, Blobs, Centroids, FramePriors, ra_dec_roll_rad
 from estimator.detection import background, captions, classify, components, detect, windows
 from estimator.detection.classify import Flag
 from estimator.detection.detect import DETECTORS
+from estimator.identification.stars.detections import FlatCentroids, Sensor, detections_of
 from estimator.trackers import pipeline
 from estimator.trackers.pipeline import Clock, Settings
 
@@ -273,7 +274,7 @@ def test_lights_are_chosen_and_doubted_as_told(
     np.testing.assert_array_equal(pipeline.away_from_border(blobs.box_px, CAMERA), off_border.all(axis=1))
 
 
-@law(Centroids.weights_per_px2)
+@law()
 @given(rng=SEEDS, count=some.integers(0, 9), more_px=some.floats(0, 5), even=some.booleans())
 def test_weights_are_the_inverse_of_all_the_errors(
     rng: np.random.Generator, count: int, more_px: float, even: bool
@@ -281,12 +282,16 @@ def test_weights_are_the_inverse_of_all_the_errors(
     roots = rng.normal(size=(count, 2, 2)) + 2 * np.eye(2)
     spread = roots @ roots.transpose(0, 2, 1) + 0.01 * np.eye(2)
     sigma = np.sqrt(np.trace(spread, axis1=1, axis2=2) / 2)
-    lights = Centroids(np.zeros((count, 2)), sigma, np.ones(count), None if even else spread)
-    xx, yy, xy = lights.weights_per_px2(np.hypot(sigma, more_px)).T
+    known = NO_SPREAD if even else spread
+    lights = FlatCentroids(np.zeros((count, 2)), sigma, np.ones(count), known, np.hypot(sigma, more_px))
+    seen = detections_of(lights, Sensor(1.0, (0.0, 0.0), (0.0,) * 5, np.zeros(4), np.nan, 0.25), 0.0)
+    xx, yy, xy = seen.weight.T
     weight = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -1)
     alone = sigma[:, None, None] ** 2 * np.eye(2) if even else spread
     whole = weight @ (alone + more_px**2 * np.eye(2))
     np.testing.assert_allclose(whole, np.broadcast_to(np.eye(2), whole.shape), rtol=0, atol=1e-9)
+    greatest = np.linalg.eigvalsh(alone + more_px**2 * np.eye(2))[:, 1]
+    np.testing.assert_allclose(seen.sigma**2, greatest, rtol=1e-9)
 
 
 @law(pipeline.detect_and_centroid, pipeline.process_frame, Clock.lap, camera.check_frame)

@@ -85,7 +85,7 @@ def rays_of(tangent):
 
 
 def identify(detections, calibrated=False):
-    return quads.identify(detections, QUADS, SKY, SKY, SEARCHED, CHECKS, calibrated)
+    return quads.identify(detections, QUADS, SKY, SEARCHED, CHECKS, calibrated)
 
 
 @pytest.mark.parametrize("ratio", [0.955, 1.0, 1.045])
@@ -138,7 +138,7 @@ def test_the_effort_is_bounded() -> None:
     tangent = rng.uniform(FIELD[[0, 2]], FIELD[[1, 3]], (40, 2))
     tangent = np.concatenate([tangent, observe(Rotation.identity(), rng)[0]])
     loose = detections_of(tangent, np.full(len(tangent), np.nan), sigma=3e-4, zoom=0.05)
-    assert not len(quads.identify(loose, QUADS, SKY, SKY, SEARCHED, 0, False).star)
+    assert not len(quads.identify(loose, QUADS, SKY, SEARCHED, 0, False).star)
 
 
 def test_a_right_focal_length_is_kept() -> None:

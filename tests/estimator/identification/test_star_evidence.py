@@ -138,7 +138,7 @@ def test_a_magnitude_s_likelihoods_of_one_star_add_up_to_one(star: int) -> None:
     sky = sky_index.build_without_pairs(vectors, np.linspace(2, 6, 60))
     mag, share = np.arange(-2, 10, 1e-3), 0.8
     detections = seen(np.zeros((len(mag), 2)))._replace(mag=mag)
-    ratio = [10 ** evidence._magnitude_dex(detections, sky, n, star, share) for n in range(len(mag))]
+    ratio = [evidence._magnitude_ratio(detections, sky, n, star, share) for n in range(len(mag))]
     density = [evidence.magnitude_density(sky, value) / share for value in mag]
     # Of 5 stars in 100, variable ones and the like, the magnitude is any of those seen.
     assert np.dot(ratio, density) * 1e-3 == pytest.approx(0.95 + 0.05 * np.sum(density) * 1e-3, rel=2e-3)
@@ -161,7 +161,7 @@ def test_the_information_is_that_of_the_projection_s_slopes(uncertain: float) ->
     weights = np.moveaxis(np.array([[xx, xy], [xy, yy]]), 2, 0)
     wanted = np.einsum("ink,nkl,jnl->ij", slopes, weights, slopes)
     count, info = 4 if uncertain else 3, np.zeros((4, 4))
-    ratio = plain._fit(detections._replace(focal_uncertainty=uncertain), SKY, R, 1.0, rows, rows, info)
+    ratio, _ = plain._fit(detections._replace(focal_uncertainty=uncertain), SKY, R, 1.0, rows, rows, info)
     np.testing.assert_allclose(info[:count, :count], wanted[:count, :count], rtol=0, atol=1e-6 * np.abs(wanted).max())
     assert (info[count:] == 0).all()
     assert ratio == pytest.approx(1.01 if uncertain else 1.0, abs=1e-4)

@@ -30,7 +30,7 @@ from estimator.identification.stars.evidence import Solution
 
 
 def solve(detections: evidence.Detections, sky: sky_index.SkyIndex = SKY) -> Solution:
-    return search.lost_in_space(detections, sky, sky, SEARCHED, CHECKS)
+    return search.lost_in_space(detections, sky, SEARCHED, CHECKS)
 
 
 @pytest.mark.slow

@@ -17,6 +17,8 @@ from estimator.catalog import catalog
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids
+from estimator.identification.stars import evidence, search
+from estimator.identification.stars.detections import changed
 from estimator.trackers import misfit
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
@@ -78,6 +80,31 @@ def test_lens_that_drifted_is_found(tracker: StarTracker, lens: Camera) -> None:
         CAMERA.focal_px * np.abs(one.tangents(corners) - lens.tangents(corners)).max() for one in (CAMERA, found)
     )
     assert left_px < 0.5 * lost_px
+
+
+@pytest.mark.parametrize("claimed", [1.0, 0.8])
+def test_wider_errors_without_new_matches_need_no_match(
+    tracker: StarTracker, claimed: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The closed form agrees with the evaluation of every factor, which an unmatched light beside a star asks for."""
+    _, centroids = field(tracker, 5, CAMERA, claimed)
+    detections = tracker.detections(centroids, tracker.sigma_px(centroids))
+    wide = changed(detections, len(centroids), 25.0, 0.0)
+    found = search.lost_in_space(wide, tracker.sky, 80, 100_000)
+    R_cam_from_ref, gates = Rotation.from_quat(found.cam_from_ref_xyzw).as_matrix(), np.full(len(centroids), 0.01)
+    hypothesis = evidence.evaluate(detections, tracker.sky, R_cam_from_ref, 1.0, gates, -np.inf)
+    kept = centroids.take(hypothesis.observed)
+    detections = tracker.detections(kept, tracker.sigma_px(kept))
+    hypothesis = evidence.evaluate(detections, tracker.sky, hypothesis.R_cam_from_ref, 1.0, gates[: len(kept)], -np.inf)
+    matched = evidence.build_solution(detections, tracker.sky, hypothesis)
+    quick, quick_factor = misfit.widened(matched, hypothesis.R_cam_from_ref, detections, tracker.sky)
+    monkeypatch.setattr(evidence, "count_near", lambda *_: 1)
+    slow, slow_factor = misfit.widened.py_func(matched, hypothesis.R_cam_from_ref, detections, tracker.sky)
+    assert len(matched.star) == len(slow.star)
+    assert quick_factor == pytest.approx(slow_factor, rel=1e-3)
+    assert quick.dex == pytest.approx(slow.dex, abs=1e-2)
+    np.testing.assert_allclose(quick.covariance_rad2, slow.covariance_rad2, rtol=1e-2, atol=1e-16)
+    assert quick.chi2 == pytest.approx(slow.chi2, rel=1e-2)
 
 
 @law(misfit.refit, misfit.with_lens, misfit.variance_of, StarTracker.refit, slow=True)
