@@ -180,7 +180,7 @@ def test_three_indexes_hold_the_pairs_that_there_are(rng: np.random.Generator, m
     z = slope * np.arange(len(kvector)) + offset
     assert all(np.count_nonzero(every <= at) == n for at, n in zip(z, kvector, strict=True))
     bare = sky_index.build_without_pairs(vectors, mag)
-    assert bare.bytes == sum(part.nbytes for part in bare if isinstance(part, np.ndarray))
+    assert bare.bytes == sum(part.nbytes for part in (*bare, *bare.cells) if isinstance(part, np.ndarray))
     assert set(bare.cell_star.tolist()) == set(range(count))
 
 

@@ -50,7 +50,7 @@ def test_a_bright_double_does_not_pull_the_attitude(tracker: StarTracker) -> Non
     assert np.mean(nees) < 18
 
 
-@law(companions.with_companions)
+@law(companions.with_companions, companions.are_small)
 @given(seed=some.integers(0, 10**6))
 def test_coarse_centroids_know_nothing_of_companions(tracker: StarTracker, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -61,9 +61,10 @@ def test_coarse_centroids_know_nothing_of_companions(tracker: StarTracker, seed:
     noisy_px = xy_px[star] + noise_px * rng.standard_normal((len(star), 2))
     centroids = Centroids(noisy_px, np.full(len(star), noise_px), np.ones(len(star)))
     detections = tracker.detections(centroids, tracker.sigma_px(centroids))
-    assert tracker.patterns is not None
-    solution = tracker._search(centroids, tracker.sigma_px(centroids), tracker.patterns, tracker.searches[0])
+    solution, _ = tracker._search(centroids, tracker.sigma_px(centroids), tracker.searches[0])
     after, errors = companions.with_companions(solution, detections, tracker.sky)
+    assert companions.are_small(detections.sigma)
+    assert not companions.are_small(detections.sigma / 3)
     assert after is solution
     assert errors is detections
 
