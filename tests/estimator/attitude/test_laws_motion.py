@@ -101,7 +101,7 @@ def test_exact_streaks_give_the_rate_in_one_of_two_signs(rng: np.random.Generato
             # One wrong streak of thirty is left out.
             wrong = replace(found, streak_px=found.streak_px + np.where(np.arange(30)[:, None] == 7, 5.0, 0.0))
             again = rate.from_streaks(camera, wrong, EXPOSURE_S, sight)
-            assert min(np.linalg.norm(one.rate_rad_s - seen.rate_rad_s) for one in again) < 1e-3
+            assert min(np.linalg.norm(one.rate_rad_s - seen.rate_rad_s) for one in again) < 2e-3
     assert rate.from_streaks(CAMERA, found.take(np.arange(2)), EXPOSURE_S) == []
     assert rate.from_streaks(CAMERA, replace(found, streak_px=None), EXPOSURE_S) == []
     for exposure_s in 0.0, -1.0, np.nan, np.inf:
