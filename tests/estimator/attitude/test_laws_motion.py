@@ -208,7 +208,7 @@ def test_moments_of_an_ellipse_are_its_own(rng: np.random.Generator) -> None:
     image = np.where(distance2 < 4, 5000.0, 0.0) + rng.normal(100, 1, (60, 60))  # a uniform ellipse: a quarter of it
     blobs = local(image, 8.0, 50)
     assert len(blobs) == 1
-    assert_allclose(classify.moments(image, blobs)[0], [xx - yy, 2 * xy, xx + yy], rtol=0, atol=0.05 * (xx + yy))
+    assert_allclose(classify.moments(image, blobs)[0], [xx - yy, 2 * xy, xx + yy], rtol=0, atol=0.07 * (xx + yy))
 
 
 @law(RateEstimate.resolved)
