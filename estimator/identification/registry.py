@@ -1,7 +1,7 @@
 """Star identification algorithms by name.
 
 Each is a function of rays, a pair index and a tolerance that returns the match or None; `options.Options` has its
-keywords. The tracker verifies what a method answers with the whole field (`trackers.refinement`).
+keywords. The tracker verifies what a method answers with the whole field (`trackers.residuals.refinement`).
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ from estimator.trackers.pipeline import (
     direction_sigma_rad,
     process_frame,
 )
-from estimator.trackers.refinement import mutual_nearest
+from estimator.trackers.residuals.refinement import mutual_nearest
 from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
 from estimator.trackers.star_tracker import NO_STARS
 

@@ -35,10 +35,11 @@ from estimator.identification.chance import (
 from estimator.identification.stars import quads, search
 from estimator.identification.stars.detections import Detections, FlatCentroids, Sensor, detections_of
 from estimator.identification.stars.evidence import Solution
-from estimator.trackers import companions, misfit, warm_up
-from estimator.trackers.misfit import Refit
+from estimator.trackers import warm_up
 from estimator.trackers.pipeline import Clock, Report, Settings, brightest, check_algorithms, process_frame
-from estimator.trackers.refinement import NO_MATCH, FieldMatcher
+from estimator.trackers.residuals import companions, misfit
+from estimator.trackers.residuals.misfit import Refit
+from estimator.trackers.residuals.refinement import NO_MATCH, FieldMatcher
 from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
 
 NO_STARS = "too few stars detected"

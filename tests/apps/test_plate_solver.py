@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.trackers.pipeline import Clock
-from estimator.trackers.refinement import NO_MATCH
+from estimator.trackers.residuals.refinement import NO_MATCH
 from estimator.trackers.star_tracker import NO_STARS
 from skysim.apps import plate_solver
 from skysim.core.errors import InputError

@@ -44,6 +44,7 @@ CASES = [
     Case(SKY, {}, "tracker.options", "{a: 1}", {"tracker.name": "tetra3rs"}),
     Case(SKY, {}, "tracker.time_limit", "3 s", {"tracker.name": "tetra3rs"}),
     Case(SKY, {"tracker.name": "tetra3rs"}, "tracker.solver", "quest", {"tracker.name": "own"}),
+    Case("simsat_bump", {"tracker.name": "tetra3rs"}, "tracker.gyro", "true", {"tracker.name": "own"}),
     Case(
         SKY,
         {"tracker.name": "tetra3rs"},

@@ -6,6 +6,7 @@ The scene `simsat_bump` with its accident early and fewer frames. Steered by the
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,9 +47,9 @@ def test_the_tracker_is_compiled_before_the_first_frame_of_a_flight(monkeypatch:
     solved: list[Frame] = []
     solve = factory.solve_frame
 
-    def watched(tracker: factory.Estimator, frame: Frame) -> Report:
+    def watched(tracker: factory.Estimator, frame: Frame, **known: Any) -> Report:
         solved.append(frame)
-        return solve(tracker, frame)
+        return solve(tracker, frame, **known)
 
     monkeypatch.setattr(factory, "solve_frame", watched)
     testbed = prepared(exposure='{time: 10 ms, rate_hz: 5, frames: 2, first: "0.1 s"}', motion__maneuver="[]")

@@ -29,7 +29,7 @@ from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid
-from estimator.trackers.refinement import NO_MATCH
+from estimator.trackers.residuals.refinement import NO_MATCH
 from estimator.trackers.star_tracker import QUAD_SEARCHES, StarTracker
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import CATALOGS

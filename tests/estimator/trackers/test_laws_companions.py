@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids
-from estimator.trackers import companions
-from estimator.trackers.companions import ARCSEC_RAD, ERROR_RAD, SHARE
 from estimator.trackers.pipeline import Settings
+from estimator.trackers.residuals import companions
+from estimator.trackers.residuals.companions import ARCSEC_RAD, ERROR_RAD, SHARE
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.paths import CATALOGS
 

@@ -19,8 +19,8 @@ from estimator.core.camera import Camera
 from estimator.core.types import Centroids
 from estimator.identification.stars import evidence, search
 from estimator.identification.stars.detections import changed
-from estimator.trackers import misfit
 from estimator.trackers.pipeline import Settings
+from estimator.trackers.residuals import misfit
 from estimator.trackers.star_tracker import StarTracker
 
 CAMERA = Camera.from_fov(1024, 780, np.radians(17))

@@ -30,9 +30,9 @@ from estimator.identification.published.pyramid import pyramid
 from estimator.identification.published.saa import AssumptionPool, saa
 from estimator.identification.registry import IDENTIFIERS
 from estimator.identification.stars.evidence import Solution
-from estimator.trackers import refinement
 from estimator.trackers.pipeline import Settings
-from estimator.trackers.refinement import FieldMatcher
+from estimator.trackers.residuals import refinement
+from estimator.trackers.residuals.refinement import FieldMatcher
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import TrackingMode
 

@@ -17,7 +17,7 @@ from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.dome_tracker import SETTINGS, DomeTracker
 from estimator.trackers.pipeline import SATURATED, Clock, Settings, detect_and_centroid
-from estimator.trackers.refinement import NO_MATCH, mutual_nearest
+from estimator.trackers.residuals.refinement import NO_MATCH, mutual_nearest
 from estimator.trackers.star_tracker import NO_STARS, StarTracker
 
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"

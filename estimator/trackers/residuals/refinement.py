@@ -26,8 +26,8 @@ from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.stars import evidence
 from estimator.identification.stars.evidence import Solution
-from estimator.trackers import misfit
 from estimator.trackers.pipeline import Settings, direction_sigma_rad
+from estimator.trackers.residuals import misfit
 
 NO_MATCH = "no identification beyond chance"
 MISFIT_SHARE = 0.8  # near misses per match; centroid errors that are claimed three times too small give up to 0.75
