@@ -200,9 +200,10 @@ class StarTracker:
         """
         cam_from_ref, xy_px, light = self.rich_field()
         warm_up.run(self.camera, xy_px, light, dtype, self.solve)
-        # Residuals of four standard deviations: the errors are matched and fitted anew then.
-        moved_px = xy_px + 0.4 * (-1.0) ** np.arange(len(xy_px))[:, None]
-        self.solve_centroids(Centroids(moved_px, np.full(len(xy_px), 0.1), light))
+        # Residuals of two and of four standard deviations: the errors are matched and fitted anew then.
+        for step_px in 0.2, 0.4:
+            moved_px = xy_px + step_px * (-1.0) ** np.arange(len(xy_px))[:, None]
+            self.solve_centroids(Centroids(moved_px, np.full(len(xy_px), 0.1), light))
         # As many false lights as stars: whether the camera model fits the field is tested then.
         xy_px = np.concatenate([xy_px, xy_px[:, ::-1]])
         centroids = Centroids(xy_px, np.full(len(xy_px), 0.1), np.concatenate([light, light / 2]))
