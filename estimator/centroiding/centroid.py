@@ -102,6 +102,10 @@ def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePr
         rows = _with_fallback(rows, image, blobs, gain_e_dn)
         covariance[failed] = rows[failed, 2, None, None] ** 2 * np.eye(2)
     own = streaks[:, [10, 12, 12, 11]].reshape(-1, 2, 2)
+    if blobs.turn_rad:
+        # A streak v that a roll w bends is an arc, whose mean is off its middle by a 24th of the acceleration w J v.
+        x, y = _frame_streaks(image, blobs, priors).T
+        rows[:, :2] -= blobs.turn_rad / 24 * np.column_stack([-y, x])
     return Centroids(rows[:, :2], rows[:, 2], rows[:, 3], covariance, streaks[:, 8:10], own)
 
 

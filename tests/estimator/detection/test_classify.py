@@ -211,6 +211,11 @@ def test_streaks_that_a_roll_makes_differ_are_stars(
     seen = process_frame(image, CAMERA, Settings(), lambda *_: Attitude("no_solution"), None, rate, 0.1).centroids
     assert len(seen) == 15
     assert off_px(seen, xy).max() < 0.15
+    assert seen.covariance_px2 is not None
+    nearest = np.linalg.norm(seen.xy_px[None] - xy[:, None], axis=2).argmin(axis=1)
+    error = (seen.xy_px[nearest] - xy)[:, :, None]
+    chi2 = np.swapaxes(error, 1, 2) @ np.linalg.solve(seen.covariance_px2[nearest], error)
+    assert chi2.mean() < 2 * 2  # where an arc's mean were taken for its middle, up to 2 * 13
     blobs = detect.default(image)
     assert [flags_near(blobs, x, y) & Flag.HOT for x, y in HOT_PX] == [Flag.HOT] * 4
     assert np.count_nonzero(blobs.flag == 0) == 15
