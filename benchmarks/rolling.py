@@ -1,11 +1,12 @@
 """Attitude under a rolling shutter against the same frames with a global one, by rate: stars and a dome.
 
 Every frame is rendered twice with the same seeds, with the camera's rolling shutter and with a global one, at a random
-attitude and a constant rate about a random axis, of stars mostly perpendicular to the boresight. The tracker gets the
-rate from a gyro (0.01 deg/s about each axis) or takes it from the frame. NEES is 3 for an honest covariance; errors are
-compared over the frames that both solve. A frame without a gyro must tell three unknowns more: its errors are compared
-with the Cramer-Rao bound of rows and streaks (median of the normalized error, 1 at the bound), and that bound of the
-roll with what it were if the rate were known, which no tracker of one frame can better.
+attitude and a constant rate about a random axis, of stars mostly perpendicular to the boresight. Each frame of each
+rate has attitude, noise and survey of its own, so that the means over rates are of independent frames. The tracker gets
+the rate from a gyro (0.01 deg/s about each axis) or takes it from the frame. NEES is 3 for an honest covariance; errors
+are compared over the frames that both solve. A frame without a gyro must tell three unknowns more: its errors are
+compared with the Cramer-Rao bound of rows and streaks (median of the normalized error, 1 at the bound), and that bound
+of the roll with what it were if the rate were known, which no tracker of one frame can better.
 """
 
 from __future__ import annotations
@@ -90,16 +91,23 @@ def measure(works: tuple[Work, ...] = WORKS, rates_deg_s: tuple[float, ...] = RA
     rows = []
     for work in works:
         beds = work.testbed(True), work.testbed(False)
-        for rate_deg_s in rates_deg_s:
-            for mode, ours, peer in _compare(work, beds, rate_deg_s):
+        pooled: dict[str, list[tuple[Floats, Floats]]] = {}
+        for n, rate_deg_s in enumerate(rates_deg_s):
+            for mode, ours, peer in _compare(work, beds, rate_deg_s, n * work.frames):
                 rows += _rows(f"{work.name}, {rate_deg_s:g} deg/s, {mode}", ours, peer)
+                pooled.setdefault(mode, []).append((ours[:, 0], peer[:, 0]))
+        for mode, nees in pooled.items():
+            both = (np.concatenate(each) for each in zip(*nees, strict=True))
+            rows.append(nees_row(f"{work.name}, all rates, {mode}: NEES", *(each[np.isfinite(each)] for each in both)))
     return rows
 
 
-def _compare(work: Work, beds: tuple[Testbed, Testbed], rate_deg_s: float) -> Iterator[tuple[str, Floats, Floats]]:
-    """Yield each source of the rate with (N, 3) errors of the rolling and of the global shutter."""
+def _compare(
+    work: Work, beds: tuple[Testbed, Testbed], rate_deg_s: float, first_seed: int
+) -> Iterator[tuple[str, Floats, Floats]]:
+    """Yield each source of the rate with (N, 5) rows of Solved under the rolling and under the global shutter."""
     errors: dict[tuple[str, int], list[Solved]] = {}
-    for seed in range(work.frames):
+    for seed in range(first_seed, first_seed + work.frames):
         for n, bed in enumerate(beds):
             frame, truth, tracker = frame_of(work, bed, rate_deg_s, seed)
             for mode, rate in ("gyro", gyro(truth, seed)), ("frame only", None):
@@ -194,10 +202,11 @@ def _rows(name: str, ours: Floats, peer: Floats) -> list[dict[str, Any]]:
 
 
 def nees_row(name: str, ours: Floats, peer: Floats | None = None) -> dict[str, Any]:
-    """A row of a mean NEES, met if it is within BAR_NEES of 3."""
+    """A row of a mean NEES with its standard error over frames, met if it is within BAR_NEES of 3."""
     value = float(np.mean(ours)) if len(ours) else float("nan")
+    error = f"± {np.std(ours, ddof=1) / np.sqrt(len(ours)):.2f}" if len(ours) > 1 else ""
     others = float(np.mean(peer)) if peer is not None and len(peer) else None
-    return row(name, value, "", others, 3 + BAR_NEES, abs(value - 3) <= BAR_NEES)
+    return row(name, value, error, others, 3 + BAR_NEES, abs(value - 3) <= BAR_NEES)
 
 
 def row(name: str, value: float, unit: str, peer: float | None, bar: float | None, met: bool | None) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from estimator.core import checks
 from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Blobs, Centroids, FramePriors
+from estimator.detection.classify import streaks_px
 from estimator.detection.detect import check_pixel_type, to_native
 
 # (image, blobs, gain_e_dn, priors): the gain, in electrons per unit of the image, determines the photon noise.
@@ -95,11 +96,16 @@ def streak(image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePr
     if failed.any():
         rows[failed] = np.nan
         # A streak longer than half the window of a round star does not fit into it.
-        if np.hypot(*_frame_streak(blobs, priors)) <= gaussian.HALF_WINDOW_PX:
-            rows[failed] = _fit_gaussians(image, blobs.take(failed), gain_e_dn, priors)
+        short = failed & (np.hypot(*_frame_streaks(image, blobs, priors).T) <= gaussian.HALF_WINDOW_PX)
+        if short.any():
+            rows[short] = _fit_gaussians(image, blobs.take(short), gain_e_dn, priors)
         rows = _with_fallback(rows, image, blobs, gain_e_dn)
         covariance[failed] = rows[failed, 2, None, None] ** 2 * np.eye(2)
     own = streaks[:, [10, 12, 12, 11]].reshape(-1, 2, 2)
+    if blobs.turn_rad:
+        # A streak v that a roll w bends is an arc, whose mean is off its middle by a 24th of the acceleration w J v.
+        x, y = _frame_streaks(image, blobs, priors).T
+        rows[:, :2] -= blobs.turn_rad / 24 * np.column_stack([-y, x])
     return Centroids(rows[:, :2], rows[:, 2], rows[:, 3], covariance, streaks[:, 8:10], own)
 
 
@@ -193,32 +199,34 @@ def _fit_streaks(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePr
     Where no gyro tells the frame's streak, the fit is repeated with the median of the fitted ones if that is another:
     the moments of faint streaks, of which the ends are below the threshold, make them too short.
     """
-    streak_px, sky = _frame_streak(blobs, priors), blobs.background
+    expected_px, sky = _frame_streaks(image, blobs, priors), blobs.background
     rows = np.full((len(blobs), streak_fit.OUTPUTS), np.nan)
     for _ in range(1 if priors.streak_px else STREAK_ROUNDS):
-        if np.hypot(*streak_px) < streak_fit.MIN_STREAK_PX:
+        length_px = np.hypot(*expected_px.T)
+        if np.all(length_px < streak_fit.MIN_STREAK_PX):
             break
         scene = image, blobs.xy_px, blobs.box_px, sky.level, sky.noise
-        rows = streak_fit.fit_all(*scene, streak_px, float(gain_e_dn), priors.saturation)
-        fitted_px = _median_streak(rows[:, 8:10], streak_px)
-        if np.hypot(*np.subtract(fitted_px, streak_px)) < streak_fit.length_sigma_px(np.hypot(*streak_px)) / 4:
+        rows = streak_fit.fit_all(*scene, expected_px, float(gain_e_dn), priors.saturation)
+        shift_px = _median_shift(rows[:, 8:10], expected_px)
+        if np.hypot(*shift_px) < streak_fit.length_sigma_px(float(np.median(length_px))) / 4:
             break
-        streak_px = fitted_px
+        expected_px = expected_px + shift_px
     return rows
 
 
-def _median_streak(vectors_px: Floats, streak_px: tuple[float, float]) -> tuple[float, float]:
-    """Median of the streaks (N, 2) that were measured, with signs as that of the frame; the frame's with too few."""
-    measured = vectors_px[np.isfinite(vectors_px[:, 0])]
-    if len(measured) < MIN_STREAKS:
-        return streak_px
-    dx, dy = np.median(measured * np.where(measured @ np.array(streak_px) < 0, -1.0, 1.0)[:, None], axis=0)
-    return float(dx), float(dy)
+def _median_shift(vectors_px: Floats, expected_px: Floats) -> Floats:
+    """Median (2,) of the measured streaks (N, 2) less those expected, of equal signs; 0 with too few."""
+    measured = np.isfinite(vectors_px[:, 0])
+    if np.count_nonzero(measured) < MIN_STREAKS:
+        return np.zeros(2)
+    vectors, expected = vectors_px[measured], expected_px[measured]
+    sign = np.where(np.sum(vectors * expected, axis=1) < 0, -1.0, 1.0)
+    return np.asarray(np.median(sign[:, None] * vectors - expected, axis=0))
 
 
-def _frame_streak(blobs: Blobs, priors: FramePriors) -> tuple[float, float]:
-    """Return (dx, dy) of the frame's streaks, px: from the priors, otherwise from its blobs, otherwise (0, 0)."""
-    return priors.streak_px or blobs.streak_px or (0.0, 0.0)
+def _frame_streaks(image: NDArray, blobs: Blobs, priors: FramePriors) -> Floats:
+    """Return (N, 2) streaks of the blobs, px: of the frame from the priors, otherwise from its blobs, otherwise 0."""
+    return streaks_px(blobs, image.shape, priors.streak_px or blobs.streak_px or (0.0, 0.0))
 
 
 def _gravity_rows(image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:

@@ -27,8 +27,8 @@ MARGIN_PX, MAX_HALF_WINDOW_PX = 4, 96  # margin of the window about the streak, 
 REACH_PX = 4.5  # from the initial line: pixels farther away contain only sky and are not used
 MIN_STREAK_PX = 1.5  # shortest streak whose length and direction can be measured
 MAX_ITERATIONS = 40
-# Priors (1 sigma): difference of a star's streak from the frame's, as rotation about the boresight and distortion make
-# streaks vary over the field; and of its width from that of the star before.
+# Priors (1 sigma): difference of a star's streak from the frame's, as slow rotation about the boresight and distortion
+# make streaks vary over the field; and of its width from that of the star before.
 LENGTH_FRACTION, LENGTH_PX, ANGLE_RAD, WIDTH_FRACTION = 0.15, 0.5, 0.15, 0.15
 FAR_SIGMA = 5.0  # from an end of the line: 3e-7 of the light is beyond
 # Parameters: center, flux, length, direction, width, sky.
@@ -44,11 +44,11 @@ def fit_all(
     boxes: Ints,
     level: Floats,
     noise: Floats,
-    streak: tuple[float, float],
+    streaks: Floats,
     gain_e_dn: float,
     saturation: float,
 ) -> Floats:
-    """Fit every blob: (N, 13); NaN if not a streak.
+    """Fit every blob, around its streak as expected (N, 2): (N, 13); NaN if not a streak.
 
     Columns: x, y, flux, dx, dy, and xx, yy, xy of the center's covariance; then dx, dy without the priors and their
     xx, yy, xy, NaN if the star alone does not tell its streak.
@@ -56,15 +56,19 @@ def fit_all(
     height, width = image.shape
     out = np.full((len(xy), OUTPUTS), np.nan)
     buffer, p = np.empty(len(xy), np.int64), np.empty(7)
-    # The window covers the frame's streak, with a margin, about the blob's center.
-    half_x, half_y = int(abs(streak[0]) / 2) + MARGIN_PX, int(abs(streak[1]) / 2) + MARGIN_PX
-    if max(half_x, half_y) > MAX_HALF_WINDOW_PX:
-        return out
-    capacity = (2 * half_x + 1) * (2 * half_y + 1)
+    # The window covers the streak, with a margin, about the blob's center.
+    capacity = 0
+    for n in range(len(xy)):
+        half_x, half_y = _half_window(streaks[n])
+        capacity = max(capacity, (2 * half_x + 1) * (2 * half_y + 1))
     pixels, rows, weight = np.empty((3, capacity)), np.empty((8, capacity)), np.empty(capacity)
     rows[SKY] = 1.0
-    length, angle, width_px = hypot(streak[0], streak[1]), np.arctan2(streak[1], streak[0]), 0.9
+    width_px = 0.9
     for n in range(len(xy)):
+        length, angle = hypot(streaks[n, 0], streaks[n, 1]), np.arctan2(streaks[n, 1], streaks[n, 0])
+        half_x, half_y = _half_window(streaks[n])
+        if length < MIN_STREAK_PX or half_x < 0:
+            continue
         x0, y0 = round(xy[n, 0]) - half_x, round(xy[n, 1]) - half_y
         x1, y1 = x0 + 2 * half_x, y0 + 2 * half_y
         if x0 < 0 or y0 < 0 or x1 >= width or y1 >= height:
@@ -86,6 +90,13 @@ def fit_all(
         if p[FLUX] > 0 and _fit(pixels[:, :count], sigma, gain_e_dn, rows, weight, p, out[n]):
             width_px = p[WIDTH]  # the optics are the same for the next star
     return out
+
+
+@jit
+def _half_window(streak: Floats) -> tuple[int, int]:
+    """Half the window's width and height about a streak; -1 if it is too long."""
+    half_x, half_y = int(abs(streak[0]) / 2) + MARGIN_PX, int(abs(streak[1]) / 2) + MARGIN_PX
+    return (half_x, half_y) if max(half_x, half_y) <= MAX_HALF_WINDOW_PX else (-1, -1)
 
 
 @jit

@@ -23,17 +23,21 @@ class FramePriors:
     streak_px  : (dx, dy) by which stars move over the sensor during the exposure, from the gyro; None if unknown.
         The sign does not matter: a streak looks the same in either direction
     saturation : smallest value of a saturated pixel
+    turn_rad   : by which stars turn about the frame's center meanwhile, of the sign of streak_px; as in Blobs
 
     Raises ImageError for what are no such numbers.
     """
 
     streak_px: tuple[float, float] | None = None
     saturation: float = float("inf")
+    turn_rad: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "streak_px", checks.pixel_step("streak_px", self.streak_px))
         least = checks.number("saturation", self.saturation, -np.inf, np.inf, "a number; inf if unknown")
         object.__setattr__(self, "saturation", least)
+        turn_rad = checks.number("turn_rad", self.turn_rad, -1e300, 1e300, "a finite number")
+        object.__setattr__(self, "turn_rad", turn_rad)
 
 
 NO_PRIORS = FramePriors()
@@ -95,6 +99,8 @@ class Blobs:
     background: the level and noise used for the detection
     flag      : (N,) bits of `estimator.detection.classify.Flag`, 0 for a normal star
     streak_px : (dx, dy) by which the frame's stars are smeared, sign arbitrary; None if they are round or too few
+    turn_rad  : rotation of the stars about the frame's center c meanwhile, from the pixels' x to y: a star at (x, y)
+        is smeared by streak_px + turn_rad (c_y - y, x - c_x)
     """
 
     box_px: Ints
@@ -105,6 +111,7 @@ class Blobs:
     background: Background
     flag: Ints
     streak_px: tuple[float, float] | None = None
+    turn_rad: float = 0.0
 
     def __len__(self) -> int:
         return len(self.flux)

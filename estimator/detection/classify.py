@@ -4,6 +4,8 @@ The shape is described by second moments. A uniform line of length L has a varia
 across it by L^2 / 12, so 12 (xx - yy, 2 xy) = L^2 (cos 2a, sin 2a) gives length and direction a. In this form a line
 and its reverse are equal, and lines are averaged and compared as plain vectors. If most of the brightest blobs agree on
 one line, the frame is smeared (a streak); a line that differs from the others is a particle track or a satellite.
+Where the camera rolls about its boresight the streaks differ: v(x) = t + w J (x - c) with J (x, y) = (-y, x). Any two
+of them, each up to its sign, give t and w; if most of the brightest blobs agree on such a field, it is the frame's.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ MAX_NOISE_RATIO = 4.0  # local noise over the frame's median noise
 CLEAR_SIGMA = 10.0  # of a pixel: bright enough for its shape to be significant
 VOTING_BLOBS = 15  # number of brightest blobs that decide whether the frame is smeared
 VOTES = 0.6  # share of them that must agree
+SAME_TURNED = 5  # least number of streaks that show a roll: two determine it
 SAME_STREAKS, MIN_BROKEN_PX = 3, 12.0  # where streaks break up: least number of whole ones, and their least length
 # Shortest streak that most of the brightest blobs share, and shortest line of one blob: shorter ones are explained by
 # noise or, of one blob, by a pair of stars or defocus.
@@ -63,20 +66,21 @@ SATURATED, HOT, TRACK, HUGE, TEXTURE, TEXT = (int(flag) for flag in Flag)  # pla
 def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
     """Return the blobs with their flags, and with the streak (dx, dy) that the frame's stars share, if any.
 
-    The streak is that of the priors if given, otherwise the one that most of the brightest blobs share.
+    Streak and turn are those of the priors if given, otherwise the ones that most of the brightest blobs share.
     """
     if not len(blobs):
         return replace(blobs, streak_px=priors.streak_px)
     background = blobs.background
     shape = _shapes(image, blobs.box_px, background.level, background.noise)
     text = find_captions(blobs.box_px, blobs.peak)
-    streak_px = priors.streak_px
+    streak_px, turn_rad = priors.streak_px, priors.turn_rad
     if streak_px is None:
-        common_line = _common_line(shape[~text, 3:])
-        if common_line[0] ** 2 + common_line[1] ** 2 > MIN_STREAK_PX**4 and len(blobs) >= 3:
-            streak_px = _half_angle(common_line)
+        lines, center = shape[~text, 3:], ((image.shape[1] - 1) / 2, (image.shape[0] - 1) / 2)
+        x, y, turn_rad = _field(lines, blobs.xy_px[~text], center, _common_line(lines))
+        if turn_rad != 0 or (hypot(x, y) > MIN_STREAK_PX and len(blobs) >= 3):
+            streak_px = x, y
     else:
-        common_line = _double_angle(streak_px)
+        x, y = streak_px
     flag = _flags(
         shape,
         blobs.box_px,
@@ -84,12 +88,18 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
         blobs.peak,
         background.noise,
         image.shape,
-        common_line,
+        (x, y, turn_rad),
         streak_px is not None,
         priors.saturation,
         FILTERED_NOISE * (image.dtype.kind in "iu"),
     )
-    return replace(blobs, flag=flag | TEXT * text, streak_px=streak_px)
+    return replace(blobs, flag=flag | TEXT * text, streak_px=streak_px, turn_rad=turn_rad)
+
+
+def streaks_px(blobs: Blobs, shape: tuple[int, ...], streak_px: tuple[float, float]) -> Floats:
+    """Return the (N, 2) streak of each blob of an image of this shape, from that at its center and the blobs' turn."""
+    x, y = (blobs.xy_px - np.array([shape[1] - 1, shape[0] - 1]) / 2).T
+    return np.array(streak_px) + blobs.turn_rad * np.column_stack([-y, x])
 
 
 def moments(image: NDArray, blobs: Blobs) -> Floats:
@@ -107,26 +117,27 @@ def _flags(
     peak: Floats,
     noise: Floats,
     size: tuple[int, int],
-    common_line: tuple[float, float],
+    field: tuple[float, float, float],
     smeared: bool,
     saturation: float,
     step: float,
 ) -> Ints:
-    """Return the (N,) flags of each blob, from its row of `_shapes` and the line shared by the blobs.
+    """Return the (N,) flags of each blob, from its row of `_shapes` and the streaks shared by the blobs.
 
-    common_line: shared line as L^2 (cos 2a, sin 2a);  smeared : whether the frame has streaks
+    field  : shared streak (dx, dy) at the center, and turn;  smeared : whether the frame has streaks
     step   : floor of the noise, from quantization
     """
     height, width = size
     typical_noise, typical_width2 = max(median(noise), step), median(shape[:, 2])
-    shared2 = hypot(common_line[0], common_line[1])
-    max_side = max(MAX_SIZE_FRACTION * min(height, width) + sqrt(shared2), 16.0)
+    center = (width - 1) / 2, (height - 1) / 2
     flag = np.zeros(len(shape), np.int64)
     for n in range(len(shape)):
         peak_light, neighbor_light, width2, line_x, line_y = shape[n]
         local_noise = interpolate(noise, height, width, xy[n, 1], xy[n, 0])
         pixel_noise = local_noise / FILTERED_NOISE
-        diff2 = hypot(line_x - common_line[0], line_y - common_line[1])
+        shared_x, shared_y = _line_at(field, xy[n, 0] - center[0], xy[n, 1] - center[1])
+        shared2 = hypot(shared_x, shared_y)
+        diff2 = hypot(line_x - shared_x, line_y - shared_y)
         # 6 pixel_noise: three sigma of the sum of four pixels.
         spike = neighbor_light + 6 * pixel_noise < MIN_NEIGHBOR_RATIO * peak_light
         # A track differs from the shared line, is narrow, and is at least twice as long as wide (in rms).
@@ -138,6 +149,7 @@ def _flags(
         flag[n] |= SATURATED if peak[n] >= saturation else 0
         flag[n] |= HOT if spike else 0
         flag[n] |= TRACK if track else 0
+        max_side = max(MAX_SIZE_FRACTION * min(height, width) + sqrt(shared2), 16.0)
         flag[n] |= HUGE if side > max_side and not track else 0
         flag[n] |= TEXTURE if local_noise > MAX_NOISE_RATIO * typical_noise else 0
     return flag
@@ -156,16 +168,21 @@ def _common_line(lines: Floats) -> tuple[float, float]:
         return x, y
     for k in range(len(voting)):
         x, y = voting[k]
-        square = hypot(x, y)
-        if square < MIN_BROKEN_PX**2 or _count_same(voting, x, y) < SAME_STREAKS:
+        if hypot(x, y) < MIN_BROKEN_PX**2 or _count_same(voting, x, y) < SAME_STREAKS:
             continue
-        parallel = 0
-        for n in range(len(voting)):
-            along, across = voting[n, 0] * x + voting[n, 1] * y, voting[n, 1] * x - voting[n, 0] * y
-            parallel += abs(across) < SAME_LINE * along < SAME_LINE * (1 + SAME_LINE) * square**2
-        if parallel > VOTES * len(voting):
+        if _count_pieces(voting, x, y) > VOTES * len(voting):
             return x, y
     return 0.0, 0.0
+
+
+@jit
+def _count_pieces(lines: Floats, x: float, y: float) -> int:
+    """Number of lines that are parallel to one and no longer."""
+    pieces, square = 0, hypot(x, y)
+    for n in range(len(lines)):
+        along, across = lines[n, 0] * x + lines[n, 1] * y, lines[n, 1] * x - lines[n, 0] * y
+        pieces += abs(across) < SAME_LINE * along < SAME_LINE * (1 + SAME_LINE) * square**2
+    return pieces
 
 
 @jit
@@ -177,15 +194,85 @@ def _count_same(lines: Floats, x: float, y: float) -> int:
     return same
 
 
-def _double_angle(streak_px: tuple[float, float]) -> tuple[float, float]:
+@jit
+def _field(
+    lines: Floats, xy: Floats, center: tuple[float, float], line: tuple[float, float]
+) -> tuple[float, float, float]:
+    """Return the streak (dx, dy) at the center and the turn shared by most of the brightest blobs.
+
+    The turn is 0, and the streak that of the common line, unless a blob would be a track then, and another field, given
+    by two of the blobs, agrees with more of them, and with no fewer than are pieces of a long line.
+    """
+    count, tracks = min(len(lines), VOTING_BLOBS), 0
+    dx, dy = _half_angle(line)
+    best = dx, dy, 0.0
+    for n in range(count):
+        diff2 = hypot(lines[n, 0] - line[0], lines[n, 1] - line[1])
+        tracks += diff2 > max(MIN_TRACK_PX**2, SAME_LINE * hypot(line[0], line[1]))
+    if not tracks:
+        return best
+    best_score = max(int(_agreement(lines, xy, center, best)[0]), int(VOTES * count)) + 1.0
+    if hypot(dx, dy) >= MIN_BROKEN_PX:
+        best_score = max(best_score, float(_count_pieces(lines[:count], line[0], line[1])))
+    for m in range(count):
+        first = _half_angle((lines[m, 0], lines[m, 1]))
+        for n in range(m + 1, count):
+            x, y = _half_angle((lines[n, 0], lines[n, 1]))
+            for second in ((x, y), (-x, -y)):
+                field = _field_of_two(xy[m], first, xy[n], second, center)
+                score, streaks = _agreement(lines, xy, center, field)
+                if score > best_score and streaks >= SAME_TURNED:
+                    best, best_score = field, score
+    return best
+
+
+@jit
+def _field_of_two(
+    start: Floats,
+    first: tuple[float, float],
+    end: Floats,
+    second: tuple[float, float],
+    center: tuple[float, float],
+) -> tuple[float, float, float]:
+    """Field of two streaks at two places by least squares: the turn from their difference, the rest from their mean."""
+    x, y = end[0] - start[0], end[1] - start[1]
+    turn = ((second[1] - first[1]) * x - (second[0] - first[0]) * y) / max(x * x + y * y, 1.0)
+    mean_x, mean_y = (start[0] + end[0]) / 2 - center[0], (start[1] + end[1]) / 2 - center[1]
+    return (first[0] + second[0]) / 2 + turn * mean_y, (first[1] + second[1]) / 2 - turn * mean_x, turn
+
+
+@jit
+def _agreement(
+    lines: Floats, xy: Floats, center: tuple[float, float], field: tuple[float, float, float]
+) -> tuple[float, int]:
+    """Return how many of the brightest blobs are like a field's streaks, with how like as a fraction, and streaks."""
+    score, streaks, count = 0.0, 0, min(len(lines), VOTING_BLOBS)
+    for n in range(count):
+        x, y = _line_at(field, xy[n, 0] - center[0], xy[n, 1] - center[1])
+        square = hypot(x, y)
+        off = hypot(lines[n, 0] - x, lines[n, 1] - y) / (SAME_LINE * square + MIN_STREAK_PX**2)
+        if off < 1:
+            score += 1 + (1 - off) / (count + 1)
+            streaks += hypot(lines[n, 0], lines[n, 1]) > MIN_STREAK_PX**2
+    return score, streaks
+
+
+@jit
+def _line_at(field: tuple[float, float, float], x: float, y: float) -> tuple[float, float]:
+    """The line L^2 (cos 2a, sin 2a) of a field's streak at a place from the center."""
+    return _double_angle(field[0] - field[2] * y, field[1] + field[2] * x)
+
+
+@jit
+def _double_angle(x: float, y: float) -> tuple[float, float]:
     # (dx, dy) to L^2 (cos 2a, sin 2a).
-    x, y = streak_px
-    return float(x * x - y * y), float(2 * x * y)
+    return x * x - y * y, 2 * x * y
 
 
+@jit
 def _half_angle(line: tuple[float, float]) -> tuple[float, float]:
     # L^2 (cos 2a, sin 2a) to (dx, dy).
-    length, angle = sqrt(hypot(*line)), atan2(line[1], line[0]) / 2
+    length, angle = sqrt(hypot(line[0], line[1])), atan2(line[1], line[0]) / 2
     return length * cos(angle), length * sin(angle)
 
 

@@ -29,6 +29,7 @@ MIN_GROWN_PX = 8  # smallest area of a blob that is significant only as a whole
 FEW_STARS, DIRECTIONS, SEARCH_LENGTH_PX = 8, 8, 10.0
 LARGE_PX = 150  # a blob this large is not a faint streak, and a line filter finds many in its noise
 MAX_STREAK_PX = 1024  # longest streak filtered for: a longer one spreads the star too thinly
+MAX_TURN_PX = 4.0  # largest difference of streaks by a roll, at the corners, for which they are filtered along one
 MIN_STREAK_AREA_PX = 5  # noise averaged along a line is correlated: several pixels exceed the threshold
 THESIS_INTENSITY, THESIS_AREA_PX = 0.04, 50
 
@@ -66,7 +67,10 @@ def default(
 def _classified(image: NDArray, threshold_sigma: float, min_area_px: int, max_blobs: int, priors: FramePriors) -> Blobs:
     """The brightest blobs with their flags, detected with the filter along the frame's streak if it is smeared."""
     background = estimate_background(image)
-    if priors.streak_px is None or not 2 <= max(map(abs, priors.streak_px)) <= MAX_STREAK_PX:
+    # Where a roll makes the streaks differ by more at the corners, no filter along one of them is that of all.
+    largest_turn_rad = MAX_TURN_PX / np.hypot(*image.shape) * 2
+    known = priors.streak_px is not None and abs(priors.turn_rad) <= largest_turn_rad
+    if not known or not 2 <= max(map(abs, priors.streak_px or ())) <= MAX_STREAK_PX:
         blobs = detect_blobs(image, background, threshold_sigma * background.noise, min_area_px, max_blobs, GROW_SIGMA)
         blobs = classify.classify(image, blobs, priors)
         if blobs.streak_px is None:
@@ -76,10 +80,10 @@ def _classified(image: NDArray, threshold_sigma: float, min_area_px: int, max_bl
                 return blobs
             faint = detect_faint_streaks(image, background, threshold_sigma, max_blobs, priors)
             return classify.classify(image, faint, priors) if len(faint) > stars + 1 else blobs
-        if max(map(abs, blobs.streak_px)) > MAX_STREAK_PX:
+        if abs(blobs.turn_rad) > largest_turn_rad or max(map(abs, blobs.streak_px)) > MAX_STREAK_PX:
             return blobs
         # The bright blobs have revealed the streak: detect again with the filter along it.
-        priors = FramePriors(blobs.streak_px, priors.saturation)
+        priors = FramePriors(blobs.streak_px, priors.saturation, blobs.turn_rad)
     streaks = detect_streaks(image, background, threshold_sigma, max_blobs, priors)
     return classify.classify(image, streaks, priors)
 

@@ -167,10 +167,11 @@ def detect_and_centroid(
     settings: Settings,
     clock: Clock,
     streak_px: tuple[float, float] | None = None,
+    turn_rad: float = 0.0,
 ) -> Centroids:
     """Detect blobs and compute their centroids, without those that cannot be stars or are too inaccurate.
 
-    streak_px : (dx, dy) that stars move during the exposure, from the gyro; None if unknown
+    streak_px, turn_rad : of FramePriors, from the gyro; None if unknown
     Raises ImageError for a frame of another shape than the camera's, or a saturated one.
     """
     check_frame(image, camera)
@@ -181,7 +182,7 @@ def detect_and_centroid(
             raise ImageError(f"{SATURATED}: over half of its pixels are at {settings.saturation:g}")
     if settings.bad_px is not None:
         image = replace_bad_pixels(image, settings.bad_px)
-    priors = FramePriors(streak_px, settings.saturation)
+    priors = FramePriors(streak_px, settings.saturation, turn_rad)
     blobs = DETECTORS[settings.detector](
         image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, priors
     )
@@ -229,10 +230,10 @@ def process_frame(
 
     Without streak_px, a rate of known sign and the exposure time give the streak.
     """
-    clock = Clock()
+    clock, turn_rad = Clock(), 0.0
     if streak_px is None and rate is not None and rate.sign_known and exposure_s is not None:
-        streak_px = center_streak_px(camera, rate, exposure_s)
-    centroids = detect_and_centroid(image, camera, settings, clock, streak_px)
+        streak_px, turn_rad = center_streak_px(camera, rate, exposure_s), -float(rate.rate_rad_s[2]) * exposure_s
+    centroids = detect_and_centroid(image, camera, settings, clock, streak_px, turn_rad)
     return Report(solve(centroids, clock), centroids, clock.seconds)
 
 

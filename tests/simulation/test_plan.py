@@ -304,6 +304,12 @@ def test_a_solver_s_own_error_is_a_cause() -> None:
         ),
         (
             "afit_simsat",
+            {"vehicle__imu": "{}", "filter": "{}"},
+            "filter.time_tag_sigma",
+            "err by 1 ms (exposure.time_tag_jitter), in which the vehicle turns by 18″ at 5 deg/s; change it to 1 ms",
+        ),
+        (
+            "afit_simsat",
             {"tracker__survey__instrument": STATION + ", zero_sigma: 20 mm}", "camera__focal_length": "20 mm"},
             "tracker.survey.instrument",
             "matching radius",

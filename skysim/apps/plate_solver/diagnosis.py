@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from estimator.core.camera import Camera
 from estimator.core.types import Blobs, Centroids, FramePriors
+from estimator.detection.classify import streaks_px
 from estimator.detection.detect import DETECTORS
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.trackers.pipeline import Clock
@@ -151,7 +152,8 @@ def trailed(refusal: Refusal) -> str:
     """The brightest blobs are parallel lines: the detector's streak, or most of a few are long for their area."""
     blobs = refusal.blobs
     if blobs.streak_px is not None:
-        return TRAILS.format(math.hypot(*blobs.streak_px))
+        trails_px = streaks_px(blobs, refusal.image.shape, blobs.streak_px)
+        return TRAILS.format(np.median(np.hypot(*trails_px.T)))
     sides_px, area_px = brightest_shapes(blobs)
     lengths_px, angle_rad = np.hypot(*sides_px.T), np.arctan2(*sides_px.T)
     lines = (lengths_px >= TRAIL_PX) & (lengths_px**2 >= THIN * area_px)

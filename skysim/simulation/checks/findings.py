@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig, TwoStopsConfig
 from skysim.scene.sections.layouts import FibersConfig, Layout, LcdConfig
@@ -34,6 +35,7 @@ MAX_BEYOND = 0.25  # fraction of the images that may lie beyond the tracker's ma
 MAX_SMEAR_PX, MAX_SMEAR_WIDTHS = 4.0, 2.0  # a path that is longer than both gives a warning; in widths of the image
 MAX_DEFOCUS = 0.5  # width of the defocus disk over that of the image in focus
 MIN_DEFOCUS_PX = 1.0
+MAX_TAG_RATIO, MAX_TAG_ARCSEC = 1.3, 1.0  # error of frames' times over the filter's claim; and the turn in that time
 
 
 def saturation(context: Context, samples: Samples) -> str:
@@ -305,6 +307,23 @@ def long_smear(context: Context, samples: Samples) -> str:
     )
 
 
+def unknown_tag_error(context: Context, samples: Samples) -> str:
+    """Warn where frames' times err by more than the filter assumes, and the vehicle turns in that time."""
+    scene = context.testbed.scene
+    sigma_s = float(scene.exposure.time_tag_jitter_s)
+    if scene.filter is None or sigma_s <= MAX_TAG_RATIO * scene.filter.time_tag_sigma_s:
+        return ""
+    rate_rad_s = float(np.linalg.norm(samples.frames.attitudes.rate_body_rad_s, axis=1).max())
+    turn_arcsec = sigma_s * rate_rad_s / ARCSEC_RAD
+    if turn_arcsec <= MAX_TAG_ARCSEC:
+        return ""
+    return (
+        f"filter.time_tag_sigma: frames' times err by {short(1e3 * sigma_s, 2)} ms (exposure.time_tag_jitter), in which"
+        f" the vehicle turns by {short(turn_arcsec, 2)}″ at {math.degrees(rate_rad_s):.3g} deg/s; change it to"
+        f" {short(1e3 * sigma_s, 2)} ms"
+    )
+
+
 FINDINGS: tuple[Callable[[Context, Samples], str], ...] = (
     bright_background,
     saturation,
@@ -315,4 +334,5 @@ FINDINGS: tuple[Callable[[Context, Samples], str], ...] = (
     out_of_focus,
     long_smear,
     not_where_expected,
+    unknown_tag_error,
 )

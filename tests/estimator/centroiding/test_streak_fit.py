@@ -381,7 +381,7 @@ def test_a_fit_uses_every_pixel_near_its_line_and_no_other() -> None:
         changed = image.copy()
         if at is not None:
             changed[at] += 100.0
-        return plain.fit_all(changed, np.array([[20.0, 20.0]]), box, 0 * grid, grid, streak_px, 1.0, 1e9)
+        return plain.fit_all(changed, np.array([[20.0, 20.0]]), box, 0 * grid, grid, np.array([streak_px]), 1.0, 1e9)
 
     y, x = np.mgrid[:41, :41]
     u, v = ((x - 20) * 8 - (y - 20) * 6) / 10, ((x - 20) * 6 + (y - 20) * 8) / 10

@@ -3,14 +3,15 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
-from estimator.core.types import Blobs, Centroids, FramePriors
+from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, RateEstimate
 from estimator.detection import classify, detect
 from estimator.detection.classify import NO_STAR, Flag
-from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
+from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid, process_frame
 
 SHAPE = (493, 659)
 CAMERA = Camera.from_fov(659, 493, np.radians(14.87))
@@ -178,6 +179,90 @@ def test_a_hot_pixel_is_no_star_of_a_smeared_frame() -> None:
         blobs = detect.default(image, priors=FramePriors(known))
         assert [flags_near(blobs, x, y) for x, y in hot] == [Flag.HOT] * 2
         assert np.count_nonzero(blobs.flag == 0) == 15
+
+
+def rolled_frame(seed: int, turn_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A frame of 15 stars while the camera turns by this (3,) about its axes, and their places at mid-exposure."""
+    rng, light = np.random.default_rng(seed), np.zeros(SHAPE)
+    xy = sky_frame(rng, 15, 0.7)[1]
+    rays = CAMERA.rays(xy)
+    for part in (np.arange(120) + 0.5) / 120 - 0.5:
+        for at in CAMERA.pixels(Rotation.from_rotvec(-part * turn_rad).apply(rays)):
+            x, y = np.rint(at).astype(int) - 6
+            light[y : y + 13, x : x + 13] += star(*(at - [x, y]), 2e4 / 120, 0.7, (13, 13))
+    return exposed(rng, light), xy
+
+
+HOT_PX = [(25, 25), (640, 480), (8, 250), (650, 8)]
+
+
+@pytest.mark.parametrize("rate_known", [False, True])
+@pytest.mark.parametrize("streak", [(0.0, 0.0), (4.0, 0.0), (10.0, -6.0), (20.0, 5.0)])
+@pytest.mark.parametrize("turn_rad", [0.025, -0.045])
+def test_streaks_that_a_roll_makes_differ_are_stars(
+    streak: tuple[float, float], turn_rad: float, rate_known: bool
+) -> None:
+    """By 20 or 37 px between opposite corners; the four brightest lights are hot pixels. From a gyro or the frame."""
+    across = np.array([streak[1], -streak[0]]) / CAMERA.focal_px
+    image, xy = rolled_frame(49, np.array([*across, -turn_rad]))
+    for x, y in HOT_PX:
+        image[y, x] += 20_000
+    rate = RateEstimate(np.array([*across, -turn_rad]) / 0.1, 1e-12 * np.eye(3)) if rate_known else None
+    seen = process_frame(image, CAMERA, Settings(), lambda *_: Attitude("no_solution"), None, rate, 0.1).centroids
+    assert len(seen) == 15
+    assert off_px(seen, xy).max() < 0.15
+    assert seen.covariance_px2 is not None
+    nearest = np.linalg.norm(seen.xy_px[None] - xy[:, None], axis=2).argmin(axis=1)
+    error = (seen.xy_px[nearest] - xy)[:, :, None]
+    chi2 = np.swapaxes(error, 1, 2) @ np.linalg.solve(seen.covariance_px2[nearest], error)
+    assert chi2.mean() < 2 * 2  # where an arc's mean were taken for its middle, up to 2 * 13
+    blobs = detect.default(image)
+    assert [flags_near(blobs, x, y) & Flag.HOT for x, y in HOT_PX] == [Flag.HOT] * 4
+    assert np.count_nonzero(blobs.flag == 0) == 15
+    assert blobs.streak_px is not None
+    if any(streak):  # the sign of one frame is arbitrary
+        turn_rad *= np.sign(np.dot(blobs.streak_px, streak))
+        assert blobs.turn_rad == pytest.approx(turn_rad, rel=0.1)
+        assert np.abs(blobs.streak_px) == pytest.approx(np.abs(streak), abs=0.5)
+
+
+def test_a_track_among_streaks_of_a_roll_is_flagged() -> None:
+    image, _ = rolled_frame(49, np.array([0.0, 10.0 / CAMERA.focal_px, 0.03]))
+    track = sum(star(20 + t, 20 - t, 900.0, 0.7, (41, 41)) for t in np.arange(-12, 12, 0.25))
+    image[240:281, 290:331] += np.rint(track).astype(np.uint16)
+    blobs = detect.default(image)
+    assert blobs.turn_rad != 0
+    assert blobs.flag[blobs.flag != 0].tolist() == [Flag.TRACK]
+    assert flags_near(blobs, 310, 260) == Flag.TRACK
+
+
+def add_line(light: np.ndarray, at: tuple[int, int], angle: float) -> None:
+    """Draw a line of 16 px in the 41 pixels from a place."""
+    for t in np.arange(-8, 8, 0.25):
+        x, y = 20 + t * np.cos(angle), 20 + t * np.sin(angle)
+        light[at[1] : at[1] + 41, at[0] : at[0] + 41] += star(x, y, 900.0, 0.7, (41, 41))
+
+
+def test_tracks_among_round_stars_make_no_roll() -> None:
+    """Of three tracks and the sky, any two lines give a turn, but the stars are round."""
+    rng = np.random.default_rng(50)
+    light, _ = sky_frame(rng, 15, 0.7)
+    for at, angle in (((20, 20), 0.4), ((560, 20), 2.0), ((20, 430), 1.2)):
+        add_line(light, at, angle)
+    blobs = detect.default(exposed(rng, light))
+    assert blobs.turn_rad == 0
+    assert np.count_nonzero(blobs.flag == Flag.TRACK) == 3
+    assert np.count_nonzero(blobs.flag == 0) == 15
+
+
+def test_three_tracks_make_no_roll() -> None:
+    """Any two lines agree with some field: five must."""
+    light = np.zeros(SHAPE)
+    for at, angle in (((100, 100), 0.4), ((500, 120), 2.0), ((220, 400), 1.2)):
+        add_line(light, at, angle)
+    blobs = detect.default(exposed(np.random.default_rng(52), light))
+    assert len(blobs) == 3
+    assert blobs.turn_rad == 0
 
 
 @pytest.mark.parametrize(("peak_sigma", "flag"), [(6.0, 0), (30.0, Flag.TRACK)])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import example, given
@@ -192,6 +194,22 @@ def test_a_verdict_changes_flags_alone(
     taken = told.take(order)
     for name in ("box_px", "xy_px", "flux", "peak", "area_px", "flag"):
         np.testing.assert_array_equal(getattr(taken, name), getattr(told, name)[order])
+
+
+@law(classify.streaks_px)
+@given(rng=SEEDS, turn_rad=some.floats(-0.5, 0.5), streak_px=STREAKS)
+def test_streaks_of_a_roll_differ_across_their_separation(
+    rng: np.random.Generator, turn_rad: float, streak_px: tuple[float, float] | None
+) -> None:
+    """By the turn times it; their mean over a frame's four corners is the streak at its center."""
+    blobs = replace(DETECTORS["local"](starry(rng)[0], 5.0, 3, 4, FramePriors()), turn_rad=turn_rad)
+    given_px = streak_px or (0.0, 0.0)
+    corners = np.array([(0, 0), (0, HEIGHT - 1), (WIDTH - 1, 0), (WIDTH - 1, HEIGHT - 1)], float)
+    at_corners = classify.streaks_px(replace(blobs, xy_px=corners), (HEIGHT, WIDTH), given_px)
+    np.testing.assert_allclose(at_corners.mean(axis=0), given_px, rtol=0, atol=1e-12)
+    streaks = classify.streaks_px(blobs, (HEIGHT, WIDTH), given_px)
+    apart, differ = (each[1:] - each[0] for each in (blobs.xy_px, streaks))
+    np.testing.assert_allclose(differ, turn_rad * apart[:, ::-1] * [-1, 1], rtol=0, atol=1e-9)
 
 
 @law(windows.in_windows)
