@@ -80,6 +80,7 @@ class Workload:
 PTASE_PX = 1024
 SHEFEX = (14.87, 11.15)
 DENSE = ((17, 13), 1024, 6.0, 0.2)
+NARROW = (6, 6), 1024, 7.5, 0.2
 WORKLOADS = (
     Workload("PTASE", (20, 20), PTASE_PX, 6.0, 3 * ARCSEC_RAD * PTASE_PX / 2 / np.tan(np.radians(10))),
     Workload("SHEFEX", SHEFEX, 659, 5.75, 0.1, brightest=15, bar_percent=100, bar_ms=0.05),
@@ -87,32 +88,12 @@ WORKLOADS = (
     Workload("SHEFEX, .5 px, a fifth false", SHEFEX, 659, 5.75, 0.5, brightest=15, false_share=0.2),
     Workload("hard, V < 6.5", (10, 7.5), 1024, 6.5, 1.0, false=3, missing=0.2),
     Workload("hard, V < 7", (10, 7.5), 1024, 7.0, 1.0, false=3, missing=0.2),
-    Workload("17 x 13 deg, half false", (17, 13), 1024, 6.0, 0.2, false_share=0.5, bar_percent=99.5),
-    Workload("17 x 13 deg, 70 % false", (17, 13), 1024, 6.0, 0.2, false_share=0.7, bar_percent=97, bar_ms=5),
-    Workload(
-        "the same, half false, brighter",
-        (17, 13),
-        1024,
-        6.0,
-        0.2,
-        false_share=0.5,
-        false_brighter=True,
-        bar_percent=98,
-        bar_ms=20,
-    ),
-    Workload("6 x 6 deg, 70 % false", (6, 6), 1024, 7.5, 0.2, false_share=0.7, bar_percent=92),
-    Workload("6 x 6 deg, 25 hot pixels, a lattice", (6, 6), 1024, 7.5, 0.2, lattice=5, bar_percent=98, bar_ms=10),
-    Workload(
-        "the same, brighter than any star",
-        (6, 6),
-        1024,
-        7.5,
-        0.2,
-        lattice=5,
-        false_brighter=True,
-        bar_percent=98,
-        bar_ms=10,
-    ),
+    Workload("17 x 13 deg, half false", *DENSE, false_share=0.5, bar_percent=99.5),
+    Workload("17 x 13 deg, 70 % false", *DENSE, false_share=0.7, bar_percent=97, bar_ms=5),
+    Workload("the same, half false, brighter", *DENSE, false_share=0.5, false_brighter=True, bar_percent=98, bar_ms=20),
+    Workload("6 x 6 deg, 70 % false", *NARROW, false_share=0.7, bar_percent=92),
+    Workload("6 x 6 deg, 25 hot pixels, a lattice", *NARROW, lattice=5, bar_percent=98, bar_ms=10),
+    Workload("the same, brighter than any star", *NARROW, lattice=5, false_brighter=True, bar_percent=98, bar_ms=10),
     Workload("35 x 20 deg, 70 % false", (35, 20), 1280, 5.5, 0.2, false_share=0.7, bar_percent=99),
     Workload("23 x 23 deg, 70 % false", (23, 23), 1024, 5.5, 0.2, false_share=0.7, bar_percent=97),
     Workload(

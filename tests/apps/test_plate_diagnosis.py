@@ -110,7 +110,7 @@ def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None)
             *(np.array, 11.1, r"^perhaps another field of view: it solves with --fov 14\.8$"), marks=pytest.mark.slow
         ),
         pytest.param(spread(disk(30)), FOV_DEG, r"^blobs of 6\d px: out of focus\?$", marks=pytest.mark.slow),
-        # sqrt(400^2 + 200^2) = 447, and the width of a star; trails of 168 px are solved
+        # sqrt(400^2 + 200^2) = 447, and the width of a star
         pytest.param(spread(trail(400)), FOV_DEG, r"^trails of 4[45]\d px: ", marks=pytest.mark.slow),
         (bleach, FOV_DEG, r"^overexposed: 80% of the pixels are at 255; "),
         (noise, 20.0, r"^too few lights \(0\): "),
@@ -125,6 +125,16 @@ def test_each_cause_is_named(change: Change, fov_deg: float, says: str) -> None:
     assert hint(photograph(), FOV_DEG) == ""
     told = hint(np.ascontiguousarray(change(photograph())), fov_deg)
     assert re.search(says, told), told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length_px", [60, 150])
+def test_long_trails_are_solved_at_the_true_attitude(length_px: int) -> None:
+    centered = trail(length_px)[: length_px // 2 + 1]  # the whole kernel would move the stars by a quarter of its side
+    report, _ = plate_solver.solve_array(spread(centered)(photograph()), make_solver(FOV_DEG, None), None)
+    pointing = plate_solver.solution_fields(report)
+    ours, truth = (stars.cam_from_icrs(*angles) for angles in ([pointing[k] for k in ANGLES], (83.0, 2.0, 20.0)))
+    assert math.degrees((ours * truth.inv()).magnitude()) < 0.05
 
 
 def test_short_trails_are_those_that_the_detector_measures() -> None:
