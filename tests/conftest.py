@@ -10,7 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Collection, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +64,7 @@ def with_imports(source: Path, uses: Mapping[Path, set[Path]]) -> set[Path]:
     return found
 
 
-COMPILED = pytest.StashKey[tuple[Path, ThreadPoolExecutor]]()
+COMPILED = pytest.StashKey[tuple[Path, list[Future[None]]]]()
 # Modules run as commands, one group per process. Whatever two groups need is compiled once, by the first that needs it.
 TRACKER, FRAME = "skysim.simulation.compilation", ("--frames", "1", "--out", "{folder}")
 BLIND = "skysim", "solve", "{folder}/frame_0000.png"
@@ -78,10 +78,10 @@ GROUPS: tuple[Sequence[Sequence[str]], ...] = (
 def pytest_xdist_setupnodes(config: pytest.Config) -> None:
     """Fill numba's cache, if it is empty, while the workers of xdist collect; each of them would compile everything."""
     if config.args == config.getini("testpaths") and not any(ROOT.glob("estimator/*/__pycache__/*.nbi")):
-        config.stash[COMPILED] = Path(tempfile.mkdtemp()), ThreadPoolExecutor()
-        folder, pool = config.stash[COMPILED]
+        folder, pool = Path(tempfile.mkdtemp()), ThreadPoolExecutor()
         groups = [pool.submit(run_modules, group, folder) for group in GROUPS]
         pool.submit(lambda: (wait(groups), (folder / "done").touch()))
+        config.stash[COMPILED] = folder, groups
 
 
 def run_modules(group: Sequence[Sequence[str]], folder: Path) -> None:
@@ -106,8 +106,10 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
-    """Remove what the compilation left."""
+    """Remove what the compilation left, and raise what it raised."""
     if COMPILED in config.stash:
-        folder, pool = config.stash[COMPILED]
-        pool.shutdown()
-        shutil.rmtree(folder)
+        folder, groups = config.stash[COMPILED]
+        wait(groups)
+        shutil.rmtree(folder, ignore_errors=True)
+        for group in groups:
+            group.result()

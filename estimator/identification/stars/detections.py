@@ -97,6 +97,11 @@ def changed(detections: Detections, count: int, variance: float, focal_uncertain
     )
 
 
+def information_of(weight: Floats) -> Floats:
+    """(N, 2, 2) inverse covariances of the tangents, from rows of `Detections.weight`."""
+    return np.asarray(weight[:, [0, 2, 2, 1]].reshape(-1, 2, 2))
+
+
 @jit
 def ray(tangent: Floats, n: int, focal_ratio: float) -> vectors.Vector:
     """Unit vector of detection n in camera axes, for a focal length `focal_ratio` times the assumed one."""

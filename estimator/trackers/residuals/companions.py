@@ -18,7 +18,7 @@ from estimator.catalog.sky_index import SkyIndex
 from estimator.core.arrays import Floats
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.stars import evidence
-from estimator.identification.stars.detections import Detections
+from estimator.identification.stars.detections import Detections, information_of
 from estimator.identification.stars.evidence import Solution
 
 ARCSEC_RAD = np.pi / 180 / 3600
@@ -47,7 +47,7 @@ def with_companions(solution: Solution, detections: Detections, sky: SkyIndex) -
         seen = Rotation.from_quat(best.cam_from_ref_xyzw).apply(sky.vectors[best.star])
         view = geometry(seen, seen)
         residual = detections.tangent[best.observed] - best.focal_ratio * view.tangent
-        own, used = (_matrices(one.weight[best.observed]) for one in (detections, changed))
+        own, used = (information_of(one.weight[best.observed]) for one in (detections, changed))
         alone, spread = prediction_by_others(residual, view.jacobian, used)
         mean = mean_information(own, alone, spread)
         before = changed.weight[best.observed]
@@ -96,8 +96,3 @@ def mean_information(information: Floats, residual: Floats, spread: Floats) -> F
     probability = np.exp(log_density - log_density.max(axis=0))
     probability /= probability.sum(axis=0)
     return np.asarray(np.einsum("jk,jkim->kim", probability, np.linalg.inv(covariance)), dtype=float)
-
-
-def _matrices(weight: Floats) -> Floats:
-    """(K, 2, 2) of rows xx, yy, xy."""
-    return np.asarray(weight[:, [0, 2, 2, 1]].reshape(-1, 2, 2))

@@ -25,7 +25,14 @@ from estimator.core.jit import jit
 from estimator.core.least_squares import PRIOR_RIGHT, variance_factor
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.stars import evidence, search
-from estimator.identification.stars.detections import Detections, FlatCentroids, Sensor, changed, detections_of
+from estimator.identification.stars.detections import (
+    Detections,
+    FlatCentroids,
+    Sensor,
+    changed,
+    detections_of,
+    information_of,
+)
 from estimator.identification.stars.evidence import Solution
 
 TELLING = 1.5  # variance factor above which matches and lens are tried anew
@@ -182,8 +189,8 @@ def with_lens(
     beyond GATE_SIGMA of the errors that the last one found. The covariance is that of the attitude, whatever the lens.
     """
     cam_from_ref, keep = Rotation.from_quat(solution.cam_from_ref_xyzw), np.ones(len(solution.star), bool)
-    xx, yy, xy = detections.weight[solution.observed].T
-    whiten = np.linalg.cholesky(np.moveaxis(np.array([[xx, xy], [xy, yy]]), 2, 0)).swapaxes(1, 2)
+    information = information_of(detections.weight[solution.observed])
+    whiten = np.asarray(np.linalg.cholesky(information), dtype=float).swapaxes(1, 2)
     vectors_ref, xy_px = sky.vectors[solution.star], xy_px[solution.observed]
     corner2 = float(np.sum(np.square(detections.field[[0, 2]])))
     prior = np.diag([0.0, 0.0, 0.0, 1 / FOCAL_PRIOR**2, (corner2 / CORNER_PRIOR) ** 2])

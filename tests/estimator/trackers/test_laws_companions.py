@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids
+from estimator.identification.stars.detections import information_of
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.residuals import companions
 from estimator.trackers.residuals.companions import ARCSEC_RAD, ERROR_RAD, SHARE
@@ -67,6 +68,14 @@ def test_coarse_centroids_know_nothing_of_companions(tracker: StarTracker, seed:
     assert not companions.are_small(detections.sigma / 3)
     assert after is solution
     assert errors is detections
+
+
+@law(information_of)
+@given(seed=some.integers(0, 10**6))
+def test_the_information_holds_each_weight_at_its_axes(seed: int) -> None:
+    weight = np.random.default_rng(seed).standard_normal((5, 3))
+    for row, matrix in zip(weight, information_of(weight), strict=True):
+        assert matrix.tolist() == [[row[0], row[2]], [row[2], row[1]]]
 
 
 @law(companions.prediction_by_others)
