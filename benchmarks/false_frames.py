@@ -1,7 +1,7 @@
 """False-alarm rate: how often the tracker answers frames that do not show the sky, or hardly.
 
-`python -m benchmarks.false_frames [FRAMES] [SEED]`, with the cameras of `lost_in_space`, prints the number of answers
-and of wrong ones for three kinds of frames:
+`python -m benchmarks.false_frames [FRAMES] [SEED] [KIND ...]`, with the cameras of `lost_in_space`, prints the number
+of answers and of wrong ones for three kinds of frames, or for those named:
 
     no star   : 3 to 30 lights at uniform random positions, with magnitudes of the catalog; FRAMES of them
     mirrored  : a workload's field with its columns reversed, which no rotation of the sky gives; FRAMES / 10
@@ -102,10 +102,11 @@ def count_answers(kind: str, first: int, count: int, seed: int) -> dict[str, lis
     return out
 
 
-def run(count: int, seed: int) -> None:
-    """Count all kinds in PROCESSES processes, and print the counts so far after every BATCH frames."""
+def run(count: int, seed: int, kinds: list[str]) -> None:
+    """Count some kinds in PROCESSES processes, and print the counts so far after every BATCH frames."""
     with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("spawn")) as pool:
-        for kind, (_, share) in KINDS.items():
+        for kind in kinds:
+            share = KINDS[kind][1]
             frames, rows, begin = round(share * count), {}, time.perf_counter()
             firsts = range(0, frames, BATCH)
             sizes = [min(BATCH, frames - first) for first in firsts]
@@ -124,4 +125,5 @@ def run(count: int, seed: int) -> None:
 
 
 if __name__ == "__main__":
-    run(*(int(one) for one in (sys.argv[1:3] + ["100000", "1"][len(sys.argv[1:3]) :])))
+    numbers = sys.argv[1:3] + ["100000", "1"][len(sys.argv[1:3]) :]
+    run(int(numbers[0]), int(numbers[1]), sys.argv[3:] or list(KINDS))
