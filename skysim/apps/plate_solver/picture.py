@@ -20,7 +20,7 @@ from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.plate_solver import retries
 from skysim.apps.plate_solver.solution import PlateSolution, annotated_image, solution_fields
-from skysim.apps.plate_solver.solver import FOV_LIMITS_DEG, Solver, make_solver, solve_array, validated_date
+from skysim.apps.plate_solver.solver import FOV_LIMITS_DEG, Solver, kept_solver, make_solver, solve_array, validated_date
 from skysim.core.errors import InputError
 from skysim.core.io import files, images
 
@@ -68,8 +68,12 @@ def solve(
 
     Raises InputError with one line for an image that cannot be read.
     """
-    names = Path(camera) if camera else None, str(catalog) if catalog else None
-    solver = make_solver(fov_deg, names[0], time_utc=time_utc, catalog=names[1])
+    if camera or catalog:
+        solver = make_solver(
+            fov_deg, Path(camera) if camera else None, time_utc, catalog=str(catalog) if catalog else None
+        )
+    else:
+        solver = kept_solver(fov_deg, time_utc)
     result = solve_file(Path(path), solver, None)
     if result["bad_input"]:
         raise InputError(result["status"])

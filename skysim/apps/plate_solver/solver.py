@@ -14,6 +14,7 @@ as large (`FieldSearch.margin_dex`). N includes the hypotheses about a picture (
 from __future__ import annotations
 
 import datetime
+import functools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -208,6 +209,15 @@ def make_solver(
         check_stages(stages)
         settings = replace(settings, **stages)  # type: ignore[arg-type]
     return Solver(fov_deg, camera, read_catalog(catalog), settings, time_utc, lens)
+
+
+@functools.lru_cache(maxsize=1)
+def kept_solver(fov_deg: float | None, time_utc: datetime.datetime | None = None) -> Solver:
+    """The solver of `make_solver` with the shipped catalog, kept with its trackers for the next picture.
+
+    To index the fields of view from 2 to 100 degrees takes longer than to solve a picture.
+    """
+    return make_solver(fov_deg, None, time_utc)
 
 
 def check_stages(stages: Mapping[str, str]) -> None:
