@@ -289,7 +289,7 @@ def _count_missing(detections: Detections, sky: SkyIndex, R: Floats, focal_ratio
     field = detections.field * (INNER_FRACTION / focal_ratio)
     left, right, top, bottom = field
     matched, faintest = 0, star.max()
-    median = np.median(detections.mag)
+    median = detections.mag[len(detections.mag) // 2]  # the brightest are first
     if np.isfinite(median):
         faintest = max(faintest, np.searchsorted(sky.mag, median) - 1)
     for s in star:
