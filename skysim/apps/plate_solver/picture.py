@@ -194,12 +194,13 @@ def solve_again(refused: list[Outcome], date_utc: datetime.datetime | None) -> O
     for pixels in {id(one.hypothesis.pixels): one.hypothesis.pixels for one in refused}.values():
         readings = [one for one in refused if one.hypothesis.pixels is pixels]
         settings = readings[0].hypothesis.solver.settings
-        for note, efforts, centroids in retries.retries(pixels, readings[0].report.centroids, settings):
+        for retry in retries.retries(pixels, readings[0].report.centroids, settings):
             for one in (one.hypothesis for one in readings):
-                solver = replace(one.solver, hypotheses=one.solver.hypotheses * retries.EXTRA_TRIES)
-                report, tracker = solve_array(pixels, solver, date_utc, centroids, efforts)
+                tries = one.solver.hypotheses * retries.EXTRA_TRIES
+                solver = replace(one.solver, hypotheses=tries, upper_half=retry.upper_half)
+                report, tracker = solve_array(pixels, solver, date_utc, retry.centroids, retry.efforts)
                 if report.attitude.solved:
-                    notes = [one.assumption] * bool(one.assumption) + [note]
+                    notes = [one.assumption] * bool(one.assumption) + [retry.note]
                     return Outcome(one._replace(assumption="; ".join(notes)), report, tracker, refused[0].tried)
     return None
 
