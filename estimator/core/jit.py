@@ -11,4 +11,4 @@ from functools import partial
 import numba
 
 # Division by zero gives inf or nan, as in NumPy; sums keep the order of the source unless a function sets fastmath.
-jit = partial(numba.njit, cache=True, error_model="numpy", fastmath=False)
+jit = partial(numba.njit, cache=True, error_model="numpy", fastmath=False, no_cfunc_wrapper=True)

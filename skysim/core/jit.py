@@ -14,7 +14,7 @@ from numba.core import event
 from skysim.core import errors
 
 # Division by zero gives inf or nan, as in NumPy; sums are not reordered unless a function sets fastmath itself.
-jit = partial(numba.njit, cache=True, error_model="numpy", fastmath=False)
+jit = partial(numba.njit, cache=True, error_model="numpy", fastmath=False, no_cfunc_wrapper=True)
 
 
 class CompilationNotice(event.Listener):
