@@ -65,6 +65,12 @@ def required_matches(sigma: Floats, field_area: float, attitude_dex: float, min_
 
 
 @jit
+def middle(tangent: Floats, a: int, b: int) -> tuple[float, float]:
+    """Midpoint of two detections, tangents."""
+    return (tangent[a, 0] + tangent[b, 0]) / 2, (tangent[a, 1] + tangent[b, 1]) / 2
+
+
+@jit
 def squared_separation(tangent: Floats, a: int, b: int) -> float:
     """Squared distance between two detections, in tangents."""
     return (tangent[a, 0] - tangent[b, 0]) ** 2 + (tangent[a, 1] - tangent[b, 1]) ** 2

@@ -26,6 +26,7 @@ from estimator.identification.chance import (
     GATE_SIGMA,
     SHORT_PAIR,
     least,
+    middle,
     required_matches,
     separation,
     squared_separation,
@@ -332,7 +333,7 @@ def pair_gates(detections: Detections, a: int, b: int) -> Floats:
     (sa^2 + sb^2) / separation^2 and grows with the squared distance from the midpoint.
     """
     tangent = detections.tangent
-    x, y = (tangent[a, 0] + tangent[b, 0]) / 2, (tangent[a, 1] + tangent[b, 1]) / 2
+    x, y = middle(tangent, a, b)
     pair_variance = detections.sigma[a] ** 2 + detections.sigma[b] ** 2
     direction_variance = pair_variance / squared_separation(tangent, a, b)
     out = np.empty(len(detections.sigma))
