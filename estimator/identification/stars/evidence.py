@@ -149,12 +149,10 @@ def evaluate(
 @jit
 def _equal(first: NDArray, second: NDArray) -> bool:
     """Whether two lists of rows are equal."""
-    if len(first) != len(second):
-        return False
-    for n in range(len(first)):
-        if first[n] != second[n]:
-            return False
-    return True
+    same = len(first) == len(second)
+    for n in range(min(len(first), len(second))):
+        same = same and first[n] == second[n]
+    return same
 
 
 @jit
