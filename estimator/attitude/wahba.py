@@ -239,7 +239,7 @@ def raw_esoq2(B: Floats) -> Floats:
         u, v, w = _cofactor(M, i, 0), _cofactor(M, i, 1), _cofactor(M, i, 2)
         if u * u + v * v + w * w > length2:
             length2 = u * u + v * v + w * w
-            e[:] = u, v, w
+            e[0], e[1], e[2] = u, v, w
     scalar = z[0] * e[0] + z[1] * e[1] + z[2] * e[2]
     q = (x - trace) * e[0], (x - trace) * e[1], (x - trace) * e[2], scalar
     return matrix_of(_undo_rotation(q, frame))
@@ -250,8 +250,10 @@ def raw_davenport(B: Floats) -> Floats:
     """Davenport's q-method (Keat 1977, CSC/TM-77/6034): the eigenvector of K's largest eigenvalue."""
     S, z, trace = _symmetric(B)
     K = np.empty((4, 4))
-    K[:3, :3], K[3, 3] = S, trace
+    K[3, 3] = trace
     for i in range(3):
+        for j in range(3):
+            K[i, j] = S[i, j]
         K[i, i] -= trace
         K[i, 3] = K[3, i] = z[i]
     _, vectors = np.linalg.eigh(K)
@@ -346,7 +348,8 @@ def refine(R_cam_from_ref: Floats, cam: Floats, ref: Floats, weight: Floats) -> 
             gradient[2] += w * (a[0] * cam[n, 1] - a[1] * cam[n, 0])
             _add_information(normal, a, w)
         _factorize(normal)
-        step[:] = gradient
+        for i in range(3):
+            step[i] = gradient[i]
         least_squares.cholesky_solve(normal, step)
         rotate_in_place(step, R)
         if step[0] ** 2 + step[1] ** 2 + step[2] ** 2 < MIN_STEP2_RAD2:

@@ -115,7 +115,8 @@ def _quads(xyz: Floats, neighbor: NDArray, start: NDArray, shortest_rad: float, 
                         continue
                     if total < len(found):
                         found[total, 0], found[total, 1], found[total, 2], found[total, 3] = a, b, near[k], near[m]
-                        code[total, :2], code[total, 2:] = place[k], place[m]
+                        code[total, 0], code[total, 1] = place[k, 0], place[k, 1]
+                        code[total, 2], code[total, 3] = place[m, 0], place[m, 1]
                         arrange(code[total], found[total])
                     total += 1
     return total

@@ -98,7 +98,9 @@ def _fit(pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: F
             return
         largest_step = max(abs(step[X]), abs(step[Y]), abs(step[RADIUS]))
         # At most one pixel per step, and a quarter of a pixel in the edge's width.
-        p += min(1.0, 1 / max(largest_step, 4 * abs(step[EDGE]), 1e-300)) * step
+        scale = min(1.0, 1 / max(largest_step, 4 * abs(step[EDGE]), 1e-300))
+        for k in range(len(p)):
+            p[k] += scale * step[k]
         p[EDGE] = min(max(p[EDGE], 0.25), 0.6 * p[RADIUS])
         if hypot(p[X] - start_x, p[Y] - start_y) > start_radius / 2 or p[BRIGHTNESS] <= 0:
             return

@@ -97,7 +97,9 @@ def _fit(
             return False
         largest_step = max(abs(step[X]), abs(step[Y]), abs(step[WIDTH]))
         # Steps of more than half a pixel are shortened: the model is too nonlinear for them.
-        p += min(1.0, 0.5 / max(largest_step, 1e-300)) * step
+        scale = min(1.0, 0.5 / max(largest_step, 1e-300))
+        for k in range(len(p)):
+            p[k] += scale * step[k]
         if abs(p[X] - start_x) > 2 or abs(p[Y] - start_y) > 2 or p[FLUX] <= 0:
             return False
         p[WIDTH] = min(max(p[WIDTH], MIN_SIGMA_PX), MAX_SIGMA_PX)

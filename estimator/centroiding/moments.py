@@ -59,7 +59,7 @@ def center_of_gravity(image: NDArray, boxes: Ints, level: Floats, noise: Floats,
                 py += v
                 pxx += u * u + v * v
         if flux == 0:  # the center of gravity is undefined
-            out[n] = np.nan, np.nan, np.nan, 0.0
+            out[n, :3], out[n, 3] = np.nan, 0.0
             continue
         cx, cy = sx / flux, sy / flux
         # Sums of (x - cx)^2 + (y - cy)^2 over the pixels, and weighted by their light.
@@ -107,7 +107,7 @@ def squared_light(image: NDArray, boxes: Ints, level: Floats, noise: Floats, gai
                 cx, cy = cx / weight, cy / weight
                 sigma2 = (interpolate(noise, height, width, cy, cx) / FILTERED_NOISE) ** 2
         if weight == 0:
-            out[n] = np.nan, np.nan, np.nan, 0.0
+            out[n, :3], out[n, 3] = np.nan, 0.0
             continue
         out[n, 0], out[n, 1], out[n, 3] = cx, cy, flux
         out[n, 2] = sqrt(moment_variance / weight**2 + sampling_variance(second_moment / weight))

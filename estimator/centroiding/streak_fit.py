@@ -139,7 +139,9 @@ def _fit(pixels: Floats, noise: float, gain_e_dn: float, rows: Floats, weight: F
         largest_step = max(abs(step[X]), abs(step[Y]), abs(step[LENGTH]))
         end_shift = abs(step[ANGLE]) * p[LENGTH] / 2
         # The step is shortened so that center, length and direction move an end by about a pixel at most.
-        p += min(1.0, 1 / max(largest_step, end_shift, 2 * abs(step[WIDTH]), 1e-300)) * step
+        scale = min(1.0, 1 / max(largest_step, end_shift, 2 * abs(step[WIDTH]), 1e-300))
+        for k in range(len(p)):
+            p[k] += scale * step[k]
         p[WIDTH] = min(max(p[WIDTH], 0.3), 4.0)
         if abs(p[X] - start_x) + abs(p[Y] - start_y) > 2 + start_length / 2:
             return False

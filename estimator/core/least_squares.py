@@ -63,7 +63,8 @@ def step(normal: Floats, out: Floats) -> float:
     count = len(out)
     if not cholesky(normal[:count, :count]):
         return np.nan
-    out[:] = normal[count, :count]
+    for i in range(count):
+        out[i] = normal[count, i]
     cholesky_solve(normal, out)
     fall = 0.0
     for i in range(count):

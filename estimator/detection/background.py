@@ -118,7 +118,9 @@ def _tiles(image: NDArray, tile_px: int, smooth: NDArray, samples: NDArray) -> t
             filtered_row(image, y0 + (2 * k + 1) * (y1 - y0) // (2 * SAMPLE_ROWS), sums, smooth)
             for column in range(columns):
                 x0, x1 = column * width // columns, (column + 1) * width // columns
-                values[column, k * (x1 - x0) : (k + 1) * (x1 - x0)] = smooth[x0:x1]
+                source, sampled = smooth[x0:x1], values[column, k * (x1 - x0) : (k + 1) * (x1 - x0)]
+                for x in range(len(source)):  # a slice's assignment would take longer to compile than all the rest
+                    sampled[x] = source[x]
         for column in range(columns):
             size = (column + 1) * width // columns - column * width // columns
             tile_values = values[column, : SAMPLE_ROWS * size]
@@ -131,8 +133,31 @@ def _tiles(image: NDArray, tile_px: int, smooth: NDArray, samples: NDArray) -> t
 
 @jit
 def median(values: Floats) -> float:
-    """Median by numba's np.median, without NumPy's argument checks, which cost more than a short list."""
-    return np.median(values)
+    """Median of an array without NaN, without NumPy's argument checks, which cost more than a short list."""
+    return _median_in_place(values.flatten())
+
+
+@jit
+def _median_in_place(values: NDArray) -> float:
+    """Median of (N,) values by Hoare's selection (C. A. R. Hoare, Comm. ACM 4, 321 (1961)), which reorders them."""
+    half, low, high = len(values) // 2, 0, len(values) - 1
+    while low < high:
+        pivot, i, j = values[half], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i, j = i + 1, j - 1
+        low, high = (i if j < half else low), (j if half < i else high)
+    if len(values) % 2:
+        return values[half]
+    below = -np.inf
+    for k in range(half):
+        below = max(below, values[k])
+    return (below + values[half]) / 2 if half else np.nan
 
 
 @jit

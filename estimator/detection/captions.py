@@ -32,7 +32,8 @@ def find_captions(boxes: Ints, peak: Floats) -> NDArray[np.bool_]:
             continue
         letter[:] = False
         letter[n] = True
-        line[:] = boxes[n]
+        for side in range(4):
+            line[side] = boxes[n, side]
         count, narrow, wide = _grow(boxes, peak, n, letter, line)
         if count < MIN_LETTERS or wide < UNEQUAL_WIDTH * narrow:
             continue

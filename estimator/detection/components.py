@@ -267,10 +267,32 @@ def brightest_blobs(
         if flux > 0 and (sums[n, STRONG] >= min_strong_px or significant):
             rows[count] = n
             count += 1
-    rows = rows[:count]
-    rows = rows[np.argsort(-sums[rows, FLUX], kind="mergesort")][:max_blobs]
-    xy = np.empty((len(rows), 2))
-    for k in range(len(rows)):
-        xy[k, 0], xy[k, 1] = sums[rows[k], X] / sums[rows[k], FLUX], sums[rows[k], Y] / sums[rows[k], FLUX]
-    box = boxes[rows].astype(np.int64)
-    return box, xy, sums[rows, FLUX], sums[rows, PEAK], sums[rows, AREA].astype(np.int64), count
+    rows, kept = _by_flux(sums, rows[:count]), min(count, max_blobs)
+    box, xy, flux = np.empty((kept, 4), np.int64), np.empty((kept, 2)), np.empty(kept)
+    peak, area_px = np.empty(kept), np.empty(kept, np.int64)
+    for k in range(kept):
+        total = sums[rows[k]]
+        for side in range(4):
+            box[k, side] = boxes[rows[k], side]
+        xy[k, 0], xy[k, 1] = total[X] / total[FLUX], total[Y] / total[FLUX]
+        flux[k], peak[k], area_px[k] = total[FLUX], total[PEAK], int(total[AREA])
+    return box, xy, flux, peak, area_px, count
+
+
+@jit
+def _by_flux(sums: Floats, rows: Ints) -> Ints:
+    """The (N,) rows in decreasing order of flux, in their own order where it is equal: a merge sort from the bottom."""
+    count, length = len(rows), 1
+    merged = np.empty(count, np.int64)
+    while length < count:
+        for start in range(0, count, 2 * length):
+            middle, end = min(start + length, count), min(start + 2 * length, count)
+            i, j = start, middle
+            for k in range(start, end):
+                if i < middle and (j == end or sums[rows[i], FLUX] >= sums[rows[j], FLUX]):
+                    merged[k], i = rows[i], i + 1
+                else:
+                    merged[k], j = rows[j], j + 1
+        rows, merged = merged, rows
+        length *= 2
+    return rows

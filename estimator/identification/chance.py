@@ -41,6 +41,15 @@ def counts_dex(matched: int, missing: int) -> float:
 
 
 @jit
+def least(values: Floats) -> float:
+    """Least of (N,) values."""
+    found = np.inf
+    for value in values:
+        found = min(found, value)
+    return found
+
+
+@jit
 def required_matches(sigma: Floats, field_area: float, attitude_dex: float, min_dex: float) -> int:
     """Least number of matches that can reach min_dex, from an estimate of the greatest evidence.
 
@@ -48,11 +57,17 @@ def required_matches(sigma: Floats, field_area: float, attitude_dex: float, min_
     1 / (2 pi sigma^2 rho) of the least sigma of all detections, the attitude contributes attitude_dex.
     """
     total = len(sigma)
-    match_dex = -log10(2 * pi * sigma.min() ** 2 * total / field_area)
+    match_dex = -log10(2 * pi * least(sigma) ** 2 * total / field_area)
     for count in range(MIN_EVIDENCE_MATCHES, total):
         if count * match_dex + attitude_dex - log10(count + 1.0) >= min_dex:
             return count
     return total
+
+
+@jit
+def middle(tangent: Floats, a: int, b: int) -> tuple[float, float]:
+    """Midpoint of two detections, tangents."""
+    return (tangent[a, 0] + tangent[b, 0]) / 2, (tangent[a, 1] + tangent[b, 1]) / 2
 
 
 @jit

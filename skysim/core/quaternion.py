@@ -110,5 +110,7 @@ def interpolate(knots_wxyz: Floats, hermite_rad: Floats, knot: NDArray[np.int64]
         # Hermite basis: value at the end, slope at the beginning, slope at the end. The value at the beginning is zero.
         a, b, c = s * s * (3 - 2 * s), s * (1 - s) ** 2, -s * s * (1 - s)
         rotvec, begin, end = hermite_rad[k]
-        out[m] = multiply(knots_wxyz[k], from_rotvec(a * rotvec + b * begin + c * end))
+        turned = multiply(knots_wxyz[k], from_rotvec(a * rotvec + b * begin + c * end))
+        for n in range(4):  # an assignment to the row would take longer to compile than all the rest
+            out[m, n] = turned[n]
     return out

@@ -134,9 +134,10 @@ def inertial_knots(
     for k in range(len(knots)):
         body_from_lab = quaternion.inverse(lab_from_body_wxyz[k])
         rate = rate_body_rad_s[k] + quaternion.apply(body_from_lab, earth_rate)
-        knots[k, :3] = rate
         centripetal = quaternion.cross(rate, quaternion.cross(rate, position_m))
-        knots[k, 3:] = centripetal + quaternion.apply(body_from_lab, up)
+        weight = quaternion.apply(body_from_lab, up)
+        for i in range(3):
+            knots[k, i], knots[k, 3 + i] = rate[i], centripetal[i] + weight[i]
     return knots
 
 
@@ -165,8 +166,9 @@ def integrate_intervals(
             if stop >= end:
                 break
         add_cubic(t_s, knots, k, end, 1.0, change)
-        angle[n] = total[:3]
-        velocity[n] = total[3:] + quaternion.cross(change[:3], position_m)
+        turned = quaternion.cross(change[:3], position_m)
+        for i in range(3):
+            angle[n, i], velocity[n, i] = total[i], total[3 + i] + turned[i]
     return angle, velocity
 
 

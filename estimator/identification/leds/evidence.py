@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core import vectors
+from estimator.core import least_squares, vectors
 from estimator.core.arrays import Floats
 from estimator.core.jit import jit
 from estimator.core.vectors import Vector
-from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES, counts_dex, separation
+from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES, counts_dex, middle, separation
 from estimator.identification.leds.index import DomeIndex
 
 
@@ -66,7 +66,7 @@ def evaluate(
     """
     # Error of the pair's attitude, in units of a detection's variance: 1/2 from its midpoint (beside the detection's
     # own 1), and 2 / separation^2 per squared distance from the midpoint from its direction.
-    midpoint = (detections.tangent[a] + detections.tangent[b]) / 2
+    midpoint = middle(detections.tangent, a, b)
     direction_variance = 2 / separation(detections.tangent, a, b) ** 2
     observed, star, missing = _match(detections, dome, R_cam_from_lab, center, midpoint, 1.5, direction_variance)
     dex = -np.inf
@@ -92,7 +92,7 @@ def _match(
     dome: DomeIndex,
     R_cam_from_lab: Floats,
     center: int,
-    midpoint: Floats,
+    midpoint: tuple[float, float],
     base_variance: float,
     direction_variance: float,
 ) -> tuple[NDArray, NDArray, int]:
@@ -144,7 +144,7 @@ def _fit(
     With b = R P, q = b - r (r the pupil) and R <- exp([w]) R, a tangent changes by d . (w x b) = w . (b x d), d its
     gradient with respect to q. Returns the (3, 3) Fisher information of w, in camera axes.
     """
-    info, gradient, slopes = np.zeros((3, 3)), np.zeros(3), np.empty(3)
+    info, factor, step, slopes = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3), np.empty(3)
     for k in range(len(observed)):
         q = _vector_from_pupil(dome, R_cam_from_lab, star[k])
         bx, by, bz = q[0] + dome.pupil_m[0], q[1] + dome.pupil_m[1], q[2] + dome.pupil_m[2]
@@ -156,11 +156,25 @@ def _fit(
             slopes[2] = axis * bx * by_component - (1 - axis) * by * by_component
             residual = detections.tangent[observed[k], axis] - q[axis] / q[2]
             for i in range(3):
-                gradient[i] += weight * slopes[i] * residual
+                step[i] += weight * slopes[i] * residual
                 for j in range(3):
                     info[i, j] += weight * slopes[i] * slopes[j]
-    vectors.rotate_in_place(np.linalg.solve(info, gradient), R_cam_from_lab)
+    _factorize(info, factor)
+    least_squares.cholesky_solve(factor, step)
+    vectors.rotate_in_place(step, R_cam_from_lab)
     return info
+
+
+@jit
+def _factorize(info: Floats, factor: Floats) -> float:
+    """Cholesky factor of a (3, 3) matrix, in the lower triangle of `factor`; returns the root of its determinant.
+
+    The root is 0 for a singular matrix.
+    """
+    for i in range(3):
+        for j in range(i + 1):
+            factor[i, j] = info[i, j]
+    return factor[0, 0] * factor[1, 1] * factor[2, 2] if least_squares.cholesky(factor) else 0.0
 
 
 @jit
@@ -185,11 +199,12 @@ def _evidence(
     of 2 (it is lit or not).
     """
     density, group = len(detections.ray) / dome.field_area, dome.pairs.group
-    total = 1.5 * log10(2 * pi) - 0.5 * log10(max(np.linalg.det(info), 1e-300)) - log10(dome.prior_volume)
+    root_det = _factorize(info, np.empty((3, 3)))
+    total = 1.5 * log10(2 * pi) - log10(max(root_det, 1e-150)) - log10(dome.prior_volume)
     for k in range(len(observed)):
         qx, qy, qz = _vector_from_pupil(dome, R_cam_from_lab, star[k])
         variance = detections.sigma[observed[k]] ** 2
-        x, y = detections.tangent[observed[k]]
+        x, y = detections.tangent[observed[k], 0], detections.tangent[observed[k], 1]
         residual2 = (x - qx / qz) ** 2 + (y - qy / qz) ** 2
         match_dex = -residual2 / variance / 2 / log(10.0) - log10(2 * pi * variance * density)
         same_board = 0

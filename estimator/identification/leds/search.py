@@ -29,6 +29,8 @@ from estimator.identification.chance import (
     GATE_SIGMA,
     MIN_EVIDENCE_MATCHES,
     SHORT_PAIR,
+    least,
+    middle,
     required_matches,
     separation,
 )
@@ -91,7 +93,10 @@ def build_detections(rays_cam: Floats, sigma_rad: Floats, dome: DomeIndex) -> Le
 @jit
 def _search(detections: LedDetections, dome: DomeIndex, max_checks: int) -> tuple[LedHypothesis, float]:
     """The best hypothesis, and the evidence of the best one with another attitude."""
-    best = LedHypothesis(np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), -np.inf)
+    R_cam_from_lab = np.zeros((3, 3))
+    for axis in range(3):
+        R_cam_from_lab[axis, axis] = 1.0
+    best = LedHypothesis(np.empty(0, np.int64), np.empty(0, np.int64), R_cam_from_lab, -np.inf)
     rival_dex, checks = -np.inf, np.zeros(1, np.int64)
     order = _ordered_pairs(detections, dome)
     for rank in range(len(order)):
@@ -236,7 +241,7 @@ def _attitude_dex(detections: LedDetections, dome: DomeIndex, a: int, b: int) ->
 
     The uncertainty is sqrt(2) sigma / separation about the boresight, sigma / sqrt(2) across it.
     """
-    sigma_volume = detections.sigma.min() ** 3 / sqrt(2.0) / separation(detections.tangent, a, b)
+    sigma_volume = least(detections.sigma) ** 3 / sqrt(2.0) / separation(detections.tangent, a, b)
     return 1.5 * log10(2 * pi) - log10(dome.prior_volume) + log10(sigma_volume)
 
 
@@ -246,7 +251,7 @@ def _pair_gates(detections: LedDetections, dome: DomeIndex, a: int, b: int) -> F
 
     The pair's own error adds a shift with half of a detection's variance and a rotation with 2 sigma^2 / separation^2.
     """
-    x, y = (detections.tangent[a] + detections.tangent[b]) / 2
+    x, y = middle(detections.tangent, a, b)
     direction_variance = 2 / separation(detections.tangent, a, b) ** 2
     out = np.empty(len(detections.ray))
     for n in range(len(out)):

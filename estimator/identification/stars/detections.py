@@ -11,6 +11,7 @@ from estimator.core import vectors
 from estimator.core.arrays import Floats
 from estimator.core.camera import Distortion, undistorted
 from estimator.core.jit import jit
+from estimator.identification.chance import GATE_SIGMA
 
 
 class Detections(NamedTuple):
@@ -86,15 +87,29 @@ def detections_of(lights: FlatCentroids, sensor: Sensor, focal_uncertainty: floa
 @jit
 def changed(detections: Detections, count: int, variance: float, focal_uncertainty: float) -> Detections:
     """The first `count` detections with their variances multiplied by a factor, and another focal uncertainty."""
+    sigma, weight, factor = np.empty(count), np.empty((count, 3)), sqrt(variance)
+    for n in range(count):
+        sigma[n] = detections.sigma[n] * factor
+        for k in range(3):
+            weight[n, k] = detections.weight[n, k] / variance
     return Detections(
         detections.tangent[:count],
-        detections.sigma[:count] * sqrt(variance),
-        detections.weight[:count] / variance,
+        sigma,
+        weight,
         detections.mag[:count],
         detections.mag_sigma,
         detections.field,
         focal_uncertainty,
     )
+
+
+@jit
+def gates_of(detections: Detections, factor: float) -> Floats:
+    """(N,) matching radii, tangents: a factor times GATE_SIGMA standard deviations."""
+    gates = np.empty(len(detections.sigma))
+    for n in range(len(gates)):
+        gates[n] = factor * GATE_SIGMA * detections.sigma[n]
+    return gates
 
 
 def information_of(weight: Floats) -> Floats:

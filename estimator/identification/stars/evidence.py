@@ -27,7 +27,7 @@ from estimator.core.arrays import Floats
 from estimator.core.jit import jit
 from estimator.core.least_squares import CONVERGED_CHI2
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES, counts_dex
-from estimator.identification.stars.detections import Detections, field_area, ray
+from estimator.identification.stars.detections import Detections, field_area, gates_of, ray
 
 # Fraction of stars whose magnitude disagrees with the catalog: variable stars, doubles, an unusual passband.
 MAG_OUTLIER_FRACTION = 0.05
@@ -77,7 +77,12 @@ class Solution(NamedTuple):
 @jit
 def no_hypothesis() -> Hypothesis:
     """The empty hypothesis, with evidence -inf."""
-    return Hypothesis(np.empty(0, np.int64), np.empty(0, np.int64), np.eye(3), 1.0, np.eye(4), -np.inf)
+    R_cam_from_ref, info = np.zeros((3, 3)), np.zeros((4, 4))
+    for n in range(4):
+        info[n, n] = 1.0
+        if n < 3:
+            R_cam_from_ref[n, n] = 1.0
+    return Hypothesis(np.empty(0, np.int64), np.empty(0, np.int64), R_cam_from_ref, 1.0, info, -np.inf)
 
 
 @jit
@@ -117,15 +122,15 @@ def evaluate(
     for iteration in range(3):
         before = observed, star
         observed, star = _match(detections, sky, R, focal_ratio, gates, max_sigma)
-        gates, max_sigma = GATE_SIGMA * detections.sigma, GATE_SIGMA
+        gates, max_sigma = gates_of(detections, 1.0), GATE_SIGMA
         if len(observed) < MIN_EVIDENCE_MATCHES:
             return no_hypothesis()
         if iteration == 1 and min_dex > -np.inf:
             # `info` is that of the first fit; without the residuals the evidence is an upper bound.
-            upper_bound_dex = _evidence(detections, sky, R, focal_ratio, observed, star, info, False)
+            upper_bound_dex = _evidence(detections, sky, R, focal_ratio, observed, star, info, iteration > 1)
             if upper_bound_dex + counts_dex(len(observed), 0) < min_dex:
                 return no_hypothesis()
-        if fall < CONVERGED_CHI2 and np.array_equal(observed, before[0]) and np.array_equal(star, before[1]):
+        if fall < CONVERGED_CHI2 and _equal(observed, before[0]) and _equal(star, before[1]):
             break
         if iteration < 2:
             focal_ratio, fall = _fit(detections, sky, R, focal_ratio, observed, star, info)
@@ -133,11 +138,21 @@ def evaluate(
                 return no_hypothesis()
             if iteration == 1 and fall < CONVERGED_CHI2:
                 break
-    dex, matched = _evidence(detections, sky, R, focal_ratio, observed, star, info, True), len(observed)
+    matched, with_residuals = len(observed), len(observed) > 0  # a literal True would be compiled as another type
+    dex = _evidence(detections, sky, R, focal_ratio, observed, star, info, with_residuals)
     if dex + counts_dex(matched, 0) < min_dex:
         return no_hypothesis()
     dex += counts_dex(matched, _count_missing(detections, sky, R, focal_ratio, star))
     return Hypothesis(observed, star, R, focal_ratio, info, dex)
+
+
+@jit
+def _equal(first: NDArray, second: NDArray) -> bool:
+    """Whether two lists of rows are equal."""
+    same = len(first) == len(second)
+    for n in range(min(len(first), len(second))):
+        same = same and first[n] == second[n]
+    return same
 
 
 @jit
@@ -178,9 +193,12 @@ def count_near(
 ) -> int:
     """Number of detections beside those `observed` that have a star within their gate (N,), at most 0.05 rad."""
     R_ref_from_cam, count = R_cam_from_ref.T.copy(), 0
-    others = np.ones(len(gates), np.bool_)
-    others[observed] = False
-    for n in np.flatnonzero(others):
+    matched = np.zeros(len(gates), np.bool_)
+    for n in observed:
+        matched[n] = True
+    for n in range(len(gates)):
+        if matched[n]:
+            continue
         x, y, z = vectors.rotate(R_ref_from_cam, ray(tangent, n, focal_ratio))
         count += nearest(sky.vectors, sky.cell_first, sky.cell_star, sky.side, x, y, z, min(gates[n], 0.05))[0] >= 0
     return count
@@ -288,13 +306,14 @@ def _count_missing(detections: Detections, sky: SkyIndex, R: Floats, focal_ratio
     """
     field = detections.field * (INNER_FRACTION / focal_ratio)
     left, right, top, bottom = field
-    matched, faintest = 0, star.max()
+    matched, faintest = 0, np.int64(0)
     median = detections.mag[len(detections.mag) // 2]  # the brightest are first
     if np.isfinite(median):
-        faintest = max(faintest, np.searchsorted(sky.mag, median) - 1)
+        faintest = _count_brighter(sky, median) - 1
     for s in star:
         x, y, _ = project(sky.vectors, R, s)
         matched += left < x < right and top < y < bottom
+        faintest = max(faintest, s)
     return _count_inside(sky, R, field, faintest) - matched
 
 
@@ -344,18 +363,19 @@ def _evidence(
     total = 0.5 * count * log10(2 * pi) - prior_volume_dex(detections)
     for i in range(count):  # the product of the Cholesky factor's diagonal is sqrt(det info)
         total -= log10(factor[i, i])
-    fraction_brighter = _fraction_brighter(sky, detections.mag)
+    fraction_brighter, last = _fraction_brighter(sky, detections.mag), np.int64(0)
     for k in range(len(observed)):
         # Every number of false detections is equally probable a priori, so that n of them against n - m contribute the
         # ratio n! / (n - m)!: the density drops by one detection per match.
         density = (len(detections.sigma) - k) / field_area(detections)
+        last = max(last, observed[k])
         xx, yy, xy = vectors.row(detections.weight, observed[k])
         ratio = _magnitude_ratio(detections, sky, observed[k], star[k], fraction_brighter)
         total += log10(ratio * sqrt(xx * yy - xy * xy) / (2 * pi * density))
         if with_residuals:
             distance2 = squared_mahalanobis(detections, sky, R, focal_ratio, observed[k], star[k])
             total -= distance2 / 2 / log(10.0)
-    return total - UNMATCHED_PENALTY_DEX * max(observed.max() + 1 - 2.0 * len(observed), 0.0)
+    return total - UNMATCHED_PENALTY_DEX * max(last + 1 - 2.0 * len(observed), 0.0)
 
 
 @jit
@@ -366,7 +386,20 @@ def _fraction_brighter(sky: SkyIndex, mag: Floats) -> float:
         faintest = max(faintest, value)
     if not np.isfinite(faintest):
         return 1.0
-    return max(np.searchsorted(sky.mag, faintest + MAG_SMOOTHING), 1) / len(sky.mag)
+    return max(_count_brighter(sky, faintest + MAG_SMOOTHING), 1) / len(sky.mag)
+
+
+@jit
+def _count_brighter(sky: SkyIndex, mag: float) -> int:
+    """Number of stars brighter than a magnitude; they are sorted."""
+    low, high = 0, len(sky.mag)
+    while low < high:
+        middle = (low + high) // 2
+        if sky.mag[middle] < mag:
+            low = middle + 1
+        else:
+            high = middle
+    return low
 
 
 @jit
@@ -396,7 +429,9 @@ def build_solution(detections: Detections, stars: SkyIndex, hypothesis: Hypothes
     for axis in range(3):
         unit = np.zeros(count)
         unit[axis] = 1.0
-        covariance[axis] = cholesky_solve(hypothesis.info[:count, :count].copy(), unit)[:3]
+        column = cholesky_solve(hypothesis.info[:count, :count].copy(), unit)
+        for k in range(3):
+            covariance[axis, k] = column[k]
     for k in range(len(hypothesis.star)):
         observed, star = hypothesis.observed[k], hypothesis.star[k]
         chi2 += squared_mahalanobis(

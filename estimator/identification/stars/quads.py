@@ -37,14 +37,13 @@ def identify(
 
     The candidates are tested on the `max_detections` brightest; the attitude is then fitted to all detections.
     max_checks : bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
-    calibrated : whether the focal length should be right (`search.fit_with_calibration`)
+    calibrated : whether the focal length should be right (`search.fit_to_all`)
     """
     count = min(max_detections, len(detections.sigma))
     searched = changed(detections, count, 1.0, detections.focal_uncertainty)
     best = _search(searched, quads, stars, max_checks)
-    if calibrated and best.dex >= search.DECISIVE_DEX:
-        return search.fit_with_calibration(detections, stars, best, False)
-    return search.fit_to_all(detections, stars, best, search.DECISIVE_DEX)
+    # The last argument matters for a calibrated camera only. A literal False would be compiled as another type.
+    return search.fit_to_all(detections, stars, best, search.DECISIVE_DEX, calibrated, not calibrated)
 
 
 @jit

@@ -25,11 +25,13 @@ from estimator.core.jit import jit
 from estimator.identification.chance import (
     GATE_SIGMA,
     SHORT_PAIR,
+    least,
+    middle,
     required_matches,
     separation,
     squared_separation,
 )
-from estimator.identification.stars.detections import Detections, changed, field_area, ray
+from estimator.identification.stars.detections import Detections, changed, field_area, gates_of, ray
 from estimator.identification.stars.evidence import (
     Hypothesis,
     Solution,
@@ -84,53 +86,41 @@ def lost_in_space(detections: Detections, stars: SkyIndex, max_detections: int, 
             candidate = search(searched, stars, int(effort * max_checks))
             if candidate.dex >= accept_dex:
                 break
-    if detections.focal_uncertainty == 0 and candidate.dex >= accept_dex:
-        whole = few == len(detections.sigma)
-        free = changed(detections, len(detections.sigma), 1.0, WRONG_FOCAL)
-        return fit_with_calibration(free, stars, candidate, whole)
-    return fit_to_all(detections, stars, candidate, accept_dex)
+    calibrated = detections.focal_uncertainty == 0
+    free = changed(detections, len(detections.sigma), 1.0, WRONG_FOCAL) if calibrated else detections
+    return fit_to_all(free, stars, candidate, accept_dex, calibrated, few == len(detections.sigma))
 
 
 @jit
-def fit_to_all(detections: Detections, stars: SkyIndex, candidate: Hypothesis, accept_dex: float) -> Solution:
+def fit_to_all(
+    detections: Detections, stars: SkyIndex, candidate: Hypothesis, accept_dex: float, calibrated: bool, whole: bool
+) -> Solution:
     """Fit a candidate of some detections to all of them and all stars.
 
-    The solution is empty if the candidate has less than `accept_dex`, or keeps no more than half of its matches.
-    """
-    if candidate.dex < accept_dex:
-        return build_solution(detections, stars, no_hypothesis())
-    gates = 1.5 * GATE_SIGMA * detections.sigma
-    full = evaluate(detections, stars, candidate.R_cam_from_ref.copy(), candidate.focal_ratio, gates, -np.inf)
-    return _solution_of(detections, stars, candidate, full)
-
-
-@jit
-def _solution_of(detections: Detections, stars: SkyIndex, candidate: Hypothesis, full: Hypothesis) -> Solution:
-    """The solution of a candidate's fit to all detections; empty if it keeps no more than half of the matches."""
-    if 2 * len(full.observed) <= len(candidate.observed):
-        return build_solution(detections, stars, no_hypothesis())
-    dex = max(full.dex, candidate.dex)
-    best = Hypothesis(full.observed, full.star, full.R_cam_from_ref, full.focal_ratio, full.info, dex)
-    return build_solution(detections, stars, best)
-
-
-@jit
-def fit_with_calibration(detections: Detections, stars: SkyIndex, candidate: Hypothesis, whole: bool) -> Solution:
-    """Fit a candidate to all detections and stars with the calibrated focal length and with a free one.
-
-    The calibrated one is kept unless the other has WRONG_FOCAL_DEX more evidence. With a wrong focal length a part of
-    the stars may still match, at a wrong attitude.
+    Of a calibrated camera it is fitted with the calibrated focal length and with a free one. The calibrated one is kept
+    unless the other has WRONG_FOCAL_DEX more evidence: with a wrong focal length a part of the stars may still match,
+    at a wrong attitude. The solution is empty if the candidate has less than `accept_dex`, or keeps no more than half
+    of its matches.
     detections : with the focal uncertainty of the free fit
     whole : whether the candidate is the calibrated fit to all detections already
     """
-    exact, gates = changed(detections, len(detections.sigma), 1.0, 0.0), 1.5 * GATE_SIGMA * detections.sigma
+    chosen, full, gates = detections, no_hypothesis(), gates_of(detections, 1.5)
     R, ratio = candidate.R_cam_from_ref, candidate.focal_ratio
-    kept = candidate if whole else evaluate(exact, stars, R.copy(), 1.0, gates, -np.inf)
-    if len(kept.star) == len(gates) and focal_gain_dex(detections, stars, kept) < FREE_DEX:
-        return _solution_of(exact, stars, candidate, kept)  # no detection is left that another focal length could match
-    free = evaluate(detections, stars, R.copy(), ratio, gates, -np.inf)
-    chosen, full = (detections, free) if free.dex > kept.dex + WRONG_FOCAL_DEX else (exact, kept)
-    return _solution_of(chosen, stars, candidate, full)
+    found, free = candidate.dex >= accept_dex, True
+    if found and calibrated:
+        chosen = changed(detections, len(detections.sigma), 1.0, 0.0)
+        full = candidate if whole else evaluate(chosen, stars, R.copy(), 1.0, gates, -np.inf)
+        # If all detections match there is none that another focal length could match.
+        free = len(full.star) < len(gates) or focal_gain_dex(detections, stars, full) >= FREE_DEX
+    if found and free:
+        fitted = evaluate(detections, stars, R.copy(), ratio, gates, -np.inf)
+        if not calibrated or fitted.dex > full.dex + WRONG_FOCAL_DEX:
+            chosen, full = detections, fitted
+    if not found or 2 * len(full.observed) <= len(candidate.observed):
+        return build_solution(chosen, stars, no_hypothesis())
+    dex = max(full.dex, candidate.dex)
+    best = Hypothesis(full.observed, full.star, full.R_cam_from_ref, full.focal_ratio, full.info, dex)
+    return build_solution(chosen, stars, best)
 
 
 @jit
@@ -179,7 +169,11 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
 @jit
 def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
     """Whether two hypotheses are the same attitude within 5.7 degrees (trace > 2.99); False if `second` is empty."""
-    return second.dex > -np.inf and bool(np.sum(first.R_cam_from_ref * second.R_cam_from_ref) > 2.99)
+    trace = 0.0
+    for i in range(3):
+        for j in range(3):
+            trace += first.R_cam_from_ref[i, j] * second.R_cam_from_ref[i, j]
+    return second.dex > -np.inf and trace > 2.99
 
 
 @jit
@@ -263,7 +257,8 @@ def _test_pair(
         vectors.pair_frame(star_i, star_j, in_ref)
         for flip in range(2):
             if flip:  # the star pair in reverse order: a half turn about its first axis
-                in_ref[:, 1:] *= -1
+                for k in range(3):
+                    in_ref[k, 1], in_ref[k, 2] = -in_ref[k, 1], -in_ref[k, 2]
             if not (backward if flip else forward):
                 continue
             vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
@@ -338,7 +333,7 @@ def pair_gates(detections: Detections, a: int, b: int) -> Floats:
     (sa^2 + sb^2) / separation^2 and grows with the squared distance from the midpoint.
     """
     tangent = detections.tangent
-    x, y = (tangent[a, 0] + tangent[b, 0]) / 2, (tangent[a, 1] + tangent[b, 1]) / 2
+    x, y = middle(tangent, a, b)
     pair_variance = detections.sigma[a] ** 2 + detections.sigma[b] ** 2
     direction_variance = pair_variance / squared_separation(tangent, a, b)
     out = np.empty(len(detections.sigma))
@@ -355,7 +350,7 @@ def attitude_dex(detections: Detections, a: int, b: int) -> float:
     The uncertainty is sqrt(2) sigma / separation about the boresight (and of the focal ratio), sigma / sqrt(2) across
     it, with the least sigma of all detections and isotropic errors.
     """
-    sigma = detections.sigma.min()
+    sigma = least(detections.sigma)
     direction_sigma = sqrt(2.0) * sigma / separation(detections.tangent, a, b)
     dex = 1.5 * log10(2 * pi) + log10(sigma**2 / 2 * direction_sigma) - prior_volume_dex(detections)
     if detections.focal_uncertainty > 0:

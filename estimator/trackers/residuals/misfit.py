@@ -31,6 +31,7 @@ from estimator.identification.stars.detections import (
     Sensor,
     changed,
     detections_of,
+    gates_of,
     information_of,
 )
 from estimator.identification.stars.evidence import Solution
@@ -60,23 +61,31 @@ def widened(
     prior of `least_squares.variance_factor`, are their weights. The covariance is multiplied by the factor.
     detections : with the errors of the model, and the focal uncertainty with which the solution was found
     """
-    gates = 1.5 * GATE_SIGMA * sqrt(TRIED[-1]) * detections.sigma
+    gates = gates_of(detections, 1.5 * sqrt(TRIED[-1]))
     ratio = solution.focal_ratio
     if evidence.count_near(detections.tangent, sky, R_cam_from_ref, ratio, solution.observed, gates) == 0:
         return _scaled(solution, 4 if detections.focal_uncertainty > 0 else 3)
-    best, best_dex, dex = solution, solution.dex, np.empty(len(TRIED))
+    best, chosen, best_dex, dex = solution, 0, solution.dex, np.empty(len(TRIED))
     dex[0] = solution.dex
     for n in range(1, len(TRIED)):
         wide = changed(detections, len(detections.sigma), TRIED[n], detections.focal_uncertainty)
-        gates = 1.5 * GATE_SIGMA * wide.sigma
-        found = evidence.evaluate(wide, sky, R_cam_from_ref.copy(), ratio, gates, -np.inf)
+        found = evidence.evaluate(wide, sky, R_cam_from_ref.copy(), ratio, gates_of(wide, 1.5), -np.inf)
         dex[n] = found.dex + PRIOR_WRONG_DEX
         if dex[n] > best_dex:
-            best, best_dex = evidence.build_solution(wide, sky, found), dex[n]
-    weight = 10 ** (dex - best_dex)
-    variance = np.sum(weight * TRIED) / np.sum(weight)
-    covariance = best.covariance_rad2 * (variance / TRIED[np.argmax(dex)])
-    return with_errors(best, covariance, best.chi2, best.dex), variance
+            best, chosen, best_dex = evidence.build_solution(wide, sky, found), n, dex[n]
+    variance = _mean_factor(dex, best_dex)
+    return with_errors(best, variance / TRIED[chosen], best.chi2, best.dex), variance
+
+
+@jit
+def _mean_factor(dex: Floats, best_dex: float) -> float:
+    """Mean of the factors TRIED, weighted by their Bayes factors."""
+    total = weights = 0.0
+    for n in range(len(TRIED)):
+        weight = 10 ** (dex[n] - best_dex)
+        total += weight * TRIED[n]
+        weights += weight
+    return total / weights
 
 
 @jit
@@ -86,22 +95,24 @@ def _scaled(solution: Solution, parameters: int) -> tuple[Solution, float]:
     With n matches, p parameters and the variances times v, chi-square is divided by v, the density of each match by v,
     and the posterior's volume is multiplied by v^(p/2).
     """
-    count, dex = len(solution.star), np.empty(len(TRIED))
+    count, dex, best = len(solution.star), np.empty(len(TRIED)), 0
     chi2 = solution.chi2 * max(2 * count - parameters, 1)
     for n in range(len(TRIED)):
         gain_dex = chi2 / 2 / log(10.0) * (1 - 1 / TRIED[n]) + (parameters / 2 - count) * log10(TRIED[n])
         dex[n] = solution.dex + gain_dex + (PRIOR_WRONG_DEX if n else 0.0)
-    best = np.argmax(dex)
-    weight = 10 ** (dex - dex[best])
-    variance = np.sum(weight * TRIED) / np.sum(weight)
+        best = n if dex[n] > dex[best] else best
+    variance = _mean_factor(dex, dex[best])
     best_dex = dex[best] - (PRIOR_WRONG_DEX if best else 0.0)
-    likely = with_errors(solution, variance * solution.covariance_rad2, solution.chi2 / TRIED[best], best_dex)
-    return likely, variance
+    return with_errors(solution, variance, solution.chi2 / TRIED[best], best_dex), variance
 
 
 @jit
-def with_errors(solution: Solution, covariance_rad2: Floats, chi2: float, dex: float) -> Solution:
-    """The solution with another covariance, chi-square and evidence."""
+def with_errors(solution: Solution, factor: float, chi2: float, dex: float) -> Solution:
+    """The solution with its covariance times a factor, and another chi-square and evidence."""
+    covariance_rad2 = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            covariance_rad2[i, j] = solution.covariance_rad2[i, j] * factor
     return Solution(
         solution.observed,
         solution.star,
