@@ -25,9 +25,8 @@ from estimator.core.types import Attitude, Centroids, FramePriors, RateEstimate,
 from estimator.detection.classify import Flag
 from estimator.detection.detect import in_row_order
 from estimator.detection.windows import in_windows
-from estimator.identification.chance import MIN_EVIDENCE_MATCHES
+from estimator.identification.chance import ACCEPT_DEX, MIN_EVIDENCE_MATCHES
 from estimator.identification.stars import evidence
-from estimator.identification.stars.search import ACCEPT_DEX
 from estimator.trackers import warm_up
 from estimator.trackers.pipeline import Clock, Report, detect_and_centroid, inflate_uncertainty
 from estimator.trackers.rolling_shutter import with_streak_rate

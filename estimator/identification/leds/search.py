@@ -26,6 +26,7 @@ from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.core.vectors import Vector
 from estimator.identification.chance import (
+    ACCEPT_DEX,
     GATE_SIGMA,
     MIN_EVIDENCE_MATCHES,
     SHORT_PAIR,
@@ -37,7 +38,6 @@ from estimator.identification.chance import (
 from estimator.identification.leds.evidence import LedDetections, LedHypothesis, evaluate, same_identification
 from estimator.identification.leds.index import DirectionGrid, DomeIndex
 
-ACCEPT_DEX = 5.0  # least log10 Bayes factor of an accepted attitude, over detections at random positions
 MARGIN_DEX = 5.0  # by which the best attitude must beat every other one
 AMBIGUOUS_DEX = 2.0  # least evidence of the best attitude for a near rival to be reported as an ambiguity
 MIN_SEPARATION = 1e-9  # of a pair, in tangents: closer detections have no direction between them

@@ -23,6 +23,7 @@ from estimator.core import vectors
 from estimator.core.arrays import Floats
 from estimator.core.jit import jit
 from estimator.identification.chance import (
+    ACCEPT_DEX,
     GATE_SIGMA,
     SHORT_PAIR,
     least,
@@ -43,11 +44,6 @@ from estimator.identification.stars.evidence import (
     prior_volume_dex,
 )
 
-# Least log10 Bayes factor of an accepted attitude. By Markov's inequality, random detections reach it in at most one of
-# 10^5 frames. With 4, a mirrored sky was solved in one of 10^5 adversarial images
-# (docs/findings/robustness.md); 5 loses two in a thousand of the hardest frames (python -m benchmarks.lost_in_space),
-# 6 would lose twelve.
-ACCEPT_DEX = 5.0
 DECISIVE_DEX = 10.0  # evidence at which the search stops without looking for rivals
 MARGIN_DEX = 3.0  # by which the solution must beat every other attitude
 NO_RIVAL_DEX = ACCEPT_DEX - MARGIN_DEX  # below this an attitude is neither acceptable nor a rival
