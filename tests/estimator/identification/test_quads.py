@@ -1,5 +1,6 @@
 """Quads: their index against brute force, and frames of a camera whose focal length is wrong."""
 
+import functools
 from dataclasses import replace
 from itertools import combinations, permutations
 
@@ -17,7 +18,12 @@ from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 
 HEIGHT_RAD = np.radians(8.0)
-QUADS = quad_index.build(SKY, HEIGHT_RAD)
+
+
+@functools.cache
+def all_quads() -> quad_index.QuadIndex:
+    """The quads of the sky: built in a test, as each worker would compile them during the collection."""
+    return quad_index.build(SKY, HEIGHT_RAD)
 
 
 def code_of(stars):
@@ -59,9 +65,9 @@ def test_the_index_holds_every_quad_of_locally_bright_stars_by_its_code() -> Non
 
 
 def test_a_quad_is_in_the_cell_of_its_code() -> None:
-    number = np.repeat(np.arange(quad_index.SIDE**4), np.diff(QUADS.first))
+    number = np.repeat(np.arange(quad_index.SIDE**4), np.diff(all_quads().first))
     bound = np.array([quad_index.ALONG, quad_index.ACROSS] * 2)
-    cell = np.clip((QUADS.code + bound) / (2 * bound) * quad_index.SIDE, 0, quad_index.SIDE - 1).astype(int)
+    cell = np.clip((all_quads().code + bound) / (2 * bound) * quad_index.SIDE, 0, quad_index.SIDE - 1).astype(int)
     np.testing.assert_array_equal(cell @ quad_index.SIDE ** np.arange(3, -1, -1), number)
 
 
@@ -85,7 +91,7 @@ def rays_of(tangent):
 
 
 def identify(detections, calibrated=False):
-    return quads.identify(detections, QUADS, SKY, SEARCHED, CHECKS, calibrated)
+    return quads.identify(detections, all_quads(), SKY, SEARCHED, CHECKS, calibrated)
 
 
 @pytest.mark.parametrize("ratio", [0.955, 1.0, 1.045])
@@ -138,7 +144,7 @@ def test_the_effort_is_bounded() -> None:
     tangent = rng.uniform(FIELD[[0, 2]], FIELD[[1, 3]], (40, 2))
     tangent = np.concatenate([tangent, observe(Rotation.identity(), rng)[0]])
     loose = detections_of(tangent, np.full(len(tangent), np.nan), sigma=3e-4, zoom=0.05)
-    assert not len(quads.identify(loose, QUADS, SKY, SEARCHED, 0, False).star)
+    assert not len(quads.identify(loose, all_quads(), SKY, SEARCHED, 0, False).star)
 
 
 def test_a_right_focal_length_is_kept() -> None:
