@@ -6,9 +6,14 @@ keywords. The tracker verifies what a method answers with the whole field (`trac
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
-from estimator.core.types import StarMatch
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.catalog.pair_index import PairIndex
+from estimator.core.camera import Camera
+from estimator.core.types import Centroids, StarMatch
 from estimator.identification.published.fialho import VERSIONS
 from estimator.identification.published.master_star import master_star
 from estimator.identification.published.pyramid import pyramid
@@ -26,3 +31,43 @@ IDENTIFIERS: dict[str, Identifier] = {
     "master_star": master_star,
     **VERSIONS,
 }
+
+STEP = 0.02  # of the focal length
+CALIBRATED, STRETCH = 5e-4, 0.011  # relative errors of the focal length: calibrated, half a step and what is over
+EFFORTS = (60, 1_500_000), (600, 3_000_000), (3000, 4_000_000)  # triangles and checks, at most
+
+
+def candidates(
+    identifier: str,
+    centroids: Centroids,
+    camera: Camera,
+    index: PairIndex | None,
+    focal_uncertainty: float,
+    sigma_px: float,
+    base_stars: int,
+) -> Iterator[tuple[Camera, Rotation]]:
+    """Candidate cameras and attitudes, cam_from_ref, of the brightest centroids.
+
+    If the focal length is uncertain, its interval is searched in steps of STEP, first with little effort at all steps,
+    then with more.
+    sigma_px : least centroid error;  base_stars : of the search (`options.Options`)
+    """
+    identify = IDENTIFIERS[identifier]
+    steps = int(np.ceil(focal_uncertainty / STEP - 0.5))
+    stretch = STRETCH if focal_uncertainty else CALIBRATED
+    zooms = sorted((n * STEP for n in range(-steps, steps + 1)), key=abs)
+    for triangles, most_checks in EFFORTS:
+        for zoom in zooms:
+            zoomed = camera.zoomed(1 + zoom)
+            match = identify(
+                zoomed.rays(centroids.xy_px),
+                index,
+                max(1.5 if steps else 1.0, 4 * sigma_px) / zoomed.focal_px,
+                stretch=stretch,
+                focal_unknown=steps > 0,
+                max_triangles=triangles,
+                max_checks=most_checks,
+                base_stars=base_stars,
+            )
+            if match:
+                yield zoomed, match.cam_from_ref

@@ -270,6 +270,21 @@ class StarTracker:
         clock.lap("identify")
         return Attitude(NO_MATCH)
 
+    def _candidates(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
+        """Candidate cameras and attitudes by the published identifier that the settings name."""
+        from estimator.identification.registry import candidates  # several compiled modules
+
+        settings = self.settings
+        return candidates(
+            settings.identifier,
+            brightest(centroids, settings),
+            self.camera,
+            self.index,
+            self.focal_uncertainty,
+            settings.centroid_sigma_px,
+            settings.base_stars,
+        )
+
     def solve_matches(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:
         """Solve the attitude for given matches from any source (the truth included), without identification.
 
@@ -409,34 +424,6 @@ class StarTracker:
         match = StarMatch(solution.observed, solution.star, cam_from_ref, -solution.dex)
         rms_px = solution.rms * self.camera.focal_px
         return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2)
-
-    def _candidates(self, centroids: Centroids) -> Iterator[tuple[Camera, Rotation]]:
-        """Candidate attitudes and cameras by the published identifier that the settings name.
-
-        If the focal length is uncertain, its interval is searched in steps of 2 %, first with little effort at all
-        steps, then with more.
-        """
-        identify = _published()[self.settings.identifier]
-        step, stretch = 0.02, 0.011 if self.focal_uncertainty else 5e-4
-        steps = int(np.ceil(self.focal_uncertainty / step - 0.5))
-        zooms = sorted((n * step for n in range(-steps, steps + 1)), key=abs)
-        bright_centroids = brightest(centroids, self.settings)
-        for triangles, most_checks in ((60, 1_500_000), (600, 3_000_000), (3000, 4_000_000)):
-            for zoom in zooms:
-                camera = self.camera.zoomed(1 + zoom)
-                tolerance_rad = max(1.5 if steps else 1.0, 4 * self.settings.centroid_sigma_px) / camera.focal_px
-                match = identify(
-                    camera.rays(bright_centroids.xy_px),
-                    self.index,
-                    tolerance_rad,
-                    stretch=stretch,
-                    focal_unknown=steps > 0,
-                    max_triangles=triangles,
-                    max_checks=most_checks,
-                    base_stars=self.settings.base_stars,
-                )
-                if match:
-                    yield camera, match.cam_from_ref
 
 
 def _lights(centroids: Centroids, sigma_px: Floats) -> FlatCentroids:

@@ -28,7 +28,7 @@ from estimator.identification.published.fialho import search_options as fialho_o
 from estimator.identification.published.master_star import master_star
 from estimator.identification.published.pyramid import pyramid
 from estimator.identification.published.saa import AssumptionPool, saa
-from estimator.identification.registry import IDENTIFIERS
+from estimator.identification.registry import IDENTIFIERS, STEP, candidates
 from estimator.identification.stars.evidence import Solution
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.residuals import refinement
@@ -108,6 +108,22 @@ def test_directions_of_nothing_are_no_stars(
         assert told is None or (len(set(told.observed.tolist())) == len(told.observed) <= count)
     with pytest.raises(ImageError, match="focal length is uncertain"):
         Options(focal_unknown=True).require_known_focal(name)
+
+
+@law(candidates)
+@given(rng=SEEDS, steps=some.integers(-2, 2))
+def test_the_true_camera_and_attitude_are_a_candidate(rng: np.random.Generator, steps: int) -> None:
+    """The focal length is off by whole steps of the search, or known."""
+    world = World(rng)
+    light = 10 ** (-0.4 * world.mag[world.star])
+    centroids = Centroids(CAMERA.pixels(world.seen), np.full(len(light), 0.05), light)
+    camera, uncertainty = CAMERA.zoomed(1 / (1 + STEP * steps)), 0.04 if steps else 0.0
+    found = candidates("pyramid", centroids, camera, world.index, uncertainty, 0.05, Settings().base_stars)
+    right = (
+        abs(lens.focal_px / CAMERA.focal_px - 1) < 1e-9 and (cam_from_ref * world.truth.inv()).magnitude() < 1e-3
+        for lens, cam_from_ref in found
+    )
+    assert any(right)
 
 
 @law(Options.magnitudes, Options.require_known_focal)
