@@ -75,8 +75,11 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
     text = find_captions(blobs.box_px, blobs.peak)
     streak_px, turn_rad = priors.streak_px, priors.turn_rad
     if streak_px is None:
-        lines, center = shape[~text, 3:], ((image.shape[1] - 1) / 2, (image.shape[0] - 1) / 2)
-        x, y, turn_rad = _field(lines, blobs.xy_px[~text], center, _common_line(lines))
+        # Columns of readout smear are no streaks: what crosses half the frame has no say.
+        x0, y0, x1, y1 = blobs.box_px.T
+        votes = ~text & (x1 - x0 < image.shape[1] / 2) & (y1 - y0 < image.shape[0] / 2)
+        lines, center = shape[votes, 3:], ((image.shape[1] - 1) / 2, (image.shape[0] - 1) / 2)
+        x, y, turn_rad = _field(lines, blobs.xy_px[votes], center, _common_line(lines))
         if turn_rad != 0 or (hypot(x, y) > MIN_STREAK_PX and len(blobs) >= 3):
             streak_px = x, y
     else:

@@ -41,7 +41,7 @@ def observe(truth: Rotation, rng, sigma=SIGMA, zoom=1.0, vectors=VECTORS, mag=MA
 def detections_of(tangent, mag, sigma=SIGMA, zoom=0.0) -> evidence.Detections:
     sigmas = np.full(len(tangent), sigma)
     weight = np.stack([sigmas**-2, sigmas**-2, 0 * sigmas], axis=1)
-    return evidence.Detections(np.ascontiguousarray(tangent), sigmas, weight, np.array(mag), 0.25, FIELD, zoom)
+    return evidence.Detections(np.ascontiguousarray(tangent), sigmas, weight, np.array(mag), 0.25, FIELD, zoom, np.nan)
 
 
 def attitude_error(solution: Solution, truth: Rotation):

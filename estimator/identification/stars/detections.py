@@ -23,6 +23,8 @@ class Detections(NamedTuple):
     mag     : (N,) magnitudes on the catalog's scale, NaN if unknown;  mag_sigma : their standard deviation
     field   : (4,) tangents left, right, top, bottom of the sensor's edges
     focal_uncertainty : relative uncertainty of the focal length; 0 for a calibrated camera
+    limit_mag : to which every star should be seen: that of the median detection, as what shows faint false lights shows
+        the stars of their magnitude; NaN if unknown, and of a part of the detections
     """
 
     tangent: Floats
@@ -32,6 +34,7 @@ class Detections(NamedTuple):
     mag_sigma: float
     field: Floats
     focal_uncertainty: float
+    limit_mag: float
 
 
 class Sensor(NamedTuple):
@@ -81,7 +84,8 @@ def detections_of(lights: FlatCentroids, sensor: Sensor, focal_uncertainty: floa
         weight[n, 0], weight[n, 1], weight[n, 2] = yy * scale, xx * scale, -xy * scale
         mag[n] = sensor.zero_point_mag - 2.5 * log10(lights.flux[n])
     tangent = undistorted(lights.xy_px, focal_px, center_x, center_y, sensor.distortion)
-    return Detections(tangent, sigma, weight, mag, sensor.magnitude_sigma, sensor.field, focal_uncertainty)
+    limit_mag = mag[count // 2] if count else np.nan
+    return Detections(tangent, sigma, weight, mag, sensor.magnitude_sigma, sensor.field, focal_uncertainty, limit_mag)
 
 
 @jit
@@ -100,6 +104,7 @@ def changed(detections: Detections, count: int, variance: float, focal_uncertain
         detections.mag_sigma,
         detections.field,
         focal_uncertainty,
+        detections.limit_mag if count == len(detections.sigma) else np.nan,
     )
 
 

@@ -301,15 +301,13 @@ def cholesky_solve(a: Floats, b: Floats) -> Floats:
 def _count_missing(detections: Detections, sky: SkyIndex, R: Floats, focal_ratio: float, star: NDArray) -> int:
     """Number of missing stars: well inside the field, not matched, and bright enough to be detected.
 
-    Bright enough are stars as bright as the faintest matched one, and as bright as half of the detections, if their
-    magnitudes are known: what shows faint false lights shows the stars of their magnitude.
+    Bright enough are stars as bright as the faintest matched one, and those to `detections.limit_mag`, if it is known.
     """
     field = detections.field * (INNER_FRACTION / focal_ratio)
     left, right, top, bottom = field
     matched, faintest = 0, np.int64(0)
-    median = detections.mag[len(detections.mag) // 2]  # the brightest are first
-    if np.isfinite(median):
-        faintest = _count_brighter(sky, median) - 1
+    if np.isfinite(detections.limit_mag):
+        faintest = _count_brighter(sky, detections.limit_mag) - 1
     for s in star:
         x, y, _ = project(sky.vectors, R, s)
         matched += left < x < right and top < y < bottom

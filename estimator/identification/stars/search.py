@@ -95,8 +95,8 @@ def fit_to_all(
 
     Of a calibrated camera it is fitted with the calibrated focal length and with a free one. The calibrated one is kept
     unless the other has WRONG_FOCAL_DEX more evidence: with a wrong focal length a part of the stars may still match,
-    at a wrong attitude. The solution is empty if the candidate has less than `accept_dex`, or keeps no more than half
-    of its matches.
+    at a wrong attitude. The solution is empty if the candidate has less than `accept_dex`, if it keeps no more than
+    half of its matches, or if all detections together are not beyond chance.
     detections : with the focal uncertainty of the free fit
     whole : whether the candidate is the calibrated fit to all detections already
     """
@@ -112,7 +112,7 @@ def fit_to_all(
         fitted = evaluate(detections, stars, R.copy(), ratio, gates, -np.inf)
         if not calibrated or fitted.dex > full.dex + WRONG_FOCAL_DEX:
             chosen, full = detections, fitted
-    if not found or 2 * len(full.observed) <= len(candidate.observed):
+    if not found or 2 * len(full.observed) <= len(candidate.observed) or full.dex < ACCEPT_DEX:
         return build_solution(chosen, stars, no_hypothesis())
     dex = max(full.dex, candidate.dex)
     best = Hypothesis(full.observed, full.star, full.R_cam_from_ref, full.focal_ratio, full.info, dex)

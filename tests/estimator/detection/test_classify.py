@@ -6,6 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
+from benchmarks import frames
+from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, RateEstimate
@@ -342,6 +344,19 @@ def test_rows_of_equal_lights_are_no_text() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 50, 84])
+def test_columns_of_readout_smear_are_no_streaks(seed: int) -> None:
+    """Saturated stars leave columns from border to border: they are parallel, but no star moved along them."""
+    setup, stars = frames.SETUPS[3], catalog.hipparcos()
+    image, truth = frames.render(setup, stars, np.random.default_rng([1, seed]))
+    blobs = detect.default(image, priors=FramePriors(None, setup.depth))
+    assert blobs.streak_px is None
+    xy_px = setup.camera.pixels(truth.apply(stars.vectors[stars.v_mag < 5.5]))
+    bright = xy_px[setup.camera.contains(np.nan_to_num(xy_px, nan=-1e9), 20.0)]
+    off_px = np.linalg.norm(bright[:, None] - blobs.xy_px[blobs.flag & NO_STAR == 0], axis=2).min(axis=1)
+    assert np.mean(off_px < 2) >= 0.6
+
+
 @pytest.mark.parametrize("centroider", ["cog", "gaussian_window", "gaussian_fit"])
 @pytest.mark.parametrize("over", [2.0, 10.0])
 def test_saturated_stars_are_kept_with_a_sigma_that_covers_them(centroider: str, over: float) -> None:

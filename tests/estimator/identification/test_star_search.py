@@ -24,8 +24,11 @@ from star_fields import (
 
 from estimator.catalog import sky_index
 from estimator.core.errors import ImageError
+from estimator.core.types import NO_SPREAD
 from estimator.core.vectors import quaternion_xyzw
+from estimator.identification.stars import detections as detections_module
 from estimator.identification.stars import evidence, search
+from estimator.identification.stars.detections import FlatCentroids, Sensor, changed, gates_of
 from estimator.identification.stars.evidence import Solution
 
 
@@ -363,3 +366,29 @@ def test_the_quick_check_stops_as_soon_as_it_knows(
     tables = sky.vectors, sky.cell_first, sky.cell_star, sky.side
     found = PLAIN.quick_check(places, *tables, np.eye(3), 1.0, np.full(6, 1e-4), order, required, max_misses)
     assert found == (lookups, fits)
+
+
+@pytest.mark.parametrize(("limit_mag", "matches"), [(np.nan, 4), (6.0, 0)])
+def test_all_lights_must_confirm_what_the_brightest_tell(limit_mag: float, matches: int) -> None:
+    """Four exact stars are beyond chance among four lights, not among 104 as faint as stars that are missing."""
+    rng = np.random.default_rng(4)
+    truth = Rotation.random(rng=rng)
+    tangent, mag, _ = observe(truth, rng)
+    false = rng.uniform(FIELD[[0, 2]], FIELD[[1, 3]], (100, 2))
+    lights = detections_of(np.concatenate([tangent[:4], false]), np.append(mag[:4], np.full(100, 6.0)))
+    few = changed(lights, 4, 1.0, 0.0)
+    candidate = evidence.evaluate(few, SKY, truth.as_matrix(), 1.0, gates_of(few, 1.5), -np.inf)
+    assert candidate.dex > search.ACCEPT_DEX
+    found = search.fit_to_all(lights._replace(limit_mag=limit_mag), SKY, candidate, search.ACCEPT_DEX, True, False)
+    assert len(found.star) == matches
+
+
+def test_the_limiting_magnitude_is_that_of_the_median_light_of_all() -> None:
+    lens = Sensor(1000.0, (0.0, 0.0), (0.0,) * 5, FIELD, 20.0, 0.25)
+    sigma_px, flux = np.full(5, 0.1), np.array([900.0, 500.0, 300.0, 200.0, 100.0])
+    lights = detections_module.detections_of(
+        FlatCentroids(np.eye(5, 2), sigma_px, flux, NO_SPREAD, sigma_px), lens, 0.0
+    )
+    assert lights.limit_mag == pytest.approx(20 - 2.5 * np.log10(300))
+    assert changed(lights, 5, 4.0, 0.0).limit_mag == lights.limit_mag
+    assert np.isnan(changed(lights, 4, 1.0, 0.0).limit_mag)
