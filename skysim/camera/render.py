@@ -117,7 +117,7 @@ def render(
     kernels = source_kernels(
         optics.camera, mid_px, candidates.radius_m, candidates.place[:, 3] > 0, distance_m, cos_in, disks
     )
-    table = draw(image, tracks, kernels, window)
+    table = draw(image, tracks, kernels, STEP * kernels.sharp_px, window)
     # Only sources that gave light to the chip are reported.
     on_chip = table[:, 0] > 0
     electrons, peak, x, y, squares, length = table[on_chip, :6].T
@@ -239,8 +239,10 @@ def _in_cone(place: Floats, boresight: Floats, camera_m: Floats, cos_limit: floa
     return inside
 
 
-def draw(image: NDArray[Any], tracks: Tracks, kernels: Kernels, window: Window) -> Floats:
+def draw(image: NDArray[Any], tracks: Tracks, kernels: Kernels, step_px: Floats, window: Window) -> Floats:
     """Draw every source on a patch of its own and add the patches to the image, as many at a time as memory allows.
+
+    step_px : (N,) largest motion of each image in one piece of the exposure; of an ellipse in units of `sharpest_px`
 
     Returns (N, 8): electrons on the chip, those of the brightest pixel, flux-weighted mean x and y, sum of the
     squared pixels, path length in pixels, and the brightest pixel's x and y. The mean is that of the whole image,
@@ -256,7 +258,7 @@ def draw(image: NDArray[Any], tracks: Tracks, kernels: Kernels, window: Window) 
         last = first + max(1, int(np.searchsorted(total, budget, side="right")))
         starts = np.concatenate([[0], total[: last - first]])
         buffer = np.zeros(starts[-1])
-        _draw(buffer, starts, boxes[first:last], first, tracks, kernels, window, out)
+        _draw(buffer, starts, boxes[first:last], first, tracks, kernels, step_px, window, out)
         _deposit(image, buffer, starts, boxes[first:last])
         first = last
     return out
@@ -287,6 +289,7 @@ def _draw(
     first: int,
     tracks: Tracks,
     kernels: Kernels,
+    step_px: Floats,
     window: Window,
     out: Any,
 ) -> None:
@@ -294,7 +297,7 @@ def _draw(
         x0, x1, y0, y1 = boxes[i]
         if x1 > x0 and y1 > y0:
             patch = buffer[starts[i] : starts[i + 1]].reshape(y1 - y0, x1 - x0)
-            _expose_source(patch, x0, y0, first + i, tracks, kernels, window, out[first + i])
+            _expose_source(patch, x0, y0, first + i, tracks, kernels, step_px[first + i], window, out[first + i])
             _patch_statistics(patch, x0, y0, out[first + i])
 
 
@@ -306,12 +309,15 @@ def _expose_source(
     n: int,
     tracks: Tracks,
     kernels: Kernels,
+    step_px: float,
     window: Window,
     row: Any,
 ) -> None:
     """Integrate one source on its patch; write the light's mean position and the path length into row[2:6]."""
     end_s = window.open_s + window.exposure_s
-    table, step_px = _sampled(n, kernels)
+    table = _sampled(n, kernels)
+    if len(table):
+        step_px *= sharpest_px(table)
     row[5] = _length(tracks, n, window.open_s, end_s)
     # Without a rolling shutter all rows share one integral; with it each row needs its own interval.
     rolling = window.row_time_s != 0
@@ -375,14 +381,13 @@ def _integrate(
 
 @jit
 def _sampled(n: int, kernels: Kernels) -> Any:
-    """The table of an ellipse (empty for other kinds), and the largest motion of an image in one piece."""
+    """The table of an ellipse; empty for other kinds."""
     if kernels.kind[n] != ELLIPSE:
-        return np.empty((0, 0, 0), np.float32), STEP * kernels.sharp_px[n]
+        return np.empty((0, 0, 0), np.float32)
     begin, end, waves, samples = kernels.table[n]
     d = kernels.disk[n]
     disk = EllipseDisk(d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7], d[8], d[9], d[10], d[11], d[12], d[13], d[14])
-    table = ellipse_table(disk, kernels.tables[begin:end], waves, samples, kernels.bessel)
-    return table, STEP * sharpest_px(table)
+    return ellipse_table(disk, kernels.tables[begin:end], waves, samples, kernels.bessel)
 
 
 @jit

@@ -203,7 +203,9 @@ def test_a_moving_ellipse_is_the_mean_of_still_ones() -> None:
 def test_rim_and_mean_light_are_those_of_the_projected_disk(
     field_deg: float, incidence_deg: float, around_deg: float, azimuth_deg: float, exponent: float
 ) -> None:
-    """The rim's points are on the ellipse, and the mean of the light is center + A q / 4, to third order in r / d."""
+    """The rim's points are on the ellipse, whose area is cos i / cos^3 a of a circle of f r / d, and the mean of the
+    light is center + A q / 4, all to third order in r / d.
+    """
     lens = lens_of()
     out_px = lens.camera.focal_px * np.tan(np.radians(field_deg))
     angle = np.radians(azimuth_deg)
@@ -215,6 +217,9 @@ def test_rim_and_mean_light_are_those_of_the_projected_disk(
     third = lens.camera.focal_px * RADIUS_M**3 * 40
     mean = images.center[0] + images.gradient[0] / 4
     np.testing.assert_allclose(mean, xy @ light / light.sum() - xy_px, rtol=0, atol=third)
+    cos_i, cos_a = np.cos(np.radians([incidence_deg, field_deg]))
+    circle_px = lens.camera.focal_px * RADIUS_M * cos_a / DEPTH_M  # f r / d
+    assert np.prod(images.semi_axes_px()) == pytest.approx(circle_px**2 * cos_i / cos_a**3, rel=1e-3)
     normal, place = source.normal[0], source.place[0, :3]
     across = np.cross(normal, [0.3, -0.8, 0.52])
     across /= np.linalg.norm(across)

@@ -20,7 +20,14 @@ from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.plate_solver import retries
 from skysim.apps.plate_solver.solution import PlateSolution, annotated_image, solution_fields
-from skysim.apps.plate_solver.solver import FOV_LIMITS_DEG, Solver, kept_solver, make_solver, solve_array, validated_date
+from skysim.apps.plate_solver.solver import (
+    FOV_LIMITS_DEG,
+    Solver,
+    kept_solver,
+    make_solver,
+    solve_array,
+    validated_date,
+)
 from skysim.core.errors import InputError
 from skysim.core.io import files, images
 

@@ -186,7 +186,7 @@ def product(a: Singles, b: Singles) -> Singles:
 
 @jit(fastmath=True)
 def quadrants(spectra: Singles, cosine: Singles, sine: Singles, odd: float) -> Singles:
-    """(4, M, M) images at x, y >= 0, [y, x]: cos cos and sin sin of the real, sin cos and cos sin of the imaginary part.
+    """(4, M, M) images at x, y >= 0, [y, x]: cos cos, sin sin of the real, sin cos, cos sin of the imaginary part.
 
     By cos(a + b) = cos a cos b - sin a sin b and sin(a + b) = sin a cos b + cos a sin b these give every quadrant.
     """

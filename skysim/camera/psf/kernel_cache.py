@@ -29,7 +29,7 @@ class Kernels(NamedTuple):
     kind     : (N,) GAUSS, ROUND, GRID or ELLIPSE
     sigma_px : (N,) of a Gaussian
     reach_px : (N,) no light beyond it in x or in y
-    sharp_px : (N,) size of the sharpest feature, see `sharpness_px`; NaN for an ellipse, whose table is not built yet
+    sharp_px : (N,) size of the sharpest feature, see `sharpness_px`; 1 for an ellipse, whose table is built later
     table    : (N, 4) begin and end of the source's table in `tables`, and two sizes of its shape
     tables   : all tables that are needed, end to end
     disk     : (N, 15) the fields of `ellipse.EllipseDisk`; zeros for other kinds
@@ -160,7 +160,9 @@ def ellipse_disks(
     winged, odd = psf.kind in WINGED, psf.kind in WINGED + NOT_ROUND
     wide = (disks.semi_axes_px()[:, 1] > 1.5 * np.sqrt(variance_px2))[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
-        inverse = np.column_stack([yy * gradient[:, 0] - xy * gradient[:, 1], xx * gradient[:, 1] - xy * gradient[:, 0]])
+        inverse = np.column_stack(
+            [yy * gradient[:, 0] - xy * gradient[:, 1], xx * gradient[:, 1] - xy * gradient[:, 0]]
+        )
         slope = np.where(wide, inverse / (xx * yy - xy**2)[:, None], 0)
     drawn = center if odd else np.where(wide, center - variance_px2[:, None] * slope, mean)
     parts = (zero, gradient) if odd else (slope, zero)
@@ -202,7 +204,7 @@ def make_kernel(
     """A row of `KernelCache.kernels`, the two sizes of its table's shape, and the table."""
     if key[0] == BOX_KEY:
         box = ellipse.ellipse_box(camera.psf, camera, key[1])
-        return (ELLIPSE, 0.0, key[1] + 0.5, np.nan), (box.waves, box.samples), box.table
+        return (ELLIPSE, 0.0, key[1] + 0.5, 1.0), (box.waves, box.samples), box.table
     kernel = build_kernel(camera.psf, camera, *(n * QUANTUM_PX for n in key))
     kind = GRID if len(kernel.grid) else ROUND if len(kernel.radial) else GAUSS
     table = kernel.grid if kind == GRID else kernel.radial

@@ -66,7 +66,7 @@ def disk_images(
     distance_m = np.linalg.norm(points, axis=2)
     cos_out = -np.sum(points * normal_cam, axis=2) / distance_m
     throughput = optics.throughput(points[..., 2] / distance_m)
-    light = irradiance_e_s_m2(np.float64(1.0), emitter, cos_out, throughput, distance_m)
+    light = irradiance_e_s_m2(np.ones(()), emitter, cos_out, throughput, distance_m)
     image = optics.project(points)
     with np.errstate(invalid="ignore", divide="ignore"):
         slope = (light[1:3] - light[3:]) / (2 * light[0])  # (2, N)
