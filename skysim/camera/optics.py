@@ -80,31 +80,6 @@ class Optics:
         return cosine * VIGNETTING[config.kind](config, np.arccos(np.minimum(cosine, 1)))
 
 
-def disk_image_axes(offset_cam: Floats, normal_cam: Floats) -> Floats:
-    """Semi-axes of the images of small disks, in units of the drawn circle's radius f r / d; distortion left out.
-
-    A disk at X = (x Z, y Z, Z), d from the pupil, in the plane of unit normal n has the rim X + r e, |e| = 1, e n = 0.
-    To first order in r / d its image is the ellipse
-
-        f r / Z  J (I - n n^T) e,    J = (1 0 -x; 0 1 -y),
-
-    whose semi-axes are f r / Z times the singular values of J (I - n n^T). At an incidence i (between the normal and
-    the line of sight) and a field angle a, their product is cos i / cos^3 a: a tilted disk is foreshortened, and the
-    plane sensor enlarges it by 1 / cos^2 a along the radius and 1 / cos a across.
-
-    offset_cam : (N, 3) from the pupil to the disks, Z > 0
-    normal_cam : (N, 3)
-    Returns (N, 2), the larger one first.
-    """
-    x, y, z = offset_cam.T
-    jacobian = np.zeros((len(z), 2, 3))
-    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1
-    jacobian[:, :, 2] = -np.column_stack([x, y]) / z[:, None]
-    in_plane = np.eye(3) - normal_cam[:, :, None] * normal_cam[:, None, :]
-    enlargement = np.linalg.norm(offset_cam, axis=1) / z
-    return enlargement[:, None] * np.linalg.svd(jacobian @ in_plane, compute_uv=False)
-
-
 def radial(distortion: tuple[float, ...], r2: Floats) -> Floats:
     """Radial distortion factor 1 + k1 r^2 + k2 r^4 + k3 r^6 from k1, k2, p1, p2, k3 (OpenCV's order)."""
     k1, k2, _, _, k3 = distortion

@@ -22,8 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.camera.optics import Optics
-from skysim.camera.psf.kernel_cache import GAUSS, ROUND, Kernels, source_kernels
-from skysim.camera.psf.splat import add_gaussian, add_grid, add_round
+from skysim.camera.psf.ellipse import EllipseDisk, add_ellipse, ellipse_table, sharpest_px
+from skysim.camera.psf.kernel_cache import ELLIPSE, GAUSS, ROUND, Kernels, source_kernels
+from skysim.camera.psf.led_disk import DiskImages, disk_images
+from skysim.camera.psf.splat import Singles, add_gaussian, add_grid, add_round
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
@@ -108,9 +110,13 @@ def render(
     candidates = sources.take(in_view(sources, optics, few_poses))
     if occluded:
         candidates = candidates.take(~occluded(candidates))
-    tracks, distance_m, cos_in = image_tracks(candidates, optics, all_poses, t_s, emitter or Emitter())
-    mid_px = tracks.xy_px[len(t_s) // 2]
-    kernels = source_kernels(optics.camera, mid_px, candidates.radius_m, candidates.place[:, 3] > 0, distance_m, cos_in)
+    emitter, middle = emitter or Emitter(), len(t_s) // 2
+    tracks, distance_m, cos_in = image_tracks(candidates, optics, all_poses, t_s, emitter)
+    mid_px = tracks.xy_px[middle]
+    disks = led_images(candidates, optics, Poses(*(samples[middle] for samples in all_poses)), emitter)
+    kernels = source_kernels(
+        optics.camera, mid_px, candidates.radius_m, candidates.place[:, 3] > 0, distance_m, cos_in, disks
+    )
     table = draw(image, tracks, kernels, STEP * kernels.sharp_px, window)
     # Only sources that gave light to the chip are reported.
     on_chip = table[:, 0] > 0
@@ -180,6 +186,22 @@ def project(sources: Sources, optics: Optics, poses: Poses) -> tuple[Floats, Flo
     return optics.project(direction_cam), distance, cos_out, direction_cam[:, :, 2]
 
 
+def led_images(sources: Sources, optics: Optics, pose: Poses, emitter: Emitter) -> DiskImages | None:
+    """The geometric images of N sources at one pose, NaN for stars; None if all are stars."""
+    led = np.flatnonzero(sources.radius_m * sources.place[:, 3] > 0)
+    if not len(led):
+        return None
+    cam_from_lab, camera_m = pose
+    offset_cam, normal_cam = (a @ cam_from_lab.T for a in (sources.place[led, :3] - camera_m, sources.normal[led]))
+    images = disk_images(optics, emitter, offset_cam, normal_cam, sources.radius_m[led])
+    if len(led) == len(sources):
+        return images
+    spread = (np.full((len(sources), *part.shape[1:]), np.nan) for part in images)
+    for whole, part in zip(full := DiskImages(*spread), images, strict=True):
+        whole[led] = part
+    return full
+
+
 def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]:
     """Rows of the sources within a cone about the boresight at any of these poses.
 
@@ -220,7 +242,7 @@ def _in_cone(place: Floats, boresight: Floats, camera_m: Floats, cos_limit: floa
 def draw(image: NDArray[Any], tracks: Tracks, kernels: Kernels, step_px: Floats, window: Window) -> Floats:
     """Draw every source on a patch of its own and add the patches to the image, as many at a time as memory allows.
 
-    step_px : (N,) largest motion of each image in one piece of the exposure
+    step_px : (N,) largest motion of each image in one piece of the exposure; of an ellipse in units of `sharpest_px`
 
     Returns (N, 8): electrons on the chip, those of the brightest pixel, flux-weighted mean x and y, sum of the
     squared pixels, path length in pixels, and the brightest pixel's x and y. The mean is that of the whole image,
@@ -293,6 +315,9 @@ def _expose_source(
 ) -> None:
     """Integrate one source on its patch; write the light's mean position and the path length into row[2:6]."""
     end_s = window.open_s + window.exposure_s
+    table = _sampled(n, kernels)
+    if len(table):
+        step_px *= sharpest_px(table)
     row[5] = _length(tracks, n, window.open_s, end_s)
     # Without a rolling shutter all rows share one integral; with it each row needs its own interval.
     rolling = window.row_time_s != 0
@@ -300,11 +325,11 @@ def _expose_source(
     for j in range(0, len(patch), rows):
         delay_s = (y0 + j) * window.row_time_s
         begin_s = window.open_s + delay_s
-        sums = _integrate(patch, j, j + rows, x0, y0, n, tracks, kernels, step_px, begin_s, end_s + delay_s)
+        sums = _integrate(patch, j, j + rows, x0, y0, n, tracks, kernels, table, step_px, begin_s, end_s + delay_s)
     if rolling:
         row[2], row[3] = _centroid(patch, x0, y0)
     elif sums[0] > 0:
-        row[2], row[3] = sums[1] / sums[0], sums[2] / sums[0]
+        row[2], row[3] = sums[1] / sums[0] + kernels.disk[n, 2], sums[2] / sums[0] + kernels.disk[n, 3]
 
 
 @jit
@@ -317,6 +342,7 @@ def _integrate(
     n: int,
     tracks: Tracks,
     kernels: Kernels,
+    table: Singles,
     step_px: float,
     begin_s: float,
     end_s: float,
@@ -348,14 +374,25 @@ def _integrate(
             electrons = rate * lit / points
             if not electrons > 0:  # no image at this time (NaN position), or the LED faces away
                 continue
-            _splat_point(patch, row0, row1, x - x0, y - y0, electrons, n, kernels)
+            _splat_point(patch, row0, row1, x - x0, y - y0, electrons, n, kernels, table)
             total, total_x, total_y = total + electrons, total_x + electrons * x, total_y + electrons * y
     return total, total_x, total_y
 
 
 @jit
+def _sampled(n: int, kernels: Kernels) -> Any:
+    """The table of an ellipse; empty for other kinds."""
+    if kernels.kind[n] != ELLIPSE:
+        return np.empty((0, 0, 0), np.float32)
+    begin, end, waves, samples = kernels.table[n]
+    d = kernels.disk[n]
+    disk = EllipseDisk(d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7], d[8], d[9], d[10], d[11], d[12], d[13], d[14])
+    return ellipse_table(disk, kernels.tables[begin:end], waves, samples, kernels.bessel)
+
+
+@jit
 def _splat_point(
-    patch: Any, row0: int, row1: int, x: float, y: float, electrons: float, n: int, kernels: Kernels
+    patch: Any, row0: int, row1: int, x: float, y: float, electrons: float, n: int, kernels: Kernels, table: Singles
 ) -> None:
     """Add the image of a point of light to the patch, by its kind of kernel."""
     begin, end, p, q = kernels.table[n]
@@ -363,6 +400,8 @@ def _splat_point(
         add_gaussian(patch, row0, row1, x, y, electrons, kernels.sigma_px[n])
     elif kernels.kind[n] == ROUND:
         add_round(patch, row0, row1, x, y, electrons, kernels.tables[begin:end].reshape(p, q))
+    elif kernels.kind[n] == ELLIPSE:
+        add_ellipse(patch, row0, row1, x + kernels.disk[n, 0], y + kernels.disk[n, 1], electrons, table)
     else:
         add_grid(patch, row0, row1, x, y, electrons, kernels.tables[begin:end].reshape(p, p, q, q))
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skysim.camera.psf.kernel import build_kernel
+from skysim.camera.psf.kernel import Kernel, build_kernel
 from skysim.camera.psf.kernel_cache import GAUSS, GRID, ROUND, sharpness_px, source_kernels
 from skysim.core.errors import InputError
 from skysim.scene.sections.camera import CameraConfig
@@ -92,3 +92,11 @@ def test_a_full_cache_is_cleared_and_gives_the_same_images(monkeypatch: pytest.M
 def test_a_lamp_far_out_of_focus_is_refused_in_one_line() -> None:
     with pytest.raises(InputError, match=r"camera\.focus: .* px; allowed: up to 500 px"):
         shapes(camera(focus="infinity", f_number=1.0), [1e-3], [True], [0.08])
+
+
+def test_a_kernels_peak_is_the_brightest_pixel_of_a_centered_image() -> None:
+    """A Gaussian's: the integral over a pixel of 1 px, here by the midpoint rule."""
+    empty = np.empty((0, 3), np.float32), np.empty((0, 0, 0, 0), np.float32)
+    x = (np.arange(2000) + 0.5) / 2000 - 0.5
+    wanted = (np.mean(np.exp(-(x**2) / 2 / 0.7**2)) / np.sqrt(2 * np.pi) / 0.7) ** 2
+    assert Kernel(0.7, *empty).peak == pytest.approx(wanted, rel=1e-6)

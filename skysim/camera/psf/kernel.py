@@ -123,12 +123,17 @@ class PsfModel:
 
 
 @lru_cache(maxsize=1024)
-def bandwidth(psf: Psf, camera: CameraConfig, sigma_px: float, level: float) -> float:
-    """The frequency above which lens and Gaussian pass less than `level`, in steps of a half from 1 to 64."""
+def passband(psf: Psf, camera: CameraConfig, sigma_px: float, level: float) -> float:
+    """The frequency above which lens and Gaussian pass less than `level`, in steps of 1/16 up to 64."""
     f = np.linspace(0, 64, 1025)
     transfer = (PSFS[psf.kind](psf, camera, *axes) for axes in ((f, 0 * f), (0 * f, f)))
     combined = np.maximum(*map(np.abs, transfer)) * blur(sigma_px, f, 0 * f)
-    return float(max(np.ceil(2 * f[np.flatnonzero(combined >= level)[-1]]) / 2, 1.0))
+    return float(f[np.flatnonzero(combined >= level)[-1]])
+
+
+def bandwidth(psf: Psf, camera: CameraConfig, sigma_px: float, level: float) -> float:
+    """The same in steps of a half from 1 to 64."""
+    return float(max(np.ceil(2 * passband(psf, camera, sigma_px, level)) / 2, 1.0))
 
 
 def softening_sigma_px(bandwidth: float, highest: float) -> float:

@@ -8,26 +8,32 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from skysim.camera.psf import ellipse
 from skysim.camera.psf.kernel import QUANTUM_PX, Kernel, build_kernel
-from skysim.camera.psf.otf import blur_radius_px, field_sigma_px
+from skysim.camera.psf.led_disk import DiskImages
+from skysim.camera.psf.otf import NOT_ROUND, WINGED, blur_radius_px, field_sigma_px
 from skysim.camera.psf.splat import PER_PX, Singles
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig, Psf
 
-GAUSS, ROUND, GRID = 0, 1, 2
+GAUSS, ROUND, GRID, ELLIPSE = 0, 1, 2, 3
+BOX_KEY = -1  # first number of the key of an ellipse's box; those of kernels are sizes
+MAX_ROUND_ERROR = 1e-4  # of the peak: a disk whose round image differs by less is drawn round
 PACKING = np.array([1 << 42, 1 << 21, 1])  # packs three sizes, in steps of 0.01 px, into one integer
 
 
 class Kernels(NamedTuple):
     """The pixel-integrated images of N sources.
 
-    kind     : (N,) GAUSS, ROUND or GRID
+    kind     : (N,) GAUSS, ROUND, GRID or ELLIPSE
     sigma_px : (N,) of a Gaussian
     reach_px : (N,) no light beyond it in x or in y
-    sharp_px : (N,) size of the sharpest feature, see `sharpness_px`
+    sharp_px : (N,) size of the sharpest feature, see `sharpness_px`; 1 for an ellipse, whose table is built later
     table    : (N, 4) begin and end of the source's table in `tables`, and two sizes of its shape
     tables   : all tables that are needed, end to end
+    disk     : (N, 15) the fields of `ellipse.EllipseDisk`; zeros for other kinds
+    bessel   : the table for `ellipse.jinc`
     """
 
     kind: NDArray[np.int64]
@@ -36,6 +42,8 @@ class Kernels(NamedTuple):
     sharp_px: Floats
     table: NDArray[np.int64]
     tables: Singles
+    disk: Floats
+    bessel: Singles
 
 
 class KernelCache(NamedTuple):
@@ -64,13 +72,16 @@ def source_kernels(
     is_led: NDArray[np.bool_],
     distance_m: Floats,
     cos_field: Floats,
+    disks: DiskImages | None = None,
 ) -> Kernels:
     """The kernels of N sources.
 
     xy_px      : (N, 2) image positions, for the blur that grows with the field; NaN is taken as the principal point
     radius_m   : (N,) of the emitting disk, 0 for a star; drawn as a round disk of angular radius radius / distance
+                 where that differs from its image in `disks` by less than MAX_ROUND_ERROR
     is_led     : (N,) LEDs, which may be out of focus by their own distance_m; stars are at infinity
     cos_field  : (N,) of the angle from the boresight
+    disks      : their geometric images, NaN for stars; None draws all disks round
     Raises InputError for a source too far out of focus.
     """
     position = np.where(np.isnan(xy_px), camera.center_px, xy_px)
@@ -81,13 +92,20 @@ def source_kernels(
     outside_px = np.maximum(np.maximum(-position, position - size), 0).max(axis=1)
     # Sources far outside the frame have no image.
     emitter, blur = (np.where(outside_px < MAX_RADIUS_PX, radius, 0.0) for radius in (emitter, blur))
-    largest = (emitter + blur).max(initial=0.0)
+    widest = emitter if disks is None else np.where(emitter > 0, np.fmax(emitter, disks.semi_axes_px()[:, 0]), 0)
+    largest = (widest + blur).max(initial=0.0)
     if largest > MAX_RADIUS_PX:
         raise InputError(
             f"camera.focus: a source's image, {blur.max():.0f} px out of focus, has a radius of {largest:.0f} px;"
             f" allowed: up to {MAX_RADIUS_PX:.0f} px"
         )
     steps = np.rint(np.column_stack([extra, emitter, blur]) / QUANTUM_PX).astype(np.int64)
+    disk = np.zeros((len(steps), len(ellipse.EllipseDisk._fields)))
+    if disks is not None:
+        variance_px2 = 1 / (2 * np.pi * build_kernel(camera.psf, camera).peak) + extra**2 + blur**2 / 4
+        chosen = np.flatnonzero((emitter > 0) & (round_error(disks, emitter, variance_px2) > MAX_ROUND_ERROR))
+        sizes = (part[chosen] for part in (blur, extra, variance_px2))
+        disk[chosen], steps[chosen] = ellipse_disks(camera.psf, camera, disks.take(chosen), *sizes)
     gaussian = camera.psf.kind == "gaussian"
     if gaussian:
         steps[(steps[:, 1:] == 0).all(axis=1), 0] = 0  # Gaussians need no shared table
@@ -106,7 +124,55 @@ def source_kernels(
         widening = np.hypot(sigma, extra) / np.where(point, sigma, 1)
         sigma, sharp = (np.where(point, a * widening, a) for a in (sigma, sharp))
         reach = np.where(point, reach * np.maximum(widening, 1), reach)
-    return Kernels(kind.astype(np.int64), sigma, reach, sharp, spans, cache.tables[0])
+    return Kernels(kind.astype(np.int64), sigma, reach, sharp, spans, cache.tables[0], disk, ellipse.jinc_table())
+
+
+def round_error(disks: DiskImages, drawn_px: Floats, variance_px2: Floats) -> Floats:
+    """(N,) about the largest error, over the peak, of disks drawn as circles of these radii about their centers.
+
+    Behind a blur of variance s^2 the edge of a wide disk has the slope 0.4 / s; a radius a of a small one makes the
+    image wider by a^2 / 4, and so its peak less by a^2 / 8 s^2. A shifted image differs by up to 0.6 / s a pixel, and
+    so does the gradient of a small disk, which shifts the image; that of a wide one is seen as it is. NaN where a disk
+    has no image.
+    """
+    s_px, axes = np.sqrt(variance_px2), disks.semi_axes_px()
+    edge_px = np.abs(axes - drawn_px[:, None]).max(axis=1)
+    shift_px, gradient_px = (np.hypot(*part.T) for part in (disks.center, disks.gradient))
+    gradient = np.minimum(gradient_px / np.maximum(axes[:, 1], 1e-9), 0.15 * gradient_px / s_px)
+    return np.asarray((np.minimum(0.4, drawn_px / 2 / s_px) * edge_px + 0.6 * shift_px) / s_px + gradient)
+
+
+def ellipse_disks(
+    psf: Psf, camera: CameraConfig, disks: DiskImages, blur_px: Floats, sigma_px: Floats, variance_px2: Floats
+) -> tuple[Floats, NDArray[np.int64]]:
+    """(M, 15) `ellipse.EllipseDisk` of M disks, and (M, 3) the keys of their boxes.
+
+    variance_px2 : s^2 of the blur behind which they are seen
+
+    Blurred by a Gaussian, a light of I (1 + g x) is (1 + g x) I + s^2 g dI/dx: the blurred I, shifted by -s^2 g, times
+    (1 + g x). A disk smaller than its blur is only shifted by its gradient. For a lens with wings or one that is not
+    round the gradient is in the spectrum.
+    """
+    matrix, center, gradient = disks
+    square = matrix @ matrix.transpose(0, 2, 1)
+    xx, xy, yy = square[:, 0, 0], square[:, 0, 1], square[:, 1, 1]
+    mean, zero = center + gradient / 4, np.zeros_like(gradient)
+    winged, odd = psf.kind in WINGED, psf.kind in WINGED + NOT_ROUND
+    wide = (disks.semi_axes_px()[:, 1] > 1.5 * np.sqrt(variance_px2))[:, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        inverse = np.column_stack(
+            [yy * gradient[:, 0] - xy * gradient[:, 1], xx * gradient[:, 1] - xy * gradient[:, 0]]
+        )
+        slope = np.where(wide, inverse / (xx * yy - xy**2)[:, None], 0)
+    drawn = center if odd else np.where(wide, center - variance_px2[:, None] * slope, mean)
+    parts = (zero, gradient) if odd else (slope, zero)
+    # With wings the reach is that of a circle, where they are faded; else that along x and y.
+    radius_px = disks.semi_axes_px()[:, 0] if winged else np.sqrt(np.maximum(xx, yy))
+    reach = ellipse.reach_px(psf, camera, radius_px + blur_px, sigma_px)
+    one = np.ones_like(xx)
+    half_px = ellipse.box_half_px(reach + np.abs(drawn).max(axis=1))
+    disk = np.column_stack([drawn, mean, xx, xy, yy, *parts, blur_px, sigma_px, reach * winged, odd * one])
+    return disk, np.column_stack([BOX_KEY * one, half_px, 0 * one]).astype(np.int64)
 
 
 def add_kernels(cache: KernelCache, camera: CameraConfig, keys: list[tuple[int, ...]]) -> None:
@@ -117,12 +183,9 @@ def add_kernels(cache: KernelCache, camera: CameraConfig, keys: list[tuple[int, 
         cache.tables.append(np.empty(0, np.float32))
     tables, begin = [cache.tables[0]], len(cache.tables[0])
     for key in dict.fromkeys(key for key in keys if key not in cache.rows):
-        kernel = build_kernel(camera.psf, camera, *(n * QUANTUM_PX for n in key))
-        kind = GRID if len(kernel.grid) else ROUND if len(kernel.radial) else GAUSS
-        table = kernel.grid if kind == GRID else kernel.radial
-        sizes = {GAUSS: (0, 0), ROUND: kernel.radial.shape, GRID: kernel.grid.shape[1:3]}[kind]
+        properties, sizes, table = make_kernel(camera, key)
         cache.rows[key] = len(cache.kernels)
-        cache.kernels.append((kind, kernel.sigma_px, kernel.reach_px, sharpness_px(kernel)))
+        cache.kernels.append(properties)
         cache.spans.append((begin, begin + table.size, *sizes))
         tables.append(table.ravel())
         begin += table.size
@@ -133,6 +196,20 @@ def add_kernels(cache: KernelCache, camera: CameraConfig, keys: list[tuple[int, 
             )
     if len(tables) > 1:
         cache.tables[0] = np.concatenate(tables)
+
+
+def make_kernel(
+    camera: CameraConfig, key: tuple[int, ...]
+) -> tuple[tuple[int, float, float, float], tuple[int, int], Singles]:
+    """A row of `KernelCache.kernels`, the two sizes of its table's shape, and the table."""
+    if key[0] == BOX_KEY:
+        box = ellipse.ellipse_box(camera.psf, camera, key[1])
+        return (ELLIPSE, 0.0, key[1] + 0.5, 1.0), (box.waves, box.samples), box.table
+    kernel = build_kernel(camera.psf, camera, *(n * QUANTUM_PX for n in key))
+    kind = GRID if len(kernel.grid) else ROUND if len(kernel.radial) else GAUSS
+    table = kernel.grid if kind == GRID else kernel.radial
+    sizes = {GAUSS: (0, 0), ROUND: kernel.radial.shape[:2], GRID: kernel.grid.shape[1:3]}[kind]
+    return (kind, kernel.sigma_px, kernel.reach_px, sharpness_px(kernel)), sizes, table
 
 
 def sharpness_px(kernel: Kernel) -> float:

@@ -16,7 +16,6 @@ from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, beliefs
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, full_scale_e
-from skysim.simulation.checks.dome import assumptions
 from skysim.simulation.checks.expected_error import Expected, mean_root
 from skysim.simulation.checks.views import View
 from skysim.sources.dome.shell.room import fit
@@ -108,15 +107,6 @@ def spot(context: Context, samples: Samples) -> Fact:
     text = f"{width:.1f} px wide (D4σ): lens {lens_px:.1f}{led}, defocus {defocus_px:.1f} px"
     values = {"width_px": width, "lens_px": lens_px, "led_px": disk_px, "defocus_px": defocus_px}
     return Fact("image size", [text], values)
-
-
-def image_shape(context: Context, samples: Samples) -> Fact | None:
-    """By how much round images err from the ellipses of inclined LEDs, where it matters to the peaks."""
-    testbed = context.testbed
-    if not isinstance(testbed.scene.light, DomeConfig):
-        return None
-    note = assumptions.round_disk_note(testbed.scene, testbed.sources, testbed.mount)
-    return Fact("image shape", [note], {}) if note else None
 
 
 def fill(context: Context, samples: Samples) -> Floats:
@@ -338,7 +328,6 @@ FACTS: tuple[Callable[[Context, Samples], Fact | None], ...] = (
     field_of_view,
     lights_in_field,
     spot,
-    image_shape,
     peak,
     smear,
     cap,

@@ -1,14 +1,10 @@
-"""Warnings about a dome: where it breaks an assumption of its tracker or of the renderer."""
+"""Warnings about a dome: where it breaks an assumption of its tracker."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from skysim.camera.optics import Optics, disk_image_axes
-from skysim.camera.psf.kernel import build_kernel
-from skysim.core.types import Floats, Mount, Sources
+from skysim.core.types import Mount, Sources
 from skysim.dynamics import guidance
 from skysim.dynamics.profiles.load import load_profiles
 from skysim.scene.scene import Scene
@@ -23,10 +19,6 @@ MAX_ELLIPSOID_RMS_M = 1e-3
 # Largest diameter of an LED's image: half of a background tile of the local detector (`TILE_PX` there). The detector
 # takes wider disks for background.
 MAX_IMAGE_PX = 32.0
-# Largest error of an image's peak from drawing LED disks round that gives no note: less than the scatter of
-# brightness among LEDs of one kind (7-9 %, AFIT Table 2).
-MAX_ROUND_ERROR = 0.05
-REFERENCE_POSES = 33  # of the maneuver, at which LEDs in view are collected
 
 
 def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
@@ -95,81 +87,6 @@ def image_width_warning(scene: Scene, sources: Sources, mount: Mount) -> str:
     return (
         f"tracker.detector: LED images are {width_px:.0f} px wide; local treats images wider than {MAX_IMAGE_PX:.0f} px"
         " as background; use threshold"
-    )
-
-
-class RoundDisks(NamedTuple):
-    """How wrong round images are, for N views of LEDs.
-
-    axes          : (N, 2) true semi-axes of the disk's image over the drawn radius, see `optics.disk_image_axes`
-    peak_error    : (N,) relative error of the drawn image's peak
-    incidence_rad : (N,) between the LED's normal and the line of sight
-    field_rad     : (N,) between the boresight and the line of sight
-    """
-
-    axes: Floats
-    peak_error: Floats
-    incidence_rad: Floats
-    field_rad: Floats
-
-
-def round_disks(scene: Scene, sources: Sources, mount: Mount) -> RoundDisks:
-    """Errors of drawing LED disks round, for the LEDs in view during the reference maneuver.
-
-    The renderer draws a disk of radius r as a circle of radius c = f r / d and conserves its light, so the peak goes
-    as one over the image's area. Disk and point spread add in variance. With s^2 = 1 / (2 pi peak) that of a point's
-    image and p, q the true semi-axes,
-
-        peak drawn / peak true = sqrt((s^2 + p^2 / 4) (s^2 + q^2 / 4)) / (s^2 + c^2 / 4):
-
-    p q / c^2 where the disk is resolved, c >> s, and 1 where it is not.
-    """
-    offset_m, normal, radius_m = np.split(led_views(scene, sources, mount), [3, 6], axis=1)
-    distance_m = np.linalg.norm(offset_m, axis=1)
-    axes = disk_image_axes(offset_m, normal)
-    drawn_px = scene.camera.focal_px * radius_m / distance_m[:, None]
-    spread_px2 = 1 / (2 * np.pi * build_kernel(scene.camera.psf, scene.camera).peak)
-    true_px2, drawn_px2 = (spread_px2 + (drawn_px * scale) ** 2 / 4 for scale in (axes, np.ones(2)))
-    cos_incidence = -np.sum(offset_m * normal, axis=1) / distance_m
-    return RoundDisks(
-        axes,
-        np.sqrt(np.prod(true_px2 / drawn_px2, axis=1)) - 1,
-        np.arccos(np.minimum(cos_incidence, 1)),
-        np.arccos(np.minimum(offset_m[:, 2] / distance_m, 1)),
-    )
-
-
-def led_views(scene: Scene, sources: Sources, mount: Mount) -> Floats:
-    """(N, 7) LEDs on the chip at even times of the reference maneuver: offset from the pupil in m and normal, both in
-    camera axes, and radius in m.
-    """
-    optics, chip_px = Optics.from_camera(scene.camera), np.array([scene.camera.width_px, scene.camera.height_px])
-    end_s = scene.exposure.first_s + scene.exposure.frames / scene.exposure.rate_hz
-    views = []
-    reference = guidance.plan(scene.motion, profiles=load_profiles(scene, mount))
-    for lab_from_body in reference.attitudes(np.linspace(0, end_s, REFERENCE_POSES)):
-        cam_from_lab = mount.cam_from_body * lab_from_body.inv()
-        offset_m = cam_from_lab.apply(sources.place[:, :3] - lab_from_body.apply(mount.camera_body_m))
-        normal, xy_px = cam_from_lab.apply(sources.normal), optics.project(offset_m)
-        on_chip = ((xy_px > -0.5) & (xy_px < chip_px - 0.5)).all(axis=1)
-        facing = np.sum(offset_m * normal, axis=1) < 0
-        views.append(np.column_stack([offset_m, normal, sources.radius_m])[on_chip & facing])
-    return np.concatenate(views)
-
-
-def round_disk_note(scene: Scene, sources: Sources, mount: Mount) -> str:
-    """A note where LED disks, which are drawn round, should be ellipses. Attitudes do not depend on it."""
-    views = round_disks(scene, sources, mount)
-    if np.abs(views.peak_error).max(initial=0.0) <= MAX_ROUND_ERROR:
-        return ""
-    worst = int(np.abs(views.peak_error).argmax())
-    axes = " and ".join(f"{axis:.2f}" for axis in views.axes[worst])
-    return (
-        "LED disks are drawn as circles: places are right, peaks wrong by"
-        f" {100 * np.median(np.abs(views.peak_error)):.2g} % (median),"
-        f" {100 * abs(views.peak_error[worst]):.2g} % at"
-        f" {np.degrees(views.incidence_rad[worst]):.0f}° of incidence and {np.degrees(views.field_rad[worst]):.0f}° off"
-        f" axis, where the image's semi-axes should be {axes} of the drawn radius"
     )
 
 

@@ -1,0 +1,316 @@
+"""The pixel-integrated image of one elliptical disk, built for each exposure (compiled).
+
+An ellipse has more sizes than a cache of kernels can hold: two semi-axes, an orientation and the defocus. Its image is
+therefore built from its spectrum when it is drawn,
+
+    H(f) = lens(f) pixel(f) 2 J1(w) / w ...,    w = 2 pi |A^T f|,
+
+A of `led_disk.DiskImages`. The factors that all disks of a camera share, and the waves of the Fourier series, are
+tabulated once for each size of box (`box_table`). The sum over the waves is separable, and its even and odd parts need
+one quadrant of the box only. The result is sampled S times a pixel, between which Lagrange's cubic
+gives the image at any position (`add_ellipse`).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from math import ceil, floor, sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import special
+
+from skysim.camera.psf.kernel import FADE_PX, PsfModel, passband, softening_sigma_px
+from skysim.camera.psf.otf import EXTENT, WINGED
+from skysim.camera.psf.splat import Singles, cubic
+from skysim.core.jit import jit
+from skysim.core.types import Floats
+from skysim.scene.sections.camera import CameraConfig, Psf
+
+CUT_SIGMA = 4.0  # a box ends here beyond the disk: 3e-5 of the peak of a resolved disk are beyond
+MAX_WAVES = 512  # of a box along an axis; a larger image is softened
+# Images up to so many times as wide as a point's, and wider ones, whose waves are weaker: level of the lens's transfer
+# function below which waves are left out, and samples a pixel over the frequency that the lens passes by 1e-3. The
+# image is then within 2e-4 of the peak.
+POINT_LIKE = 1.7
+ACCURACY = {True: (2e-5, 8), False: (2e-4, 4)}
+PAD = 1  # empty pixels about a table, for the four points
+ENTRIES = 64  # of the Bessel table, per unit of its argument
+COARSE_HALF_PX = ((100, 16), (24, 4), (0, 1))  # (from this half width, boxes in steps of so many pixels)
+
+
+class EllipseBox(NamedTuple):
+    """Shared tables for images that reach `half` pixels: sizes, and one array of singles for compiled code.
+
+    waves   : F frequencies k / N of the N x N box along each axis, 0 <= k < F
+    samples : S a pixel
+    table   : the frequencies, (F,); lens and pixel at (fx, fy) and (-fx, fy), real, then imaginary parts, (4, F, F);
+              cosine and sine of the waves at x = t + p / S, in the order of p, then t, (2, F, S (half + 1))
+    """
+
+    waves: int
+    samples: int
+    table: Singles
+
+
+def reach_px(psf: Psf, camera: CameraConfig, radius_px: Any, sigma_px: Any) -> Any:
+    """How far the images of disks of these largest radii reach behind a lens and another Gaussian, pixels included."""
+    radius, sigma = EXTENT[psf.kind](psf, camera)
+    fade_px = FADE_PX if psf.kind in WINGED else 0.0
+    return radius + fade_px + radius_px + CUT_SIGMA * np.hypot(sigma, sigma_px) + np.sqrt(0.5)
+
+
+def box_half_px(reach: Any) -> Any:
+    """Half widths of the boxes that hold images of this reach: whole pixels, coarser for larger ones."""
+    step = np.select([reach > size for size, _ in COARSE_HALF_PX], [step for _, step in COARSE_HALF_PX])
+    return (np.ceil(reach / step) * step).astype(np.int64)
+
+
+def ellipse_box(psf: Psf, camera: CameraConfig, half: int) -> EllipseBox:
+    """The tables of a box of 2 half + 1 pixels, and a margin for wings."""
+    lens = PsfModel(psf, camera, 0.0, ())
+    size = 2 * (half + ceil(lens.wing_margin_px())) + 1
+    level, per_wave = ACCURACY[bool(half <= POINT_LIKE * reach_px(psf, camera, 0.0, 0.0))]
+    passed = passband(psf, camera, 0.0, level)
+    waves = min(ceil(passed * size) + 1, MAX_WAVES)
+    samples = max(2, min(ceil(per_wave * passband(psf, camera, 0.0, 1e-3)), 3072 // size))
+    f = np.arange(waves) / size
+    # fy > 0 stands for -fy too; fx = 0 is in both halves.
+    weight = np.outer(np.where(f > 0, 1.0, 0.5), np.where(f > 0, 2.0, 1.0)) / size**2
+    weight *= np.outer(np.sinc(f), np.sinc(f))
+    spectra = [weight * lens.otf(fx, f[None, :], softening_sigma_px(passed, f[-1])) for fx in (f[:, None], -f[:, None])]
+    x = (np.arange(half + 1) + np.arange(samples)[:, None] / samples).ravel()
+    phase = 2 * np.pi * np.outer(f, x)
+    parts = [f, *map(np.real, spectra), *map(np.imag, spectra), np.cos(phase), np.sin(phase)]
+    return EllipseBox(waves, samples, np.concatenate([part.ravel() for part in parts]).astype(np.float32))
+
+
+@lru_cache(maxsize=1)
+def jinc_table() -> Singles:
+    """2 J1(w) / w at w = 0, 1 / ENTRIES, ..., up to that of the largest image."""
+    w = np.arange(1, 4096 * ENTRIES) / ENTRIES
+    return np.concatenate([[1.0], 2 * special.j1(w) / w]).astype(np.float32)
+
+
+@jit
+def jinc(table: Singles, w: float) -> Any:
+    """2 J1(w) / w and its slope, by linear interpolation: within 8e-6 and 4e-3."""
+    at = min(w * np.float32(ENTRIES), np.float32(table.size - 2))
+    k = np.uint64(at)
+    step = table[k + np.uint64(1)] - table[k]
+    return table[k] + (at - np.float32(k)) * step, step * np.float32(ENTRIES)
+
+
+class EllipseDisk(NamedTuple):
+    """One disk for compiled code, all in pixels.
+
+    center_x, _y   : of the drawn image, from the image of the disk's center
+    mean_x, _y     : of its center of gravity, from there
+    xx, xy, yy     : A A^T
+    slope_x, _y    : of the light behind the blur, over the light at the center, a pixel
+    gradient_x, _y : A q, an odd part of the spectrum
+    blur           : radius of the defocus disk
+    sigma          : of a Gaussian blur beside the lens's
+    fade           : reach of wings, where they are faded to zero; 0 for a lens without wings
+    odd            : 1 if the spectrum has an odd part, else 0
+    """
+
+    center_x: float
+    center_y: float
+    mean_x: float
+    mean_y: float
+    xx: float
+    xy: float
+    yy: float
+    slope_x: float
+    slope_y: float
+    gradient_x: float
+    gradient_y: float
+    blur: float
+    sigma: float
+    fade: float
+    odd: float
+
+
+@jit(fastmath=True)
+def spectrum(disk: EllipseDisk, f: Singles, lens: Singles, bessel: Singles) -> Singles:
+    """(4, F, F) spectra of a disk, [l, m] at (f[l], f[m]): sum and difference of (fx, fy) and (-fx, fy), of
+    the real part, then of the imaginary part.
+
+    The transform of a disk of density 1 + q e is J + i (A q f) 2 pi J' / w, J = 2 J1(w) / w.
+    """
+    waves, turn = lens.shape[1], np.float32(2 * np.pi)
+    out = np.zeros((4, waves, waves), np.float32)
+    gauss = np.exp(np.float32(-2 * (np.pi * disk.sigma) ** 2) * f * f)
+    radius, xx, xy, yy = np.float32(disk.blur), np.float32(disk.xx), np.float32(disk.xy), np.float32(disk.yy)
+    for i in range(waves):
+        for j in range(waves):
+            common = gauss[i] * gauss[j]
+            if radius > 0:
+                common *= jinc(bessel, turn * radius * np.sqrt(f[i] * f[i] + f[j] * f[j]))[0]
+            squares, cross = xx * f[i] * f[i] + yy * f[j] * f[j], np.float32(2) * xy * f[i] * f[j]
+            w, v = turn * np.sqrt(max(squares + cross, 0)), turn * np.sqrt(max(squares - cross, 0))
+            (p, p_slope), (q, q_slope) = jinc(bessel, w), jinc(bessel, v)
+            if disk.odd == 0:
+                a, b = common * lens[0, i, j] * p, common * lens[1, i, j] * q
+            else:
+                along, aside = disk.gradient_x * f[i], disk.gradient_y * f[j]
+                tilt_p = turn * (aside + along) * p_slope / max(w, np.float32(1e-9))
+                tilt_q = turn * (aside - along) * q_slope / max(v, np.float32(1e-9))
+                a = common * (lens[0, i, j] * p - lens[2, i, j] * tilt_p)
+                b = common * (lens[1, i, j] * q - lens[3, i, j] * tilt_q)
+                c = common * (lens[0, i, j] * tilt_p + lens[2, i, j] * p)
+                d = common * (lens[1, i, j] * tilt_q + lens[3, i, j] * q)
+                out[2, i, j], out[3, i, j] = c + d, c - d
+            out[0, i, j], out[1, i, j] = a + b, a - b
+    return out
+
+
+@jit(fastmath=True)
+def product(a: Singles, b: Singles) -> Singles:
+    """a^T b, four rows at a time."""
+    out = np.zeros((a.shape[1], b.shape[1]), np.float32)
+    whole = len(a) // 4 * 4
+    for r in range(len(out)):
+        row = out[r]
+        for k in range(0, whole, 4):
+            w0, w1, w2, w3 = a[k, r], a[k + 1, r], a[k + 2, r], a[k + 3, r]
+            for i in range(row.size):
+                row[i] += w0 * b[k, i] + w1 * b[k + 1, i] + w2 * b[k + 2, i] + w3 * b[k + 3, i]
+        for k in range(whole, len(a)):
+            w = a[k, r]
+            for i in range(row.size):
+                row[i] += w * b[k, i]
+    return out
+
+
+@jit(fastmath=True)
+def quadrants(spectra: Singles, cosine: Singles, sine: Singles, odd: float) -> Singles:
+    """(4, M, M) images at x, y >= 0, [y, x]: cos cos, sin sin of the real, sin cos, cos sin of the imaginary part.
+
+    By cos(a + b) = cos a cos b - sin a sin b and sin(a + b) = sin a cos b + cos a sin b these give every quadrant.
+    """
+    out = np.zeros((4, cosine.shape[1], cosine.shape[1]), np.float32)
+    out[0] = product(cosine, product(spectra[0], cosine))
+    out[1] = product(sine, product(spectra[1], sine))
+    if odd > 0:
+        out[2] = product(cosine, product(spectra[3], sine))
+        out[3] = product(sine, product(spectra[2], cosine))
+    return out
+
+
+@jit
+def mirrored(position: int, phase: int, samples: int, count: int) -> Any:
+    """Index of |position + phase / S| in the quadrants' order, and the sign of it."""
+    if position >= 0:
+        return phase * count + position, np.float32(1)
+    return ((samples - phase) * count - position - 1 if phase else -position), np.float32(-1)
+
+
+@jit(fastmath=True)
+def unfold(parts: Singles, samples: int, half: int, disk: EllipseDisk) -> Singles:
+    """(S, n, S n) the image at (i + p / S, j + q / S), [q, j, p n + i], of n x n pixels, n = 2 (half + PAD) + 1.
+
+    Pixel (half + PAD, half + PAD) is at the image's center. The disk's slope is applied, the negative ringing is cut.
+    """
+    size, count, middle, none = 2 * (half + PAD) + 1, half + 1, half + PAD, np.float32(0)
+    out, slope = np.zeros((samples, size, samples * size), np.float32), np.float32(disk.slope_x)
+    for q in range(samples):
+        for j in range(-half, half + 1):
+            r, up = mirrored(j, q, samples, count)
+            even0, even1, odd0, odd1 = parts[0, r], parts[1, r], parts[2, r], parts[3, r]
+            for p in range(samples):
+                row = out[q, middle + j, p * size : (p + 1) * size]
+                right, left = p * count, mirrored(-1, p, samples, count)[0]
+                for i in range(half + 1):
+                    row[middle + i] = even0[right + i] - up * even1[right + i]
+                for i in range(half):
+                    row[middle - 1 - i] = even0[left + i] + up * even1[left + i]
+                if disk.odd > 0:
+                    for i in range(half + 1):
+                        row[middle + i] -= odd0[right + i] + up * odd1[right + i]
+                    for i in range(half):
+                        row[middle - 1 - i] += odd0[left + i] - up * odd1[left + i]
+                light = np.float32(1 + disk.slope_x * (p / samples - middle) + disk.slope_y * (j + q / samples))
+                for i in range(size):
+                    row[i] = max(row[i] * (light + slope * np.float32(i)), none)
+    return out
+
+
+@jit(fastmath=True)
+def fade(table: Singles, reach_px: float) -> None:
+    """Fade wings to zero over FADE_PX, since a sharp end would alias with the pixel grid, and scale the light to 1."""
+    samples, size = table.shape[0], table.shape[1]
+    total = 0.0
+    for q in range(samples):
+        for j in range(size):
+            v = (j - size // 2 + q / samples) ** 2
+            for p in range(samples):
+                for i in range(size):
+                    r = sqrt((i - size // 2 + p / samples) ** 2 + v)
+                    s = min(max((reach_px - r) / FADE_PX, 0.0), 1.0)
+                    table[q, j, p * size + i] *= np.float32(s * s * (3 - 2 * s))
+                    total += table[q, j, p * size + i]
+    table *= np.float32(samples * samples / total)
+
+
+@jit(fastmath=True)
+def sharpest_px(table: Singles) -> float:
+    """Half the peak over the steepest slope, as `kernel_cache.sharpness_px`."""
+    samples, size = table.shape[0], table.shape[1]
+    peak, slope2 = np.float32(0), np.float32(0)
+    for q in range(samples - 1):
+        for j in range(size):
+            row, below = table[q, j], table[q + 1, j]
+            for i in range(size):
+                x, y = row[i + size] - row[i], below[i] - row[i]
+                slope2 = max(slope2, x * x + y * y)
+                peak = max(peak, row[i])
+    return peak / (2 * samples * sqrt(slope2))
+
+
+@jit
+def ellipse_table(disk: EllipseDisk, box: Singles, waves: int, samples: int, bessel: Singles) -> Singles:
+    """The image of a disk for `add_ellipse`, from the tables of its box; its light is 1."""
+    square, count = waves * waves, (box.size - waves - 4 * waves * waves) // (2 * waves)
+    f, lens = box[:waves], box[waves : waves + 4 * square].reshape(4, waves, waves)
+    wave = box[waves + 4 * square :].reshape(2, waves, count)
+    parts = quadrants(spectrum(disk, f, lens, bessel), wave[0], wave[1], disk.odd)
+    table = unfold(parts, samples, count // samples - 1, disk)
+    if disk.fade > 0:
+        fade(table, disk.fade)
+    return table
+
+
+@jit(fastmath=True)
+def add_ellipse(patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, table: Singles) -> None:
+    """Add an image from its samples, see `unfold`: Lagrange's cubic through 4 x 4 of them, along y first."""
+    height, width = patch.shape
+    samples, size = table.shape[0], table.shape[1]
+    half = size // 2 - PAD
+    center_x, center_y = floor(x + 0.5), floor(y + 0.5)
+    left, right = max(center_x - half, 0), min(center_x + half + 1, width)
+    top, bottom = max(center_y - half, row0, 0), min(center_y + half + 1, row1, height)
+    if right <= left or bottom <= top:
+        return
+    at_x, at_y = (center_x - x) * samples, (center_y - y) * samples
+    first_x, first_y = floor(at_x), floor(at_y)
+    wx, wy = cubic(at_x - first_x), cubic(at_y - first_y)
+    u0, u1, u2, u3 = np.float32(wx[0]), np.float32(wx[1]), np.float32(wx[2]), np.float32(wx[3])
+    v0, v1, v2, v3 = np.float32(wy[0]), np.float32(wy[1]), np.float32(wy[2]), np.float32(wy[3])
+    phase, row = np.empty(4, np.int64), np.empty(4, np.int64)
+    start = np.empty(4, np.int64)
+    for s in range(4):
+        phase[s], row[s] = (first_y + s - 1) % samples, size // 2 - center_y + (first_y + s - 1) // samples
+        k = first_x + s - 1
+        start[s] = k % samples * size + size // 2 + left - center_x + k // samples
+    sums = np.empty(table.shape[2], np.float32)
+    a, b, c, d = sums[start[0] :], sums[start[1] :], sums[start[2] :], sums[start[3] :]
+    for j in range(top, bottom):
+        first, second = table[phase[0], row[0] + j], table[phase[1], row[1] + j]
+        third, fourth = table[phase[2], row[2] + j], table[phase[3], row[3] + j]
+        for i in range(sums.size):
+            sums[i] = v0 * first[i] + v1 * second[i] + v2 * third[i] + v3 * fourth[i]
+        line = patch[j, left:right]
+        for i in range(line.size):
+            line[i] += electrons * (u0 * a[i] + u1 * b[i] + u2 * c[i] + u3 * d[i])
