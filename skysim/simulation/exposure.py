@@ -14,12 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Clock
 from skysim.camera import background, display_glow
+from skysim.camera.bodies import behind, concatenated, render_bodies
 from skysim.camera.detector.detector import add_snr_and_saturation, expose, saturation_dn, smear
 from skysim.camera.render import Poses, in_view, project, render
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Frame, Truth
 from skysim.dynamics import multibody
-from skysim.simulation.testbed import Testbed, exposure_window, time_tag_error_s
+from skysim.simulation.testbed import Testbed, bodies_during, exposure_window, time_tag_error_s
 
 
 def render_frame(
@@ -44,6 +45,7 @@ def render_frame(
     if black_level is not None:
         light_e += black_level * window.exposure_s
     light = testbed.clocks.pulses_at(testbed.sources, middle_s) if testbed.clocks else testbed.sources
+    bodies = bodies_during(testbed, middle_s)
     occludes = partial(multibody.occluded, testbed.obstacles, lab_from_body) if testbed.obstacles else None
     sources = render(
         light_e,
@@ -53,8 +55,11 @@ def render_frame(
         testbed.mount,
         window,
         testbed.emitter,
-        occludes,
+        behind(bodies, occludes),
     )
+    if bodies:
+        path = (testbed.optics, testbed.trajectory, testbed.mount, window)
+        sources = concatenated([sources, *render_bodies(light_e, bodies, *path, occludes)])
     smear(light_e, window.exposure_s, testbed.detector.shutter)
     # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
     sources = add_snr_and_saturation(sources, light_e, window.exposure_s, testbed.detector)
