@@ -16,6 +16,7 @@ from estimator.trackers.pipeline import Clock
 from skysim.camera import background, display_glow
 from skysim.camera.bodies import behind, concatenated, render_bodies
 from skysim.camera.detector.detector import add_snr_and_saturation, expose, saturation_dn, smear
+from skysim.camera.disc_image import Exposed
 from skysim.camera.render import Poses, in_view, project, render
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Frame, Truth
@@ -58,8 +59,8 @@ def render_frame(
         behind(bodies, occludes),
     )
     if bodies:
-        path = (testbed.optics, testbed.trajectory, testbed.mount, window)
-        sources = concatenated([sources, *render_bodies(light_e, bodies, *path, occludes)])
+        exposed = Exposed(testbed.optics, testbed.trajectory, testbed.mount, window)
+        sources = concatenated([sources, *render_bodies(light_e, bodies, exposed, occludes)])
     smear(light_e, window.exposure_s, testbed.detector.shutter)
     # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
     sources = add_snr_and_saturation(sources, light_e, window.exposure_s, testbed.detector)

@@ -223,31 +223,43 @@ def test_a_lambert_sphere_has_lambert_s_phase_and_center(phase_deg: float) -> No
     a = np.radians(phase_deg)
     x, y = np.meshgrid(*2 * (np.linspace(-1, 1, 801),))
     mu = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
-    light = np.where(mu > 0, discs.lambert(mu, x * np.sin(a) + mu * np.cos(a)), 0.0)
+    light = np.where(mu > 0, np.maximum(x * np.sin(a) + mu * np.cos(a), 0.0), 0.0)
     full = np.where(mu > 0, mu, 0.0)
     assert light.sum() / full.sum() == pytest.approx((np.sin(a) + (np.pi - a) * np.cos(a)) / np.pi, abs=1e-3)
-    xy, share = discs.disc_elements(discs.lambert, a, 30)
+    xy, share = discs.disc_elements(discs.Surface(discs.LAMBERT, a))
     assert share.sum() == pytest.approx(1.0)
     assert share @ xy == pytest.approx([(light * x).sum() / light.sum(), 0.0], abs=2e-3)
 
 
+def lattice(surface: discs.Surface, across: int = 200) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    axis = (np.arange(across) + 0.5) * (2 / across) - 1
+    x, y = np.meshgrid(axis, axis)
+    return x, y, discs.light_map(surface, axis)
+
+
 def test_the_full_moon_is_uniform_and_the_half_moon_ends_at_the_terminator() -> None:
-    xy, share = discs.disc_elements(discs.lommel_seeliger, 0.0, 40)
-    inside = np.hypot(*xy.T) < 0.9
+    x, y, share = lattice(discs.Surface(discs.LOMMEL_SEELIGER, 0.0))
+    inside = np.hypot(x, y) < 0.98
     assert np.ptp(share[inside]) < 1e-9 * share.max()
-    xy, share = discs.disc_elements(discs.lommel_seeliger, np.pi / 2, 40)
-    assert xy[:, 0].min() > 0
-    xy, share = discs.disc_elements(discs.lommel_seeliger, np.radians(60.0), 40)
-    equator = np.abs(xy[:, 1]) < 0.03
-    assert xy[equator, 0].min() == pytest.approx(-np.cos(np.radians(60.0)), abs=0.05)  # the terminator's ellipse
+    for phase_deg in (60.0, 90.0, 120.0):
+        x, y, share = lattice(discs.Surface(discs.LOMMEL_SEELIGER, np.radians(phase_deg)))
+        terminator = -np.cos(np.radians(phase_deg)) * np.sqrt(np.maximum(1 - y**2, 0))
+        assert (share[x < terminator - 0.01] == 0).all()
+        assert (share[(x > terminator + 0.01) & (np.hypot(x, y) < 0.99)] > 0).all()
+
+
+def test_earthshine_lights_the_whole_disc() -> None:
+    x, y, share = lattice(discs.Surface(discs.LOMMEL_SEELIGER, np.pi / 2, 0.01))
+    dark = (x < -0.02) & (np.hypot(x, y) < 0.98)
+    assert np.ptp(share[dark]) < 1e-9 * share[dark].max()
+    assert share[dark].sum() == pytest.approx(0.01 / 1.01 * dark.sum() / (np.hypot(x, y) < 1).sum(), rel=1e-3)
 
 
 def test_the_sun_s_limb_is_dark() -> None:
     """Its mean brightness is 0.30 + 2/3 0.93 - 1/2 0.23 of the center's."""
-    xy, share = discs.disc_elements(discs.limb_darkened, 0.0, 60)
-    center = share[np.hypot(*xy.T) < 0.1].mean()
-    cells = np.pi / 4 * 60**2
-    assert share.sum() / cells / center == pytest.approx(0.30 + 0.62 - 0.115, rel=0.01)
+    _, _, share = lattice(discs.Surface(discs.LIMB_DARKENED, 0.0))
+    mean = share.sum() / (np.pi / 4 * 200**2)
+    assert mean / share[100, 100] == pytest.approx(0.30 + 0.62 - 0.115, rel=1e-3)
 
 
 def test_the_light_of_all_bodies_is_their_magnitudes() -> None:

@@ -13,7 +13,7 @@ from skysim.core.types import Floats
 from skysim.scene.sections.light import BodiesConfig
 from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
-from skysim.sources.solar_system.discs import Elements, Law, disc_elements, lambert, limb_darkened, lommel_seeliger
+from skysim.sources.solar_system.discs import LAMBERT, LIMB_DARKENED, LOMMEL_SEELIGER, Surface
 from skysim.sources.solar_system.magnitudes import earthshine_fraction, magnitude
 from skysim.sources.solar_system.observer import observe_from
 from skysim.sources.solar_system.places import Place, place
@@ -30,7 +30,7 @@ class Body(NamedTuple):
 
     naif: int
     radius_km: float
-    law: Law
+    law: int
     b_v: float
     v_i: float
 
@@ -40,15 +40,15 @@ class Body(NamedTuple):
 
 
 BODIES = {
-    "sun": Body(10, 695_700.0, limb_darkened, *SUN),
-    "moon": Body(301, 1737.4, lommel_seeliger, 0.92, 0.95),
-    "mercury": Body(199, 2439.4, lommel_seeliger, 0.97, 0.97),
-    "venus": Body(299, 6051.8, lambert, 0.81, 0.75),
-    "mars": Body(499, 3389.5, lommel_seeliger, 1.43, 1.25),
-    "jupiter": Body(599, 69_911.0, lambert, 0.87, 0.55),
-    "saturn": Body(699, 58_232.0, lambert, 1.09, 0.75),
-    "uranus": Body(799, 25_362.0, lambert, 0.56, -0.2),
-    "neptune": Body(899, 24_622.0, lambert, 0.41, -0.2),
+    "sun": Body(10, 695_700.0, LIMB_DARKENED, *SUN),
+    "moon": Body(301, 1737.4, LOMMEL_SEELIGER, 0.92, 0.95),
+    "mercury": Body(199, 2439.4, LOMMEL_SEELIGER, 0.97, 0.97),
+    "venus": Body(299, 6051.8, LAMBERT, 0.81, 0.75),
+    "mars": Body(499, 3389.5, LOMMEL_SEELIGER, 1.43, 1.25),
+    "jupiter": Body(599, 69_911.0, LAMBERT, 0.87, 0.55),
+    "saturn": Body(699, 58_232.0, LAMBERT, 1.09, 0.75),
+    "uranus": Body(799, 25_362.0, LAMBERT, 0.56, -0.2),
+    "neptune": Body(899, 24_622.0, LAMBERT, 0.41, -0.2),
 }
 NAMES = {body.id: name for name, body in BODIES.items()}
 
@@ -57,7 +57,7 @@ NAMES = {body.id: name for name, body in BODIES.items()}
 class BodyLight:
     """One body in the sky, in the lab's axes (the ICRS).
 
-    radius_rad : of its disc;  flux_e_s_m2 : photo-electrons at the aperture;  earthshine : see `disc_elements`
+    radius_rad : of its disc;  flux_e_s_m2 : photo-electrons at the aperture;  earthshine : see `Surface`
     """
 
     name: str
@@ -71,9 +71,9 @@ class BodyLight:
     def id(self) -> int:
         return BODIES[self.name].id
 
-    def elements(self, across: int) -> Elements:
-        """The disc's elements, so many on its diameter."""
-        return disc_elements(BODIES[self.name].law, self.place.phase_rad, across, self.earthshine)
+    @property
+    def surface(self) -> Surface:
+        return Surface(BODIES[self.name].law, self.place.phase_rad, self.earthshine)
 
     def directions(self, xy: Floats) -> Floats:
         """(M, 3) unit vectors toward points (M, 2) of the disc, in units of its radius."""
@@ -81,6 +81,11 @@ class BodyLight:
         offset = xy @ np.stack([x_axis, np.cross(center, x_axis)])
         vectors = center + np.tan(self.radius_rad) * offset
         return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+    def overlaps(self, other: BodyLight) -> bool:
+        """Whether two discs overlap."""
+        cosine = float(self.place.direction @ other.place.direction)
+        return cosine > np.cos(self.radius_rad + other.radius_rad)
 
     def hides(self, directions: Floats) -> NDArray[np.bool_]:
         """(M,) which of these unit vectors (M, 3) lie behind the disc."""
