@@ -68,7 +68,8 @@ def render_frame(
     image = expose(light_e, window.exposure_s, testbed.detector, random_stream(scene.seed, DETECTOR, index))
     clock.lap("detector")
     rate_cam = testbed.mount.cam_from_body.apply(testbed.trajectory.rate_at(middle_s))
-    truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, occluded_ids(testbed, lab_from_body))
+    seen = tuple(body.truth() for body in bodies if body.id in sources.id)
+    truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, occluded_ids(testbed, lab_from_body), seen)
     tagged_s = middle_s + time_tag_error_s(scene, index)
     return Frame(index, image, tagged_s, window.exposure_s, saturation_dn(camera.detector)), truth
 

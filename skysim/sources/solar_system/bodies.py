@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.core.types import Floats
+from skysim.core.types import BodyTruth, Floats
 from skysim.scene.sections.light import BodiesConfig
 from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
@@ -53,6 +53,11 @@ BODIES = {
 NAMES = {body.id: name for name, body in BODIES.items()}
 
 
+def light_name(id: int) -> str:
+    """The name of a body, the number of any other light."""
+    return NAMES.get(id, str(id))
+
+
 @dataclass(frozen=True, slots=True)
 class BodyLight:
     """One body in the sky, in the lab's axes (the ICRS).
@@ -74,6 +79,14 @@ class BodyLight:
     @property
     def surface(self) -> Surface:
         return Surface(BODIES[self.name].law, self.place.phase_rad, self.earthshine)
+
+    def truth(self) -> BodyTruth:
+        """What a frame's truth says of the body."""
+        x, y, z = self.place.direction
+        ra_deg, dec_deg = np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arcsin(z))
+        diameter_arcsec, phase_deg = np.degrees(2 * self.radius_rad) * 3600, np.degrees(self.place.phase_rad)
+        numbers = map(float, (self.magnitude, ra_deg, dec_deg, diameter_arcsec, phase_deg))
+        return BodyTruth(self.id, self.name, *numbers)
 
     def directions(self, xy: Floats) -> Floats:
         """(M, 3) unit vectors toward points (M, 2) of the disc, in units of its radius."""
