@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
+from scipy import fft
 
 from skysim.camera.optics import Optics
 from skysim.camera.psf.kernel_cache import Kernels, source_kernels
@@ -101,30 +101,20 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> StarImag
     reach_px = kernels.reach_px.max() + 2
     low = np.floor(np.nanmin(xy_px, axis=(0, 1)) - reach_px).astype(np.int64)
     width, height = (np.ceil(np.nanmax(xy_px, axis=(0, 1)) + reach_px).astype(np.int64) - low + 1).tolist()
-    patches = np.zeros((len(points), height, width))
+    # Side by side in one strip, each in a patch of its own.
+    strip = np.zeros((height, len(points) * width))
+    moved = xy_px - low + width * np.column_stack([np.arange(len(points)), np.zeros(len(points))])
     window = exposed.window._replace(open_s=exposed.window.open_s + low[1] * exposed.window.row_time_s)
-    streak_px = 0.0
-    for n, patch in enumerate(patches):
-        one = tracks._replace(
-            xy_px=np.ascontiguousarray(xy_px[:, n : n + 1] - low),
-            rate_e_s=np.ascontiguousarray(tracks.rate_e_s[:, n : n + 1]),
-            pulse_s=tracks.pulse_s[n : n + 1],
-        )
-        streak_px = draw(patch, one, kernel_of(kernels, n), STEP * kernels.sharp_px[n : n + 1], window)[0, 5]
+    drawn = draw(strip, tracks._replace(xy_px=moved), kernels, STEP * kernels.sharp_px, window)
+    patches = strip.reshape(height, steps, steps, width).transpose(1, 2, 0, 3)
     speed = (xy_px[middle + 1, 0] - xy_px[middle - 1, 0]) / (2 * tracks.step_s)
-    return StarImages(patches.reshape(steps, steps, height, width), low, speed, float(streak_px))
+    return StarImages(patches, low, speed, float(drawn[0, 5]))
 
 
 def star_kernel(optics: Optics, xy_px: Floats) -> Kernels:
     """The kernel of a star at a place on the chip."""
     one = np.ones(1)
     return source_kernels(optics.camera, xy_px[None], 0 * one, np.zeros(1, bool), one, one)
-
-
-def kernel_of(kernels: Kernels, n: int) -> Kernels:
-    """The kernel of one source, with all tables."""
-    kind, sigma, reach, sharp, table = (np.ascontiguousarray(array[n : n + 1]) for array in kernels[:5])
-    return Kernels(kind, sigma, reach, sharp, table, kernels.tables)  # type: ignore[arg-type]
 
 
 class DiscImage(NamedTuple):
@@ -148,8 +138,17 @@ def disc_image(body: BodyLight, disc: DiscOnChip, exposed: Exposed, hidden: Hidd
     radius_from_px = np.asarray(np.linalg.inv(disc.px_from_radius) @ sheared, float)
     reach_px = math.ceil(float(np.linalg.norm(np.linalg.inv(radius_from_px), 2))) + 4
     light = lattice_light(body, radius_from_px, reach_px, steps, hidden)
-    parts = (fftconvolve(light[q::steps, p::steps], star.patches[q, p]) for q in range(steps) for p in range(steps))
-    return DiscImage(sum(parts, np.zeros(())), star.corner_px - reach_px, star.streak_px)
+    return DiscImage(convolved(light, star.patches), star.corner_px - reach_px, star.streak_px)
+
+
+def convolved(light: Floats, patches: Floats) -> Floats:
+    """The sum over phases (q, p) of the convolutions of light[q::s, p::s] with patches[q, p], in full."""
+    steps, _, height, width = patches.shape
+    full = (len(light) // steps + height - 1, len(light) // steps + width - 1)
+    shape = [fft.next_fast_len(size, real=True) for size in full]
+    by_phase = light.reshape(len(light) // steps, steps, -1, steps).transpose(1, 3, 0, 2)
+    spectrum = (fft.rfft2(by_phase, shape) * fft.rfft2(patches, shape)).sum(axis=(0, 1))
+    return np.asarray(fft.irfft2(spectrum, shape)[: full[0], : full[1]])
 
 
 def lattice_light(body: BodyLight, radius_from_px: Floats, reach_px: int, steps: int, hidden: Hidden | None) -> Floats:
