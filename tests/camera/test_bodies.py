@@ -152,3 +152,16 @@ def test_the_moon_eclipses_the_sun() -> None:
     assert left == sorted(left, reverse=True)
     assert left[0] > 0.1
     assert left[-1] < 1e-6
+
+
+def test_a_star_behind_the_moon_is_hidden() -> None:
+    """Within its radius of 0.26 degrees, and by the vehicle's parts as before."""
+    moon = light("moon")
+    stars = points_of(moon, np.array([[0.0, 0.0], [0.7, 0.7], [0.0, 1.01]]))
+    hidden = drawing.behind([moon], None)
+    assert hidden is not None
+    assert hidden(stars).tolist() == [True, True, False]
+    by_both = drawing.behind([moon], lambda sources: np.array([False, False, True]))
+    assert by_both is not None
+    assert by_both(stars).all()
+    assert drawing.behind([], None) is None
