@@ -1,7 +1,7 @@
 """Frames of a rolling shutter: put every light at the time of the middle row, and solve as a global shutter's frame.
 
 The rate of the camera moves the lights (`attitude.motion`). It is given by a gyro, or taken from the streaks, in both
-signs, or assumed to be slow, with an error that covers the streaks that are too short to be seen. The identified lights
+signs, or without any assumed to be slow, with an error that covers streaks too short to be seen. The identified lights
 then tell attitude and rate together (`attitude.rolling`), and the frame is solved once more with that rate. Every stage
 of the tracker therefore works on lights of one time, and its tests against a wrong camera model stay as they are.
 """
@@ -60,27 +60,53 @@ def solve_rolling(
 ) -> Attitude:
     """Attitude and rate at the middle row of a rolling shutter; the last refusal if no candidate of the rate solves.
 
+    Where streaks leave the sign of the rate open, some stars may match with the wrong one as well: both signs are
+    tried, and the one with more evidence is kept.
     solve_global : solves centroids of one time
     rate         : from a gyro; None: from the frame
     exposure_s   : None: streaks tell nothing of the rate
     """
+    best: Attitude | None = None
     for candidate, prior in candidates(camera, lights.sight, centroids, rate, exposure_s):
-        attitude = solve_global(at_middle_row(camera, centroids, candidate, lights.sight))
-        fitted, matched = candidate, np.empty((2, 0), int)
-        for _ in range(ROUNDS):
-            if attitude.match is None or np.array_equal((attitude.match.observed, attitude.match.star), matched):
-                break
-            matched = np.stack([attitude.match.observed, attitude.match.star])
-            try:
-                fitted = _fit(camera, lights, centroids, attitude, (candidate, prior), exposure_s)
-            except ValueError as error:
-                attitude = Attitude(f"no attitude: {error}")
-                break
-            exact = replace(fitted, covariance_rad2_s2=np.zeros((3, 3)))
-            attitude = solve_global(at_middle_row(camera, centroids, exact, _sight_of(lights, attitude, centroids)))
-        if attitude.solved:
-            return _with_rate(camera, lights, centroids, attitude, fitted)
-    return attitude
+        if best is not None and candidate.sign_known:
+            break
+        attitude = _solve_with(camera, lights, centroids, solve_global, (candidate, prior), exposure_s)
+        if attitude.solved and (best is None or _chance(attitude) < _chance(best)):
+            best = attitude
+        if best is not None and candidate.sign_known:
+            break
+    return best or attitude
+
+
+def _chance(attitude: Attitude) -> float:
+    """log10 of the probability of a chance match."""
+    assert attitude.match is not None
+    return attitude.match.log10_chance
+
+
+def _solve_with(
+    camera: Camera,
+    lights: Lights,
+    centroids: Centroids,
+    solve_global: Callable[[Centroids], Attitude],
+    start: tuple[RateEstimate, RateEstimate],
+    exposure_s: float | None,
+) -> Attitude:
+    """Attitude and rate from one candidate of the rate with its prior."""
+    candidate = start[0]
+    attitude = solve_global(at_middle_row(camera, centroids, candidate, lights.sight))
+    fitted, matched = candidate, np.empty((2, 0), int)
+    for _ in range(ROUNDS):
+        if attitude.match is None or np.array_equal((attitude.match.observed, attitude.match.star), matched):
+            break
+        matched = np.stack([attitude.match.observed, attitude.match.star])
+        try:
+            fitted = _fit(camera, lights, centroids, attitude, start, exposure_s)
+        except ValueError as error:
+            return Attitude(f"no attitude: {error}")
+        exact = replace(fitted, covariance_rad2_s2=np.zeros((3, 3)))
+        attitude = solve_global(at_middle_row(camera, centroids, exact, _sight_of(lights, attitude, centroids)))
+    return _with_rate(camera, lights, centroids, attitude, fitted) if attitude.solved else attitude
 
 
 def candidates(
@@ -88,7 +114,7 @@ def candidates(
 ) -> Iterator[tuple[RateEstimate, RateEstimate]]:
     """Rates with which a frame is identified, and the prior with which attitude and rate are then fitted.
 
-    The gyro's alone, if it is given; else those of the streaks, in both signs; at last slow ones.
+    The gyro's alone, if it is given; else those of the streaks, in both signs; slow ones where no streak is seen.
     """
     if rate is not None:
         yield from ((signed, signed) for signed in _signs(rate))
@@ -99,7 +125,9 @@ def candidates(
         streaks = from_streaks(camera, centroids, exposure_s, sight) or from_moments(
             camera, centroids, exposure_s, sight
         )
-    yield from ((streak, anything) for streak in streaks)
+    if streaks:
+        yield from ((streak, anything) for streak in streaks)
+        return
     slow_rad_s = SHORT_STREAK_PX / camera.focal_px / exposure_s if exposure_s is not None else SLOW_RAD_S
     shear_px = slow_rad_s * camera.focal_px * abs(camera.row_time_s) * camera.height_px / 2
     # About the boresight a streak is short near the center: at half the height it is as long for a greater rate.

@@ -61,11 +61,76 @@ def test_clouds_are_taken_away_and_stars_stay() -> None:
     assert len(retries.without_clouds(plain, Settings())) == 0
 
 
+def test_edges_of_trees_are_no_streak_of_the_stars() -> None:
+    """Bars stand before the clouds: what is left of their edges is parallel, and would make every star a track."""
+
+    def bars(light: NDArray, _: np.random.Generator) -> None:
+        y, x = np.mgrid[:960, :1280]
+        light += 40 * (1 + np.sin(x / 25) * np.sin(y / 25)).astype(np.float32)
+        light[480:][:, np.arange(1280) % 40 < 30] = photographs.SKY / 4
+        for at in range(35, 1280, 40):
+            light[480:500, at - 2 : at + 3] += 400
+
+    image, truth = drawn(replace(SHOT, spoil=bars), 4)
+    stars = catalog.read(CATALOGS / "gaia_v8.0.ecsv")
+    seen = truth.apply(catalog.at_epoch(stars, 2020))
+    bright = (seen[:, 2] > 0.9) & (stars.v_mag < SHOT.limit_mag - 1.5)
+    xy_px = SHOT.camera.pixels(seen[bright])
+    xy_px = xy_px[np.all((xy_px > 20) & (xy_px < [1260, 460]), axis=1)]
+    found = retries.without_clouds(image, Settings())
+    near = np.linalg.norm(xy_px[:, None] - found.xy_px, axis=2).min(axis=1)
+    assert len(xy_px) >= 5
+    assert np.mean(near < 1.0) >= 0.8
+
+
+@pytest.mark.parametrize("number", [16, 29, 36])
+def test_faint_trails_are_detected_along_the_streak_of_binned_pixels(number: int) -> None:
+    """Of trails that the detector sees in pieces, more than twice as many stars are then where they are."""
+    rng = np.random.default_rng([25, number])
+    shot = photographs.trailed(rng)
+    stars = catalog.read(CATALOGS / "gaia_v8.0.ecsv")
+    vectors = catalog.at_epoch(stars, 2020)
+    image, truth = photographs.draw(shot, stars, vectors, rng)
+    seen = truth.apply(vectors)
+    xy_px = shot.camera.pixels(seen[(seen[:, 2] > 0.9) & (stars.v_mag < shot.limit_mag + 0.5)])
+
+    def right(found: Centroids) -> int:
+        off = np.linalg.norm(xy_px[:, None] - found.xy_px, axis=2)
+        return int(np.count_nonzero(off.min(axis=1) < 2))
+
+    solver = plate_solver.make_solver(shot.fov_deg, None)
+    report, _ = plate_solver.solve_array(image, solver, None)
+    assert not report.attitude.solved
+    first, most = right(report.centroids), max(map(right, retries.trails(image, Settings())))
+    assert most > 2 * first
+    outcome = plate_solver.solve_picture(images.Picture(image), solver, None)
+    assert photographs.is_same(outcome.report.attitude.cam_from_ref, truth)
+
+
+def test_round_stars_are_no_trails() -> None:
+    image, _ = drawn(SHOT, 4)
+    assert not list(retries.trails(image, Settings()))
+
+
+def test_an_upper_half_is_solved_in_its_own_field() -> None:
+    """The trackers' field is the upper half; attitude and camera are those of the whole picture."""
+    image, truth = drawn(replace(SHOT, fov_deg=36.0, limit_mag=5.6), 7)
+    centroids = plate_solver.solve_array(image, plate_solver.make_solver(36.0, None), None)[0].centroids
+    upper = centroids.take(centroids.xy_px[:, 1] < 479.5)
+    solver = replace(plate_solver.make_solver(None, None), upper_half=True)
+    report, tracker = plate_solver.solve_array(image, solver, None, upper)
+    assert tracker.camera.height_px == 480
+    assert report.attitude.camera.height_px == 960
+    assert photographs.is_same(report.attitude.cam_from_ref, truth)
+
+
 def test_halves_are_complete_and_not_tried_with_few_lights() -> None:
     rng = np.random.default_rng(5)
     xy_px = np.concatenate([rng.uniform([0, 0], [99, 49], (30, 2)), rng.uniform([0, 51], [99, 99], (9, 2))])
     lights = Centroids(xy_px, np.full(39, 0.1), np.ones(39))
-    parts = {note: (efforts, part) for note, efforts, part in retries.halves(np.zeros((100, 100)), lights, "")}
+    found = list(retries.halves(np.zeros((100, 100)), lights, ""))
+    parts = {one.note: (one.efforts, one.centroids) for one in found}
+    assert [one.note for one in found if one.upper_half] == [retries.HALF.format("upper")]
     assert set(parts) == {retries.HALF.format(side) for side in ("upper", "left", "right")}
     efforts, upper = parts[retries.HALF.format("upper")]
     assert (efforts, len(upper)) == (retries.MORE_EFFORTS, 30)

@@ -281,14 +281,21 @@ def cholesky_solve(a: Floats, b: Floats) -> Floats:
 
 @jit
 def _count_missing(detections: Detections, sky: SkyIndex, R: Floats, focal_ratio: float, star: NDArray) -> int:
-    """Number of missing stars: brighter than the faintest matched star, well inside the field, and not matched."""
+    """Number of missing stars: well inside the field, not matched, and bright enough to be detected.
+
+    Bright enough are stars as bright as the faintest matched one, and as bright as half of the detections, if their
+    magnitudes are known: what shows faint false lights shows the stars of their magnitude.
+    """
     field = detections.field * (INNER_FRACTION / focal_ratio)
     left, right, top, bottom = field
-    matched = 0
+    matched, faintest = 0, star.max()
+    median = detections.mag[len(detections.mag) // 2]  # the brightest are first
+    if np.isfinite(median):
+        faintest = max(faintest, np.searchsorted(sky.mag, median) - 1)
     for s in star:
         x, y, _ = project(sky.vectors, R, s)
         matched += left < x < right and top < y < bottom
-    return _count_inside(sky, R, field, star.max()) - matched
+    return _count_inside(sky, R, field, faintest) - matched
 
 
 @jit

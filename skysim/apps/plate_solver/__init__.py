@@ -16,6 +16,7 @@ from skysim.apps.plate_solver.solution import solution_fields as solution_fields
 from skysim.apps.plate_solver.solver import FIELD_SEARCH as FIELD_SEARCH
 from skysim.apps.plate_solver.solver import Solver as Solver
 from skysim.apps.plate_solver.solver import best_attitude as best_attitude
+from skysim.apps.plate_solver.solver import kept_solver as kept_solver
 from skysim.apps.plate_solver.solver import make_solver as make_solver
 from skysim.apps.plate_solver.solver import solve_array as solve_array
 from skysim.apps.plate_solver.solver import validated_date as validated_date

@@ -34,6 +34,7 @@ TRAIL_PX, THIN = 20.0, 6.0  # least length of a trail, and least ratio of its sq
 SAME_ANGLE_RAD = 0.1  # greatest difference between the directions of parallel trails
 TRAILS = "trails of {:.0f} px: a shorter exposure, a steadier camera, or a mount that tracks"
 FEW_LIGHTS = 10
+EFFORTS = 3  # searches of the mirrored picture: its diagnosis should not take as long as all searches before
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def mirrored(refusal: Refusal) -> str:
         return ""
     flipped = reversed_columns(refusal.centroids, refusal.size_px[0])
     for solver in refusal.solvers:
-        attitude, _ = solve_centroids(flipped, solver, refusal.size_px, refusal.date_utc, Clock())
+        attitude, _ = solve_centroids(flipped, solver, refusal.size_px, refusal.date_utc, Clock(), EFFORTS)
         if attitude.solved:
             return "perhaps mirrored: it solves when flipped left to right; flip it, and solve that"
     return ""

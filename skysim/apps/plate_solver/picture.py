@@ -20,7 +20,14 @@ from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.plate_solver import retries
 from skysim.apps.plate_solver.solution import PlateSolution, annotated_image, solution_fields
-from skysim.apps.plate_solver.solver import FOV_LIMITS_DEG, Solver, make_solver, solve_array, validated_date
+from skysim.apps.plate_solver.solver import (
+    FOV_LIMITS_DEG,
+    Solver,
+    kept_solver,
+    make_solver,
+    solve_array,
+    validated_date,
+)
 from skysim.core.errors import InputError
 from skysim.core.io import files, images
 
@@ -68,8 +75,12 @@ def solve(
 
     Raises InputError with one line for an image that cannot be read.
     """
-    names = Path(camera) if camera else None, str(catalog) if catalog else None
-    solver = make_solver(fov_deg, names[0], time_utc=time_utc, catalog=names[1])
+    if camera or catalog:
+        solver = make_solver(
+            fov_deg, Path(camera) if camera else None, time_utc, catalog=str(catalog) if catalog else None
+        )
+    else:
+        solver = kept_solver(fov_deg, time_utc)
     result = solve_file(Path(path), solver, None)
     if result["bad_input"]:
         raise InputError(result["status"])
@@ -183,12 +194,13 @@ def solve_again(refused: list[Outcome], date_utc: datetime.datetime | None) -> O
     for pixels in {id(one.hypothesis.pixels): one.hypothesis.pixels for one in refused}.values():
         readings = [one for one in refused if one.hypothesis.pixels is pixels]
         settings = readings[0].hypothesis.solver.settings
-        for note, efforts, centroids in retries.retries(pixels, readings[0].report.centroids, settings):
+        for retry in retries.retries(pixels, readings[0].report.centroids, settings):
             for one in (one.hypothesis for one in readings):
-                solver = replace(one.solver, hypotheses=one.solver.hypotheses * retries.EXTRA_TRIES)
-                report, tracker = solve_array(pixels, solver, date_utc, centroids, efforts)
+                tries = one.solver.hypotheses * retries.EXTRA_TRIES
+                solver = replace(one.solver, hypotheses=tries, upper_half=retry.upper_half)
+                report, tracker = solve_array(pixels, solver, date_utc, retry.centroids, retry.efforts)
                 if report.attitude.solved:
-                    notes = [one.assumption] * bool(one.assumption) + [note]
+                    notes = [one.assumption] * bool(one.assumption) + [retry.note]
                     return Outcome(one._replace(assumption="; ".join(notes)), report, tracker, refused[0].tried)
     return None
 

@@ -1,14 +1,18 @@
-"""Other centroids of a picture that was refused: of its halves, without its clouds, and with its pixels binned.
+"""Other centroids of a picture that was refused: of its halves, without its clouds, of trails, with its pixels binned.
 
 Trees, roofs and street lamps are at one side of a picture, and there may be more of their lights than stars: one half
 may show the sky alone. Clouds and twilight change the sky within a tile of the detector's background, which takes that
-for noise; a top-hat filter removes all that is larger than stars. All retries together add no more than some
-thousandths to the accepted chance of a false match, as each has EXTRA_TRIES times the bar; they use the quick searches.
+for noise; a top-hat filter removes all that is larger than stars. Noise breaks faint star trails into pieces; the
+streak that binned pixels show joins them. All retries together, twenty at most, add no more than two hundredths to the
+accepted chance of a false match, as each has EXTRA_TRIES times the bar; they use the quick searches.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from math import hypot
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,38 +22,74 @@ from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.detection.background import estimate_background
-from estimator.detection.detect import to_native
+from estimator.detection.detect import DETECTORS, to_native
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.apps.plate_solver import binned
 
 EXTRA_TRIES = 1000
 MIN_LIGHTS = 10  # in a half: fewer were searched in all combinations with the others
-EFFORTS, MORE_EFFORTS = 1, 2  # searches of a half; of the upper one, the likeliest, and of a binned picture
+EFFORTS, MORE_EFFORTS = 1, 2  # searches of a half; of the upper one, the likeliest, and of other centroids
 UNEVEN = 2.0  # least ratio of the 90 % to the 10 % quantile of the noise of the background's tiles
 TOPHAT_PX = 15  # wider than a sharp star
+TRAIL_FACTORS, MIN_TRAIL_PX = (3, 2, 4), 10.0  # sides of the squares; shorter trails are seen as one
+ROUND = (0.0, 0.0)  # streak of sharp stars: what is left of the edges of trees is parallel, as streaks are
+FLAT_SIGMA_PX = 0.25  # of their centroids: JPEG has removed a part of what is faint beside clouds
 FLAT = "its stars were found without its clouds"
 HALF = "its stars were found in its {} half alone"
+TRAILED = "its stars are trails, some too faint to be seen as one in single pixels"
 BINNED = "its lights are large: they were found in the picture binned {0}x{0}"
 
 
-def retries(pixels: NDArray, centroids: Centroids, settings: Settings) -> Iterator[tuple[str, int, Centroids]]:
-    """What is tried, the number of searches, and the centroids in pixels of the picture."""
+class Retry(NamedTuple):
+    """What is tried, the number of searches, the centroids; `upper_half` as in `solver.Solver`."""
+
+    note: str
+    efforts: int
+    centroids: Centroids
+    upper_half: bool = False
+
+
+def retries(pixels: NDArray, centroids: Centroids, settings: Settings) -> Iterator[Retry]:
+    """The retries of a picture, with the centroids in its pixels."""
     yield from halves(pixels, centroids, "")
     flat = without_clouds(pixels, settings)
     if len(flat):
-        yield FLAT, EFFORTS, flat
+        yield Retry(FLAT, EFFORTS, flat)
         yield from halves(pixels, flat, f"{FLAT}, ")
+    for trailed in trails(pixels, settings):
+        yield Retry(TRAILED, MORE_EFFORTS, trailed)
     for factor, large in binned.large_lights(pixels, settings):
-        yield BINNED.format(factor), MORE_EFFORTS, large
+        yield Retry(BINNED.format(factor), MORE_EFFORTS, large)
 
 
-def halves(pixels: NDArray, centroids: Centroids, note: str) -> Iterator[tuple[str, int, Centroids]]:
+def halves(pixels: NDArray, centroids: Centroids, note: str) -> Iterator[Retry]:
     """The halves of a picture, as `retries`; `note` is put before what is tried."""
     middle = (np.array(pixels.shape[::-1]) - 1) / 2
     right, low = (centroids.xy_px > middle).T
     for side, inside in (("upper", ~low), ("lower", low), ("left", ~right), ("right", right)):
         if MIN_LIGHTS <= np.count_nonzero(inside) < len(centroids):
-            yield note + HALF.format(side), MORE_EFFORTS if side == "upper" else EFFORTS, centroids.take(inside)
+            efforts, part = MORE_EFFORTS if side == "upper" else EFFORTS, centroids.take(inside)
+            yield Retry(note + HALF.format(side), efforts, part)
+            if side == "upper":
+                yield Retry(note + HALF.format(side), efforts, part, upper_half=True)
+
+
+def trails(pixels: NDArray, settings: Settings) -> Iterator[Centroids]:
+    """The centroids of star trails, detected along the streak that the picture's binned blobs share.
+
+    Noise breaks a long faint trail into pieces, of which most blobs are then, so that their common streak is too short.
+    The mean of n^2 pixels has n times the signal-to-noise ratio, and the trail is one piece there. With its streak the
+    detector adds up the light along each trail in the pixels themselves.
+    """
+    camera = Camera.from_fov(pixels.shape[1], pixels.shape[0], 1.0)  # only its size is used
+    for factor in TRAIL_FACTORS:
+        try:
+            blobs = DETECTORS[settings.detector](binned.bin_pixels(pixels, factor), settings.threshold_sigma)
+            x, y = factor * np.array(blobs.streak_px or ROUND)
+            if hypot(x, y) >= MIN_TRAIL_PX:
+                yield detect_and_centroid(pixels, camera, settings, Clock(), (x, y))
+        except ImageError:
+            continue
 
 
 def without_clouds(pixels: NDArray, settings: Settings) -> Centroids:
@@ -61,6 +101,9 @@ def without_clouds(pixels: NDArray, settings: Settings) -> Centroids:
     flat = cv2.morphologyEx(light, cv2.MORPH_TOPHAT, np.ones((TOPHAT_PX, TOPHAT_PX), np.uint8))
     try:
         camera = Camera.from_fov(pixels.shape[1], pixels.shape[0], 1.0)  # only its size is used
-        return detect_and_centroid(flat, camera, settings, Clock())
+        # The edges of trees leave as many lights as there are stars.
+        more = replace(settings, max_blobs=2 * settings.max_blobs)
+        found = detect_and_centroid(flat, camera, more, Clock(), ROUND)
+        return replace(found, sigma_px=np.hypot(found.sigma_px, FLAT_SIGMA_PX))
     except ImageError:
         return Centroids.empty()

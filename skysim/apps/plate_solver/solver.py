@@ -14,6 +14,7 @@ as large (`FieldSearch.margin_dex`). N includes the hypotheses about a picture (
 from __future__ import annotations
 
 import datetime
+import functools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -108,6 +109,8 @@ class Solver:
         2020, and stellar aberration (20") is left out because its direction depends on the season.
     fov_uncertainty : relative, of the focal length that follows from fov_deg
     hypotheses : number of alternative readings of one picture that are solved in turn
+    upper_half : whether the centroids are of the upper half alone: the trackers' field then is that half, with quads
+        of its height, and no star counts as missing in the lower half
     tracker_cache : the trackers for the last image size and date, by camera and uncertainty
     """
 
@@ -120,6 +123,7 @@ class Solver:
     fov_uncertainty: float = FOV_UNCERTAINTY
     search: FieldSearch = FIELD_SEARCH
     hypotheses: int = 1
+    upper_half: bool = False
     tracker_cache: dict[Any, dict[Any, StarTracker]] = field(default_factory=dict, compare=False, repr=False)
 
     @property
@@ -129,6 +133,9 @@ class Solver:
 
     def candidate_cameras(self, width_px: int, height_px: int) -> list[tuple[Camera, float]]:
         """Cameras to try for this image size, each with its relative focal-length uncertainty, the likeliest first."""
+        if self.upper_half:
+            whole = replace(self, upper_half=False).candidate_cameras(width_px, height_px)
+            return [(replace(camera, height_px=height_px // 2), uncertainty) for camera, uncertainty in whole]
         if self.camera:
             from skysim.tracking.onboard_model import calibration
 
@@ -210,6 +217,15 @@ def make_solver(
     return Solver(fov_deg, camera, read_catalog(catalog), settings, time_utc, lens)
 
 
+@functools.lru_cache(maxsize=1)
+def kept_solver(fov_deg: float | None, time_utc: datetime.datetime | None = None) -> Solver:
+    """The solver of `make_solver` with the shipped catalog, kept with its trackers for the next picture.
+
+    To index the fields of view from 2 to 100 degrees takes longer than to solve a picture.
+    """
+    return make_solver(fov_deg, None, time_utc)
+
+
 def check_stages(stages: Mapping[str, str]) -> None:
     """Raise InputError for the name of an unknown algorithm; stages are detector, centroider, identifier, solver."""
     from skysim.tracking.settings import STAR_ALGORITHMS
@@ -272,6 +288,8 @@ def solve_array(
     if centroids is None:  # of the camera only the size is used
         centroids = detect_and_centroid(image, first.camera, solver.settings, clock)
     attitude, tracker = solve_centroids(centroids, solver, (width_px, height_px), date_utc, clock, efforts)
+    if attitude.camera:
+        attitude = replace(attitude, camera=replace(attitude.camera, height_px=height_px))  # the picture's, of a half
     return Report(attitude, centroids, clock.seconds), tracker
 
 

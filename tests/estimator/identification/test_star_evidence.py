@@ -78,6 +78,21 @@ def test_missing_stars_cost_the_beta_function_of_the_counts(missing: int) -> Non
     assert here.dex - whole.dex == pytest.approx(toll, abs=1e-9)
 
 
+@pytest.mark.parametrize(("false_mag", "missing"), [(4.4, 0), (5.4, 1), (6.4, 2)])
+def test_stars_as_bright_as_half_of_the_lights_are_missed(false_mag: float, missing: int) -> None:
+    """Stars 0 to 3, of magnitudes 1 to 4, among five fainter lights. Stars 4 and 5 are not seen."""
+    places = np.array([[0.01 * n, -0.06] for n in range(-2, 3)])
+    lights = seen(np.concatenate([TANGENT[:4], places]))
+    gates, dex = np.full(9, 0.01), []
+    for median_mag in 4.4, false_mag:
+        mag = np.array([1.0, 2.0, 3.0, 4.0, median_mag, median_mag, median_mag, median_mag, 9.0])
+        found = evidence.evaluate(lights._replace(mag=mag), SKY, TRUTH.as_matrix(), 1.0, gates, -np.inf)
+        assert found.star.tolist() == [0, 1, 2, 3]
+        dex.append(found.dex)
+    toll = (betaln(5, missing + 1) - betaln(5, 1)) / np.log(10)
+    assert dex[1] - dex[0] == pytest.approx(toll, abs=1e-9)
+
+
 def test_stars_outside_of_the_field_are_not_missed() -> None:
     """The faintest match is fainter than all; the eighth star is out of the field, one more is behind the camera."""
     behind = np.vstack([-SKY.vectors[:1], SKY.vectors[:7]])

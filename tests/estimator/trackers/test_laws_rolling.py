@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from estimator.catalog import catalog
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
-from estimator.core.types import Attitude, Centroids, RateEstimate
+from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.trackers import rolling_shutter
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Settings
@@ -91,6 +92,29 @@ def test_an_uncorrected_shear_turns_the_field_by_what_it_should(tracker: StarTra
         assert np.linalg.norm(error_arcsec(tracker.solve_centroids(found, exposure_s=EXPOSURE_S), seen)) < 0.1
 
 
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_of_two_signs_the_one_with_more_evidence_is_kept(
+    tracker: StarTracker, monkeypatch: pytest.MonkeyPatch, sign: int
+) -> None:
+    """A part of the stars matches with the wrong sign, too, in whichever order the two are tried."""
+    seen, found = star_frame(tracker, 1, sign * RATE_DEG_S)
+    tried = []
+
+    def both_solve(*arguments: Any) -> Attitude:
+        rate = arguments[4][0]
+        tried.append(rate)
+        chance = -38.0 if rate.rate_rad_s @ seen.rate_rad_s > 0 else -7.0
+        return Attitude(
+            "solved", seen.cam_from_ref, np.eye(3), StarMatch(*2 * [np.arange(7)], seen.cam_from_ref, chance), rate=rate
+        )
+
+    monkeypatch.setattr(rolling_shutter, "_solve_with", both_solve)
+    attitude = tracker.solve_centroids(found, exposure_s=EXPOSURE_S)
+    assert attitude.rate is not None
+    assert attitude.rate.rate_rad_s @ seen.rate_rad_s > 0
+    assert [rate.sign_known for rate in tried] == [False, False]
+
+
 def test_rows_alone_tell_a_slow_rate_with_its_sign(tracker: StarTracker) -> None:
     for seed in range(3):
         seen, found = star_frame(tracker, seed, np.array([0.3, -0.2, 0.1]))
@@ -158,7 +182,9 @@ def test_candidates_hold_the_rate_and_refusals_stay(rng: np.random.Generator) ->
     assert lights.sight.radius_m == pytest.approx(1)
     rates = list(rolling_shutter.candidates(WIDE, lights.sight, found, None, EXPOSURE_S))
     assert min(np.linalg.norm(one.rate_rad_s - seen.rate_rad_s) for one, _ in rates) < 1e-3
-    assert rates[-1][0].rate_rad_s.tolist() == [0, 0, 0]
+    assert not any(one.sign_known for one, _ in rates)
+    slow = list(rolling_shutter.candidates(WIDE, lights.sight, replace(found, streak_px=None), None, EXPOSURE_S))
+    assert slow[-1][0].rate_rad_s.tolist() == [0, 0, 0]
     gyro = RateEstimate(seen.rate_rad_s, np.eye(3))
     assert list(rolling_shutter.candidates(WIDE, lights.sight, found, gyro, EXPOSURE_S)) == [(gyro, gyro)]
     both = list(rolling_shutter.candidates(WIDE, lights.sight, found, replace(gyro, sign_known=False), None))

@@ -66,7 +66,7 @@ def photo_from_file(name: str, data: bytes, fov_deg: float | None) -> PhotoPixel
     suffix = images.image_suffix(name)
     if not suffix:
         raise InputError(f"{Path(name).name}: allowed: {', '.join(images.IMAGE_SUFFIXES)}")
-    solver = plate_solver.make_solver(fov_deg, None)
+    solver = plate_solver.kept_solver(fov_deg)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"upload{suffix}"
         path.write_bytes(data)
@@ -109,7 +109,7 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
 def solve_frame(image: NDArray, fov_deg: float | None) -> PhotoPixels:
     """Solve a frame of a live camera; the result's status says why if there is no solution."""
     check_size(image)
-    return solved_photo(image, *plate_solver.solve_array(image, plate_solver.make_solver(fov_deg, None), None))
+    return solved_photo(image, *plate_solver.solve_array(image, plate_solver.kept_solver(fov_deg), None))
 
 
 def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoPixels:
