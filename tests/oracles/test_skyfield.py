@@ -17,7 +17,7 @@ import pytest
 from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.solar_system import magnitudes, observer, places
 
-LIMIT_ARCSEC, LIMIT_MAG = 0.1, 0.1
+LIMIT_ARCSEC, LIMIT_MAG = 0.1, 0.001
 BARYCENTERS = ("jupiter", "saturn", "uranus", "neptune")
 NAMES = ("sun", "moon", "mercury", "venus", "mars", *BARYCENTERS)
 FIRST, DAYS = datetime.datetime(1972, 1, 2), 19_700  # to the end of 2025, where both have tables of UT1

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from skysim.core.types import BodyTruth, Floats
 from skysim.scene.sections.light import BodiesConfig
 from skysim.scene.sections.vehicle import SiteConfig
-from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
+from skysim.sources.photometry import Band
+from skysim.sources.solar_system.colors import ALBEDO, reflected_flux_e_s_m2
 from skysim.sources.solar_system.discs import LAMBERT, LIMB_DARKENED, LOMMEL_SEELIGER, Surface
 from skysim.sources.solar_system.magnitudes import earthshine_fraction, magnitude
 from skysim.sources.solar_system.observer import observe_from
@@ -22,17 +23,14 @@ ID_BASE = 9_000_000  # a body's number is this + NAIF's
 
 
 class Body(NamedTuple):
-    """Properties of a body: NAIF's number, mean radius, how its surface scatters, and its colors.
+    """Properties of a body: NAIF's number, mean radius, and how its surface scatters.
 
-    Radii: IAU WGCCRE 2015 (Archinal et al. 2018, Celest. Mech. 130, 22), the Sun's IAU 2015 B3. B-V: Mallama et al.
-    2017, Icarus 282, 19. V-I: about; the Sun's less 2.5 log10 of the ratio of geometric albedos in I and in V.
+    Radii: IAU WGCCRE 2015 (Archinal et al. 2018, Celest. Mech. 130, 22), the Sun's IAU 2015 B3.
     """
 
     naif: int
     radius_km: float
     law: int
-    b_v: float
-    v_i: float
 
     @property
     def id(self) -> int:
@@ -40,15 +38,15 @@ class Body(NamedTuple):
 
 
 BODIES = {
-    "sun": Body(10, 695_700.0, LIMB_DARKENED, *SUN),
-    "moon": Body(301, 1737.4, LOMMEL_SEELIGER, 0.92, 0.95),
-    "mercury": Body(199, 2439.4, LOMMEL_SEELIGER, 0.97, 0.97),
-    "venus": Body(299, 6051.8, LAMBERT, 0.81, 0.75),
-    "mars": Body(499, 3389.5, LOMMEL_SEELIGER, 1.43, 1.25),
-    "jupiter": Body(599, 69_911.0, LAMBERT, 0.87, 0.55),
-    "saturn": Body(699, 58_232.0, LAMBERT, 1.09, 0.75),
-    "uranus": Body(799, 25_362.0, LAMBERT, 0.56, -0.2),
-    "neptune": Body(899, 24_622.0, LAMBERT, 0.41, -0.2),
+    "sun": Body(10, 695_700.0, LIMB_DARKENED),
+    "moon": Body(301, 1737.4, LOMMEL_SEELIGER),
+    "mercury": Body(199, 2439.4, LOMMEL_SEELIGER),
+    "venus": Body(299, 6051.8, LAMBERT),
+    "mars": Body(499, 3389.5, LOMMEL_SEELIGER),
+    "jupiter": Body(599, 69_911.0, LAMBERT),
+    "saturn": Body(699, 58_232.0, LAMBERT),
+    "uranus": Body(799, 25_362.0, LAMBERT),
+    "neptune": Body(899, 24_622.0, LAMBERT),
 }
 NAMES = {body.id: name for name, body in BODIES.items()}
 
@@ -122,6 +120,6 @@ def body_light(name: str, at: Place, tt_jd: float, band: Band) -> BodyLight:
     """The light of a body at its place."""
     body, v_mag = BODIES[name], magnitude(name, at, tt_jd)
     earthshine = earthshine_fraction(at) if name == "moon" else 0.0
-    flux = float(star_flux_e_s_m2(v_mag, body.b_v, body.v_i, band))
+    flux = reflected_flux_e_s_m2(v_mag, ALBEDO[name], band)
     radius_rad = float(np.arcsin(body.radius_km / at.distance_km))
     return BodyLight(name, at, v_mag, radius_rad, flux * (1 + earthshine), earthshine)

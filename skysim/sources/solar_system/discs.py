@@ -28,8 +28,7 @@ PHASE_STEP_DEG = 0.05  # phases of small discs are rounded to this, so that fram
 def brightness(law: int, mu: float, mu0: float) -> float:
     """Relative brightness of a surface.
 
-    LIMB_DARKENED   : the Sun at 550 nm: 0.30 + 0.93 mu - 0.23 mu^2 (Cox 2000, Allen's Astrophysical Quantities,
-                      section 14.7)
+    LIMB_DARKENED   : the Sun at 550 nm: 0.30 + 0.93 mu - 0.23 mu^2 (Cox 2000, Allen's Astrophysical Quantities)
     LOMMEL_SEELIGER : a dark rough surface, in which light is scattered once: mu0 / (mu0 + mu) (Hapke 1981, JGR 86,
                       3039). The full disc is uniform, as the full Moon's is; the maria are left out.
     LAMBERT         : a bright cloud deck, in which light is scattered many times: mu0

@@ -41,7 +41,7 @@ def moon_magnitude(distance_km: float, sun_au: float, phase_deg: float) -> float
     """V = -12.73 + 0.026 a + 4e-9 a^4 at the mean distance.
 
     Source: Allen 1976, as in Krisciunas & Schaefer 1991, PASP 103, 1033. Within 7 degrees of full the Moon is up to
-    0.35 mag brighter than this (its opposition surge); beyond 150 degrees the law is extrapolated. An eclipse is not
+    35 % brighter than this (its opposition surge); beyond 150 degrees the law is extrapolated. An eclipse is not
     computed.
     """
     law = FULL_MOON_MAG + 0.026 * phase_deg + 4e-9 * phase_deg**4
