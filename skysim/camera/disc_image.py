@@ -176,11 +176,19 @@ def gather(light: Floats, count: int) -> Floats:
     suppresses the frequencies that the lattice folds back. Below them it is undone by the second differences
     D = -delta^2: 1 / sinc^2 = 1 + D / 12 + D^2 / 90 + ...
     """
-    blocks = light.reshape(len(light), count, -1)
-    subsamples = blocks.shape[2]
+    subsamples = light.shape[1] // count
     offset = (np.arange(subsamples) + 0.5) / subsamples - 0.5
-    after, before = blocks @ np.maximum(offset, 0), blocks @ np.maximum(-offset, 0)
-    points = blocks @ (1 - np.abs(offset)) + np.roll(after, 1, axis=1) + np.roll(before, -1, axis=1)
-    second = 2 * points - np.roll(points, 1, axis=1) - np.roll(points, -1, axis=1)
-    fourth = 2 * second - np.roll(second, 1, axis=1) - np.roll(second, -1, axis=1)
-    return np.asarray(points + second / 12 + fourth / 90)
+    weights = np.stack([1 - np.abs(offset), np.maximum(offset, 0), np.maximum(-offset, 0)])
+    points, after, before = (weights @ light.reshape(-1, subsamples).T).reshape(3, len(light), count)
+    points[:, 1:] += after[:, :-1]
+    points[:, :-1] += before[:, 1:]
+    second = minus_second_difference(points)
+    return np.asarray(points + second / 12 + minus_second_difference(second) / 90)
+
+
+def minus_second_difference(values: Floats) -> Floats:
+    """2 v(k) - v(k-1) - v(k+1) along the last axis, zeros beyond its ends."""
+    second = 2 * values
+    second[:, 1:] -= values[:, :-1]
+    second[:, :-1] -= values[:, 1:]
+    return np.asarray(second)
