@@ -48,7 +48,7 @@ BODIES = {
     "uranus": Body(799, 25_362.0, LAMBERT),
     "neptune": Body(899, 24_622.0, LAMBERT),
 }
-NAMES = {body.id: name for name, body in BODIES.items()}
+NAMES = {body.id: name.capitalize() for name, body in BODIES.items()}
 
 
 def light_name(id: int) -> str:
