@@ -298,4 +298,5 @@ def test_the_light_of_all_bodies_is_their_magnitudes() -> None:
     ratio = moon.flux_e_s_m2 / (1 + moon.earthshine) / sun.flux_e_s_m2
     # The Moon is redder than the Sun, so it is brighter in a band beyond V than its magnitude says.
     assert 0.0 < moon.magnitude - sun.magnitude + 2.5 * np.log10(ratio) < 0.25
+    assert sun.truth().phase_deg == pytest.approx(0, abs=1e-9)
     assert 2 * sun.radius_rad / ARCSEC_RAD == pytest.approx(1888, abs=5)  # near aphelion

@@ -78,7 +78,7 @@ def lit_place(direction: Floats, from_sun_km: Floats, to_body_km: Floats) -> Pla
     """
     to_observer = -to_body_km / np.linalg.norm(to_body_km)
     distance_km = float(np.linalg.norm(from_sun_km))
-    to_sun = -from_sun_km / distance_km if distance_km else to_observer
+    to_sun = -from_sun_km / distance_km if distance_km > 1 else to_observer  # the Sun itself is at a phase of 0
     across = to_sun - (to_sun @ to_observer) * to_observer
     phase_rad = float(np.arctan2(np.linalg.norm(across), to_sun @ to_observer))
     # The Sun itself and a body in opposition have no bright limb: any direction will do.
