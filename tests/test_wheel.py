@@ -43,3 +43,6 @@ def test_a_wheel_runs_a_scene_outside_of_the_checkout(tmp_path: Path) -> None:
     assert "2 of 2 frames solved, 0 wrong" in ran
     assert (here / "out/afit_simsat/report.html").is_file()
     assert "led_count" in python("-m", "skysim", "study")
+    moon = ("light.bodies={}", "start_time=2012-06-24T21:00:00", "motion.start={ra_deg: 154.9, dec_deg: 4.8}")
+    checked = python("-m", "skysim", "check", "shefex2", *(word for one in moon for word in ("--set", one)))
+    assert "Moon" in checked  # by the ephemeris in data/ephemeris

@@ -18,6 +18,8 @@ from skysim.core.types import Floats, Mount, Sources, Trajectory
 from skysim.dynamics import multibody
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
+from skysim.simulation import exposure, run
+from skysim.simulation.testbed import bodies_during, build_testbed
 from skysim.sources import stars as star_sources
 from skysim.sources.catalog import read
 from skysim.sources.dome.shell import surface
@@ -253,13 +255,37 @@ def lever(path: Path) -> None:
     save(fig, path)
 
 
+def bodies(path: Path) -> None:
+    """Moon, earthshine, full Moon and a solar eclipse through a 200 mm lens."""
+    sunny = {"exposure.time": "1 us", "camera.f_number": "16", "camera.transmission": "0.0001"}
+    eclipse = sunny | {"site.latitude_deg": "37", "site.longitude_deg": "-90"}
+    views = (
+        ("moon", "2012-06-24T21:00:00", {"exposure.time": "1 ms"}, "the Moon, 1 ms"),
+        ("moon", "2012-06-24T21:00:00", {"exposure.time": "40 ms"}, "40 ms: earthshine"),
+        ("moon", "2012-06-04T21:00:00", {"exposure.time": "10 us"}, "the full Moon, 10 µs"),
+        ("sun", "2017-08-21T18:26:40", eclipse, "an eclipse of the Sun"),
+    )
+    fig, all_axes = plt.subplots(1, 4, figsize=(10, 2.8))
+    for ax, (name, time, settings, title) in zip(all_axes, views, strict=True):
+        small = {"camera.focal_length": "200 mm", "camera.width_px": "240", "camera.height_px": "240"}
+        settings |= small | {"light.bodies": "{}", "start_time": time, "motion.rate_deg_s": "[0, 0, 0]"}
+        shown = next(b for b in bodies_during(build_testbed(loader.load("shefex2", settings)), 0.0) if b.name == name)
+        start = f"{{ra_deg: {shown.truth().ra_deg}, dec_deg: {shown.truth().dec_deg}}}"
+        testbed = run.prepare(loader.load("shefex2", settings | {"motion.start": start, "exposure.frames": "1"}))
+        image = exposure.render_frame(testbed, 0)[0].image_dn.astype(float)
+        dark = np.percentile(image, 5)
+        ax.imshow(np.sqrt(np.clip(image - dark, 0, None)), cmap="gray")
+        ax.set(xticks=[], yticks=[], title=title)
+    save(fig, path)
+
+
 def save(fig: plt.Figure, path: Path) -> None:
     """Save a figure without a date, so that equal figures have equal bytes."""
     fig.savefig(path, metadata={"Date": None}, bbox_inches="tight")
     plt.close(fig)
 
 
-FIGURES = {"axes": axes, "pixels": pixels, "roll": roll, "lever": lever}
+FIGURES = {"axes": axes, "pixels": pixels, "roll": roll, "lever": lever, "bodies": bodies}
 
 
 def main(folder: Path) -> None:

@@ -183,6 +183,23 @@ class SourceTruth:
 
 
 @dataclass(frozen=True, slots=True)
+class BodyTruth:
+    """Sun, Moon or a planet in a frame, none of which is in a star catalog; `id` is its number in the sources' truth.
+
+    ra_deg, dec_deg : apparent place of the disc's center in ICRS axes
+    phase_deg       : angle at the body between the Sun and the observer
+    """
+
+    id: int
+    name: str
+    v_mag: float
+    ra_deg: float
+    dec_deg: float
+    diameter_arcsec: float
+    phase_deg: float
+
+
+@dataclass(frozen=True, slots=True)
 class Truth:
     """The true state behind a frame.
 
@@ -192,6 +209,7 @@ class Truth:
     rate_cam_rad_s: (3,) angular velocity in camera axes
     sources       : the sources on the frame
     hidden        : (M,) ids of sources that are occluded and would otherwise be on the frame at mid-exposure
+    bodies        : Sun, Moon and planets on the frame
     """
 
     t_s: float
@@ -200,6 +218,7 @@ class Truth:
     rate_cam_rad_s: Floats
     sources: SourceTruth
     hidden: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    bodies: tuple[BodyTruth, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from skysim.core.io.files import write_text
 from skysim.core.types import Floats, FrameRow, SourceTruth
 from skysim.results.plots import figure_png, stacked_axes
 from skysim.results.stretch import to_8bit
+from skysim.sources.solar_system.bodies import light_name
 
 LEGEND_PX = 20  # height of the legend
 MIN_SNR = 3.0  # of the true sources that are marked: no one sees fainter ones
@@ -84,7 +85,7 @@ def annotate_truth(image: NDArray, sources: SourceTruth) -> NDArray[np.uint8]:
         color = DETECTED_BGR if sources.saturated[n] else TRUTH_BGR
         draw_ticks(picture, x, y, size, color)
         if n in labeled:
-            draw_label(picture, str(sources.id[n]), x + size + 2, y - size, color)
+            draw_label(picture, light_name(int(sources.id[n])), x + size + 2, y - size, color)
     return with_legend(picture, {f"true, SNR > {MIN_SNR:g}": TRUTH_BGR, "saturated": DETECTED_BGR})
 
 

@@ -24,6 +24,7 @@ from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
 
 NAME_ALIAS = "(the file's name)"  # alias of Scene.name, not a valid key in a file
 
+BODIES_YEARS = 1972, 2100  # UTC has leap seconds from 1972; the ephemeris ends with 2100
 MAX_FRAMES, MAX_DURATION_S = 1_000_000, 86_400.0  # of a run, limited by memory
 
 
@@ -95,6 +96,14 @@ class Scene(ConfigModel):
                 f"camera.shutter: readout takes {read_s:g} s, longer than the frame period"
                 f" {1 / self.exposure.rate_hz:g} s"
             )
+        return self
+
+    @model_validator(mode="after")
+    def check_bodies(self) -> Scene:
+        """Check that the ephemeris of the bodies holds at the scene's time."""
+        first, last = BODIES_YEARS
+        if getattr(self.light, "bodies", None) and not first <= self.start_time.year <= last:
+            raise ValueError(f"light.bodies: start_time {self.start_time} is outside {first} to {last}")
         return self
 
     @model_validator(mode="after")

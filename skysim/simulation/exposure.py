@@ -14,12 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Clock
 from skysim.camera import background, display_glow
+from skysim.camera.bodies import behind, concatenated, render_bodies
 from skysim.camera.detector.detector import add_snr_and_saturation, expose, saturation_dn, smear
+from skysim.camera.disc_image import Exposed
 from skysim.camera.render import Poses, in_view, project, render
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Frame, Truth
 from skysim.dynamics import multibody
-from skysim.simulation.testbed import Testbed, exposure_window, time_tag_error_s
+from skysim.simulation.testbed import Testbed, bodies_during, exposure_window, time_tag_error_s
 
 
 def render_frame(
@@ -44,6 +46,7 @@ def render_frame(
     if black_level is not None:
         light_e += black_level * window.exposure_s
     light = testbed.clocks.pulses_at(testbed.sources, middle_s) if testbed.clocks else testbed.sources
+    bodies = bodies_during(testbed, middle_s)
     occludes = partial(multibody.occluded, testbed.obstacles, lab_from_body) if testbed.obstacles else None
     sources = render(
         light_e,
@@ -53,8 +56,11 @@ def render_frame(
         testbed.mount,
         window,
         testbed.emitter,
-        occludes,
+        behind(bodies, occludes),
     )
+    if bodies:
+        exposed = Exposed(testbed.optics, testbed.trajectory, testbed.mount, window)
+        sources = concatenated([sources, *render_bodies(light_e, bodies, exposed, occludes)])
     smear(light_e, window.exposure_s, testbed.detector.shutter)
     # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
     sources = add_snr_and_saturation(sources, light_e, window.exposure_s, testbed.detector)
@@ -62,7 +68,8 @@ def render_frame(
     image = expose(light_e, window.exposure_s, testbed.detector, random_stream(scene.seed, DETECTOR, index))
     clock.lap("detector")
     rate_cam = testbed.mount.cam_from_body.apply(testbed.trajectory.rate_at(middle_s))
-    truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, occluded_ids(testbed, lab_from_body))
+    seen = tuple(body.truth() for body in bodies if body.id in sources.id)
+    truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, occluded_ids(testbed, lab_from_body), seen)
     tagged_s = middle_s + time_tag_error_s(scene, index)
     return Frame(index, image, tagged_s, window.exposure_s, saturation_dn(camera.detector)), truth
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,7 +21,7 @@ from skysim.camera.render import Window
 from skysim.core.errors import InputError
 from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import CAMERA_TIMING, random_stream
-from skysim.core.types import Mount, Sources, Telemetry, Trajectory
+from skysim.core.types import Floats, Mount, Sources, Telemetry, Trajectory
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.controllers.adapter import ControllerSource
 from skysim.dynamics.controllers.interface import Factory
@@ -29,7 +30,7 @@ from skysim.dynamics.profiles.load import load_profiles
 from skysim.dynamics.profiles.spline import AttitudeSpline
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
 from skysim.scene.sections.motion import PointingConfig
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
@@ -39,6 +40,8 @@ from skysim.sources.dome.layouts.led_list import led_list
 from skysim.sources.dome.led import Emitter
 from skysim.sources.dome.shell import surface
 from skysim.sources.photometry import Band
+from skysim.sources.solar_system.bodies import BodyLight, bodies_at
+from skysim.sources.solar_system.observer import observe_from
 from skysim.tracking import factory, settings
 from skysim.tracking.external.interface import TRACKERS
 
@@ -231,7 +234,19 @@ def light_sources(scene: Scene, band: Band) -> Sources:
     stars = catalog.read_for("light.catalog", scene.light.catalog)
     if isinstance(scene.light, CollimatedDisplayConfig):
         return display.display_sources(scene.light, stars, scene.start_time, band)
-    return star_sources.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity(), band)
+    velocity_m_s: Floats | tuple[float, ...] = star_sources.AT_REST
+    if scene.light.bodies:
+        velocity_m_s = observe_from(scene.start_time, scene.site).from_earth_m_s
+    return star_sources.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity(), band, velocity_m_s)
+
+
+def bodies_during(testbed: Testbed, t_s: float) -> list[BodyLight]:
+    """Sun, Moon and planets at a time since the scene's start; none where the scene has no `light.bodies`."""
+    scene = testbed.scene
+    if not isinstance(scene.light, StarsConfig) or scene.light.bodies is None:
+        return []
+    time = scene.start_time + datetime.timedelta(seconds=t_s)
+    return bodies_at(scene.light.bodies, scene.site, time, testbed.band)
 
 
 def build_tracker(testbed: Testbed) -> factory.Estimator:

@@ -6,6 +6,7 @@ import datetime
 
 import erfa
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.quantities.utc import in_utc
@@ -66,30 +67,44 @@ def days_since_j2000_tt(time: datetime.datetime) -> float:
 
 
 def sources(
-    stars: Catalog, time: datetime.datetime, limit_mag: float | None, lab_from_icrs: Rotation, band: Band
+    stars: Catalog,
+    time: datetime.datetime,
+    limit_mag: float | None,
+    lab_from_icrs: Rotation,
+    band: Band,
+    observer_velocity_m_s: Floats | tuple[float, ...] = AT_REST,
 ) -> Sources:
     """The stars to a limiting magnitude as steady points at infinity.
 
     limit_mag     : faintest Johnson V kept; None: all
     lab_from_icrs : orientation of the lab's axes in the ICRS at that time
     band          : quantum efficiency of the chip
+    observer_velocity_m_s : see `apparent`
     Returns Sources in lab axes: place is (direction, 0), strength photo-electrons s^-1 m^-2 from V and both colors.
     """
     selected = stars.to_limit(limit_mag)
-    count = len(selected)
-    direction = lab_from_icrs.apply(apparent(selected, time)) if count else np.zeros((0, 3))
+    direction = np.zeros((0, 3))
+    if len(selected):
+        direction = lab_from_icrs.apply(apparent(selected, time, observer_velocity_m_s))
+    flux = star_flux_e_s_m2(selected.v_mag, selected.b_v, selected.v_i, band)
+    return steady_points(selected.hip, direction, flux, selected.v_mag)
+
+
+def steady_points(ids: NDArray[np.int64], direction: Floats, flux_e_s_m2: Floats, magnitude: Floats) -> Sources:
+    """Steady points of light at infinity: (N, 3) unit vectors, (N,) photo-electrons s^-1 m^-2 and V magnitudes."""
+    count = len(ids)
     zeros, ones = np.zeros(count), np.ones(count)
     return Sources(
-        id=selected.hip,
+        id=ids,
         place=np.column_stack([direction, zeros]),
         normal=np.zeros((count, 3)),
         radius_m=zeros,
-        strength=star_flux_e_s_m2(selected.v_mag, selected.b_v, selected.v_i, band),
+        strength=flux_e_s_m2,
         period_s=ones,
         start_s=zeros,
         on_s=ones,
         clock=np.zeros(count, dtype=np.int64),
-        magnitude=selected.v_mag,
+        magnitude=magnitude,
     )
 
 

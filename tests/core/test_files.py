@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import warnings
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.io import files, images
 from skysim.core.io.files import HOST, TEMPORARY_NAME
-from skysim.core.types import Frame, Truth
+from skysim.core.types import BodyTruth, Frame, Truth
 from skysim.results.files import ccsds_aem, frames
 from skysim.scene import loader, scene
 from skysim.simulation import exposure, run
@@ -157,6 +157,15 @@ def test_truth_comes_back(sky: Shot, written: Path) -> None:
     assert (back * truth.lab_from_body.inv()).magnitude() < 1e-15
     np.testing.assert_array_equal(table.meta["rate_cam_rad_s"], truth.rate_cam_rad_s)
     assert (table.meta["scene"], table.meta["seed"], table.meta["t_mid_s"]) == ("shefex2", 2, truth.t_s)
+
+
+def test_bodies_come_back_by_name(sky: Shot, tmp_path: Path) -> None:
+    loaded, frame, truth = sky
+    moon = BodyTruth(9_000_301, "moon", -8.84, 154.86, 4.84, 1868.9, 118.4)
+    for bodies in ((), (moon,)):
+        frames.write_truth(tmp_path / "truth.ecsv", frame, replace(truth, bodies=bodies), loaded)
+        meta = Table.read(tmp_path / "truth.ecsv", format="ascii.ecsv").meta
+        assert meta.get("bodies", []) == [asdict(body) for body in bodies]
 
 
 def test_which_sources_are_saturated_comes_back(sky: Shot, tmp_path: Path) -> None:

@@ -489,6 +489,39 @@ def test_a_floor_that_the_check_proposes_makes_the_claims_true() -> None:
     assert nees == [pytest.approx(5.4, abs=0.3), pytest.approx(3, abs=0.15)]
 
 
+MOON = {"start_time": "2012-06-24T21:00:00", "motion__rate_deg_s": "[0, 0, 0]", "light__bodies": "{}"}
+
+
+def warned_of_bodies(ra_deg: float, dec_deg: float, **changes: str) -> list[str]:
+    scene = bed("shefex2", motion__start=f"{{ra_deg: {ra_deg}, dec_deg: {dec_deg}}}", **MOON | changes)
+    return [line for line in check(scene).findings if line.startswith("light.bodies")]
+
+
+def test_bodies_in_the_field_and_near_it_are_warned_of() -> None:
+    """The Moon at RA 154.9, Dec +4.8 of V -8.8; Mars of V 0.8 is 20 degrees from it."""
+    (inside,) = warned_of_bodies(154.9, 2.0)
+    assert re.match(r"light.bodies: Moon \(V -8.8, 1900″ wide\) is in the field, 2.8° from the boresight at", inside)
+    (near,) = warned_of_bodies(154.9, -15.0)
+    assert re.match(r"light.bodies: Moon .* is 19.8° from the boresight .* background of kind stray", near)
+    mars = next(line for line in warned_of_bodies(174.9, 2.0) if "Mars" in line)
+    assert "is in the field" in mars
+    assert warned_of_bodies(340.0, -5.0) == []
+    assert warned_of_bodies(154.9, 2.0, light__bodies="{moon: false, sun: false}") == []
+
+
+@pytest.mark.parametrize(("ra_deg", "dec_deg", "name"), [(174.9, 2.0, "Mars"), (154.9, 4.8, "Moon")])
+def test_a_body_fills_a_pixel_as_in_its_frame(ra_deg: float, dec_deg: float, name: str) -> None:
+    """Within a factor of 1.5 of the brightest pixel's electrons: its place in the pixel, and the phase's shape."""
+    start = f"{{ra_deg: {ra_deg}, dec_deg: {dec_deg}}}"
+    testbed = bed("shefex2", motion__start=start, exposure__frames="1", **MOON)
+    line = next(line for line in check(testbed).findings if name in line)
+    fill = float(re.search(r"([\d.]+) times saturation", line)[1])
+    _, truth = exposure.render_frame(run.prepare(testbed.scene), 0)
+    row = list(truth.sources.id).index(next(body.id for body in truth.bodies if body.name == name.lower()))
+    full_e = detection.full_scale_e(testbed.scene.camera.detector)
+    assert fill == pytest.approx(truth.sources.peak_e[row] / full_e, rel=0.5)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["afit_simsat", "nps_tas2", "shefex2", "scoreboard", "collimated_display"])
 def test_a_plan_that_ships_gives_no_warning(name: str) -> None:

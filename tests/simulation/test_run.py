@@ -487,3 +487,47 @@ def test_a_flight_that_forgets_is_the_same_flight() -> None:
     kept = short.simulation.knots(short.simulation.first_step)
     for one, other in zip(kept, long.simulation.knots(short.simulation.first_step), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+MOON = {
+    "light.bodies": "{}",
+    "start_time": "2012-06-24T21:00:00",
+    "motion.start": "{ra_deg: 154.5, dec_deg: 5}",
+    "motion.rate_deg_s": "[0, 0, 0]",
+    "exposure.frames": "1",
+}
+
+
+def test_the_moon_is_in_the_frame_and_in_its_truth() -> None:
+    frame, truth = exposure.render_frame(run.prepare(loader.load("shefex2", MOON)), 0)
+    (moon,) = (body for body in truth.bodies if body.name == "moon")
+    row = list(truth.sources.id).index(moon.id)
+    x, y = truth.sources.xy_px[row].round().astype(int)
+    assert truth.sources.saturated[row]
+    bright, dark = frame.image_dn[y - 2 : y + 3, x + 7 : x + 10], frame.image_dn[y - 2 : y + 3, x - 8 : x - 5]
+    assert (bright > 0.98 * frame.saturation_dn).all()
+    assert (dark > 150).all()  # earthshine: the sky is at 65
+    assert (dark < 0.5 * frame.saturation_dn).all()
+    assert moon.v_mag == pytest.approx(-8.84, abs=0.01)
+    assert 1800 < moon.diameter_arcsec < 2000
+    occulted = loader.load("shefex2", MOON | {"light.bodies": "{moon: false}"})
+    _, without = exposure.render_frame(run.prepare(occulted), 0)
+    assert not any(body.name == "moon" for body in without.bodies)
+
+
+def test_the_moon_moves_among_the_stars_during_a_run() -> None:
+    """By half a second of arc a second, so a frame a minute later has it elsewhere."""
+    settings = MOON | {"exposure.frames": "2", "exposure.rate_hz": "0.0167"}
+    testbed = run.prepare(loader.load("shefex2", settings))
+    place = [exposure.render_frame(testbed, index)[1].bodies[0] for index in (0, 1)]
+    moved_arcsec = np.hypot(place[1].ra_deg - place[0].ra_deg, place[1].dec_deg - place[0].dec_deg) * 3600
+    assert 25 < moved_arcsec < 40
+
+
+def test_bodies_belong_to_the_sky_and_to_years_of_the_ephemeris() -> None:
+    with pytest.raises(InputError, match=r"light.*bodies"):
+        loader.load("afit_simsat", {"light.bodies": "{}"})
+    with pytest.raises(InputError, match=r"light.bodies: start_time 1960.* is outside 1972 to 2100"):
+        loader.load("shefex2", {"light.bodies": "{}", "start_time": "1960-01-01T00:00:00"})
+    with pytest.raises(InputError, match=r"no body is left"):
+        loader.load("shefex2", {"light.bodies": "{sun: false, moon: false, planets: false}"})

@@ -31,7 +31,7 @@ from skysim.experiments.study.plan import (
     resolve_point,
 )
 from skysim.results import metrics
-from skysim.scene.scene import Scene
+from skysim.scene.scene import BODIES_YEARS, Scene
 from skysim.scene.sections.layouts import FibersConfig, LcdConfig
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.tracking.external.interface import OWN, TRACKERS
@@ -170,6 +170,10 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
         )
     if isinstance(trial, FlightTrial) and trial.start:
         check_random_start(scene, trial.start)
+    near = getattr(trial.start if isinstance(trial, FlightTrial) else trial, "near", None)
+    if near and not BODIES_YEARS[0] <= scene.start_time.year <= BODIES_YEARS[1]:
+        first, last = BODIES_YEARS
+        raise InputError(f"trial.near: start_time {scene.start_time} is outside {first} to {last}; allowed: none")
     if to_run:
         tracker = scene.tracker.name
         TRACKERS.check_name(tracker, plan.spec.programs)
@@ -235,9 +239,11 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
         where = "a collimated display" if scene.motion.start != "profile" else "motion.start: profile"
         raise InputError(f"trial.start: random with {where}; allowed: scene")
     dome = isinstance(scene.light, DomeConfig)
-    unused = "dec_deg" if dome else "tilt_deg"
-    if unused in start.model_fields_set:
-        raise InputError(f"trial.start.{unused}: has no effect with light of kind {scene.light.kind}; allowed: none")
+    for unused in {"dec_deg", "near"} if dome else {"tilt_deg"}:
+        if unused in start.model_fields_set:
+            raise InputError(
+                f"trial.start.{unused}: has no effect with light of kind {scene.light.kind}; allowed: none"
+            )
     greatest_deg = max(start.tilt_deg) if isinstance(start.tilt_deg, tuple) else start.tilt_deg
     vehicle = scene.vehicle
     if dome and vehicle.mount == "air_bearing" and greatest_deg > vehicle.tilt_stop_deg:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
 from skysim.core.errors import InputError
 from skysim.core.io import yaml_reader
@@ -29,6 +29,25 @@ HARDWARE = 1  # first of the three numbers of a hardware seed's key; a trial's s
 Declination = Annotated[Number, Field(ge=-90, le=90)]
 SeedKey = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*[._]seed$")]
 Tilt = Annotated[Number, Field(ge=0, le=90)]
+Angle = Annotated[Number, Field(ge=0, le=180)]
+BodyName = Literal["sun", "moon", "mercury", "venus", "mars", "jupiter", "saturn", "uranus", "neptune"]
+
+
+def check_rising(ends: tuple[float, float]) -> tuple[float, float]:
+    """Check that an interval's ends are in their order."""
+    if ends[0] > ends[1]:
+        raise ValueError(f"{ends[0]:g} to {ends[1]:g}; allowed: the smaller first")
+    return ends
+
+
+class NearBody(ConfigModel):
+    """Directions within two angles of the Sun, the Moon or a planet, where it is at the scene's start.
+
+    body : also where the scene's light has no bodies, so that frames with and without it can be compared
+    """
+
+    body: BodyName
+    off_deg: Annotated[tuple[Angle, Angle], AfterValidator(check_rising)] = (0.0, 5.0)
 
 
 class AttitudeRange(ConfigModel):
@@ -36,10 +55,12 @@ class AttitudeRange(ConfigModel):
 
     tilt_deg : under a dome, tilt of the body from vertical: one angle, or uniform in solid angle between two
     dec_deg  : under the stars, the boresight is uniform over the sphere between two declinations
+    near     : under the stars, the boresight is uniform in solid angle between two angles from a body instead
     """
 
     tilt_deg: Tilt | tuple[Tilt, Tilt] = (0.0, 30.0)
     dec_deg: tuple[Declination, Declination] = (-90.0, 90.0)
+    near: NearBody | None = None
 
 
 class RandomAttitude(AttitudeRange):

@@ -77,7 +77,13 @@ RULES = (
         "the boresight is drawn from the sphere",
         "trial.dec_deg, or a scene with light of kind dome",
     ),
-    Rule(("trial.dec_deg",), in_dome, "under a dome the tilt is drawn", "trial.tilt_deg"),
+    Rule(("trial.dec_deg", "trial.near"), in_dome, "under a dome the tilt is drawn", "trial.tilt_deg"),
+    Rule(
+        ("trial.dec_deg",),
+        lambda scene, trial: getattr(trial, "near", None) is not None,
+        "the boresight is drawn about a body",
+        "trial.near.off_deg",
+    ),
     Rule(("seed",), lambda scene, trial: True, "every trial has its own seed", "the study's seed"),
     Rule(
         DYNAMICS,

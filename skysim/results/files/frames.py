@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import shutil
 from pathlib import Path
@@ -103,4 +104,6 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
         "hidden": truth.hidden.tolist(),
         "lab": "ICRS axes" if isinstance(scene.light, StarsConfig) else "bearing center, z up",
     }
+    if truth.bodies:
+        table.meta["bodies"] = [dataclasses.asdict(body) for body in truth.bodies]
     write_table(path, table)

@@ -116,6 +116,10 @@ def earth_unused(scene: Scene) -> bool:
     return not scene.vehicle.disturbances.earth_rotation and (imu is None or imu.earth_rate == "none")
 
 
+def has_bodies(scene: Scene) -> bool:
+    return getattr(scene.light, "bodies", None) is not None
+
+
 RULES = (
     Rule(
         ("tracker.catalog", "tracker.limit_mag"),
@@ -250,7 +254,26 @@ RULES = (
         "camera.detector.blooming: column",
     ),
     Rule(
-        ("site",),
+        ("site.longitude_deg", "site.height"),
+        lambda scene: not has_bodies(scene),
+        "nothing depends on the place on the Earth",
+        "light.bodies",
+    ),
+    Rule(
+        ("site.height",),
+        lambda scene: scene.site.longitude_deg is None,
+        "without a longitude the bodies are seen from the Earth's center",
+        "site.longitude_deg",
+    ),
+    Rule(
+        ("site.latitude_deg",),
+        lambda scene: earth_unused(scene) and not (has_bodies(scene) and scene.site.longitude_deg is not None),
+        "nothing depends on the Earth's rotation",
+        "vehicle.disturbances.earth_rotation, a vehicle.imu whose earth_rate is not none, or light.bodies with a"
+        " site.longitude_deg",
+    ),
+    Rule(
+        ("site.x_azimuth_deg",),
         earth_unused,
         "nothing depends on the Earth's rotation",
         "vehicle.disturbances.earth_rotation, or a vehicle.imu whose earth_rate is not none",

@@ -231,17 +231,37 @@ class DomeConfig(ConfigModel):
         return self
 
 
+class BodiesConfig(ConfigModel):
+    """Bodies of the solar system at the scene's time, seen from `site` if it has a longitude, else from the Earth's
+    center.
+
+    planets : Mercury, Venus, Mars, Jupiter, Saturn, Uranus, Neptune
+    """
+
+    sun: bool = True
+    moon: bool = True
+    planets: bool = True
+
+    @model_validator(mode="after")
+    def check_any(self) -> Self:
+        if not (self.sun or self.moon or self.planets):
+            raise ValueError("no body is left; allowed: sun, moon or planets, or no bodies")
+        return self
+
+
 class StarsConfig(ConfigModel):
     """The real sky as the light source.
 
     catalog   : a name in data/catalogs, or a file of `skysim catalog build`; the tracker has its own
     limit_mag : faintest V; all stars of the catalog if left out
+    bodies    : Sun, Moon and planets; none if left out
     occlusion : whether the vehicle's parts hide stars
     """
 
     kind: Literal["stars"]
     catalog: str = SKY
     limit_mag: Annotated[Number, Field(ge=0, le=15)] | None = None
+    bodies: BodiesConfig | None = None
     occlusion: bool = True
 
 

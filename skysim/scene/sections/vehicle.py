@@ -206,7 +206,13 @@ class VehicleConfig(ConfigModel):
 
 
 class SiteConfig(ConfigModel):
-    """Where on the Earth the lab is, and the azimuth of its x axis from north through east."""
+    """Where on the Earth the lab is, and the azimuth of its x axis from north through east.
+
+    longitude_deg : east; `light.bodies` are seen from there, without it from the Earth's center
+    height        : above the ellipsoid
+    """
 
     latitude_deg: Annotated[Number, Field(ge=-90, le=90)] = 39.8
+    longitude_deg: Annotated[Number, Field(ge=-180, le=360)] | None = None
+    height_m: Annotated[Length, Field(ge=-500, le=10_000)] = 0.0
     x_azimuth_deg: Annotated[Number, Field(ge=-360, le=360)] = 90.0

@@ -6,6 +6,7 @@ import asyncio
 import re
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,9 +16,10 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from skysim.apps.gui.messages import Detection, Light, TrackerResult
 from skysim.apps.gui.page import forms, keys, overlay
+from skysim.apps.gui.page.panels.sensor import Sensor
 from skysim.apps.gui.page.star_names import NAMES
 from skysim.apps.gui.server import Guard, host_of
-from skysim.apps.gui.worker import export, pointing, study_process
+from skysim.apps.gui.worker import export, pointing, study_process, workbench
 from skysim.apps.gui.worker.photo import SUFFIXES
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
@@ -28,7 +30,21 @@ from skysim.dynamics import multibody
 from skysim.experiments.study import loader as study_loader
 from skysim.results import stretch
 from skysim.scene import loader
+from skysim.simulation import exposure, run
 from skysim.sources import catalog, stars
+
+
+def test_a_body_has_its_name_and_magnitude() -> None:
+    """In the sensor's labels and in what the page says of a true light."""
+    sensor = SimpleNamespace(prefix="HIP")
+    assert [Sensor.name(sensor, id) for id in (9_000_599, 32349, 20)] == ["Jupiter", "Sirius", "HIP 20"]
+    settings = {"light.bodies": "{}", "start_time": "2012-06-24T21:00:00", "exposure.frames": "1"}
+    settings |= {"motion.start": "{ra_deg: 154.9, dec_deg: 4.8}", "motion.rate_deg_s": "[0, 0, 0]"}
+    testbed = run.prepare(loader.load("shefex2", settings))
+    lights = workbench.true_lights(exposure.render_frame(testbed, 0)[1], workbench.magnitude_by_id(testbed))
+    assert lights[0].id == 9_000_301
+    assert lights[0].magnitude == pytest.approx(-8.84, abs=0.01)
+
 
 # Where the camera looks.
 

@@ -208,6 +208,6 @@ def test_a_slip_is_told_in_one_line(typed, words, complaint):
 def test_the_studies_are_listed(typed):
     code, out, _ = typed("study", "--json")
     assert code == 0
-    assert {"dome_shape", "dome_size", "led_count", "rate_smear", "false_stars", "end_to_end"} <= {
+    assert {"dome_shape", "dome_size", "led_count", "rate_smear", "false_stars", "moon_and_planets", "end_to_end"} <= {
         entry["name"] for entry in json.loads(out)
     }

@@ -14,6 +14,8 @@ from skysim.experiments.study import plan
 from skysim.experiments.study.execution import setups, trials
 from skysim.experiments.study.plan import CentroidTrial, FrameTrial, TrialSpec
 from skysim.simulation import exposure, run
+from skysim.sources.solar_system.observer import observe_from
+from skysim.sources.solar_system.places import place
 
 SKY = TrialSpec("shefex2", ".", 1, {}, {"kind": "centroids"}, True)
 DOME = TrialSpec("afit_simsat", ".", 1, {}, {"kind": "centroids"}, True)
@@ -61,6 +63,24 @@ def test_attitudes_are_even_over_what_is_allowed(spec, key):
         assert stats.kstest(share, "uniform").pvalue > 1e-4
     assert (level >= 0).all()
     assert (level <= 1).all()
+
+
+def test_attitudes_near_a_body_are_even_about_it():
+    """By the cosine of the angle from the Moon's place and by the angle around it."""
+    near = {"body": "moon", "off_deg": [2.0, 8.0]}
+    ready = setups.prepared_setup(SKY, {"start_time": "2012-07-03T18:00:00", "trial.near": near})
+    rng = np.random.default_rng(3)
+    drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(2000)])
+    boresight = drawn.apply(ready.testbed.mount.cam_from_body.inv().apply([0, 0, 1]))
+    moon = place("moon", observe_from(ready.testbed.scene.start_time, ready.testbed.scene.site)).direction
+    low, high = np.cos(np.radians([8.0, 2.0]))
+    level = (boresight @ moon - low) / (high - low)
+    east = np.cross([0, 0, 1], moon)
+    around = np.arctan2(boresight @ np.cross(moon, east), boresight @ east) / (2 * np.pi) % 1
+    assert stats.kstest(level, "uniform").pvalue > 1e-4
+    assert stats.kstest(around, "uniform").pvalue > 1e-4
+    assert (level >= -1e-9).all()
+    assert (level <= 1 + 1e-9).all()
 
 
 def test_any_turn_about_the_boresight_is_as_likely_as_another():

@@ -39,6 +39,14 @@ def study(folder: Path, scene: str, trial: str, factors: str, settings: str = "{
         ),
         ("shefex2", "{kind: centroids, tilt_deg: 20}", NOISE, "{}", r"trial.tilt_deg: has no effect"),
         ("afit_simsat", "{kind: centroids, dec_deg: [0, 90]}", NOISE, "{}", r"trial.dec_deg: has no effect"),
+        ("afit_simsat", "{kind: centroids, near: {body: moon}}", NOISE, "{}", r"trial.near: has no effect"),
+        (
+            "shefex2",
+            "{kind: frames, dec_deg: [0, 9], near: {body: moon}}",
+            NOISE,
+            "{}",
+            r"trial.dec_deg: has no effect",
+        ),
         ("shefex2", "{kind: frames}", NOISE, "{seed: 4}", r"set: seed: has no effect: every trial has its own"),
         (
             "shefex2",

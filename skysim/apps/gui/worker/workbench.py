@@ -137,7 +137,7 @@ def id_prefix(testbed: Testbed) -> str:
 
 def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> tuple[Light, ...]:
     """The true lights of a frame, the brightest first."""
-    sources = truth.sources
+    sources, magnitude = truth.sources, dict(magnitude) | {body.id: body.v_mag for body in truth.bodies}
     rows = np.argsort(-sources.electrons)
     columns = zip(
         sources.id[rows].tolist(), sources.flux_xy_px[rows].tolist(), sources.electrons[rows].tolist(), strict=True

@@ -86,7 +86,7 @@ def code_version() -> str:
     """Hash of the source code of skysim and estimator and of their data; stored with each trial."""
     code = sha256()
     sources = [path for package in ("skysim", "estimator") for path in (ROOT / package).rglob("*.py")]
-    data = [path for folder in ("qe", "led", "bands", "cameras") for path in (DATA / folder).rglob("*")]
+    data = [path for folder in ("qe", "led", "bands", "cameras", "ephemeris") for path in (DATA / folder).rglob("*")]
     for path in sorted(sources + [path for path in data if path.is_file()]):
         code.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     return code.hexdigest()[:16]

@@ -46,6 +46,8 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation import exposure, run
 from skysim.simulation.testbed import MARGIN_S, Testbed, exposure_window
+from skysim.sources.solar_system.observer import observe_from
+from skysim.sources.solar_system.places import place
 from skysim.tracking import factory
 
 GYRO_RAD_S = 1e-5  # standard deviation that a frame trial's gyro claims, 2 arcseconds a second
@@ -191,7 +193,7 @@ def random_attitude(setup: Setup, rng: np.random.Generator) -> Rotation:
     """Random lab_from_body.
 
     Under a dome: tilt uniform in solid angle within `tilt_deg`, tilt direction and yaw uniform. Otherwise: boresight
-    uniform over the sphere within `dec_deg`, roll uniform.
+    uniform over the sphere within `dec_deg` or between two angles from a body, roll uniform.
     """
     trial, testbed = setup.trial, setup.testbed
     attitudes = trial.start if isinstance(trial, FlightTrial) else trial
@@ -203,11 +205,22 @@ def random_attitude(setup: Setup, rng: np.random.Generator) -> Rotation:
         low, high = tilt_deg if isinstance(tilt_deg, tuple) else (tilt_deg,) * 2
         cosine = rng.uniform(math.cos(math.radians(high)), math.cos(math.radians(low)))
         return quaternion.to_rotation(zyz(first, math.acos(min(cosine, 1.0)), last - first))
-    low, high = (math.sin(math.radians(dec)) for dec in attitudes.dec_deg)
-    zenith = math.acos(min(max(rng.uniform(low, high), -1.0), 1.0))
+    near = attitudes.near
+    low, high = (math.radians(dec) for dec in attitudes.dec_deg)
+    if near:  # a body is the pole
+        high, low = (math.pi / 2 - math.radians(off) for off in near.off_deg)
+    zenith = math.acos(min(max(rng.uniform(math.sin(low), math.sin(high)), -1.0), 1.0))
     lab_from_cam = zyz(first, zenith, last)
+    if near:
+        lab_from_cam = quaternion.multiply(lab_from_body_pole(near.body, testbed.scene), lab_from_cam)
     cam_from_body = quaternion.from_rotation(testbed.mount.cam_from_body)
     return quaternion.to_rotation(quaternion.multiply(lab_from_cam, cam_from_body))
+
+
+def lab_from_body_pole(name: str, scene: Scene) -> Floats:
+    """(4,) wxyz of a rotation that takes z to the Sun, the Moon or a planet at the scene's start."""
+    x, y, z = place(name, observe_from(scene.start_time, scene.site)).direction
+    return zyz(math.atan2(y, x), math.acos(z), 0.0)
 
 
 def zyz(first_rad: float, second_rad: float, third_rad: float) -> Floats:

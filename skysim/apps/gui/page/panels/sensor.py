@@ -14,6 +14,7 @@ from skysim.apps.gui.messages import Detection, FrameView, Light, SceneInfo, Tra
 from skysim.apps.gui.page import keys, overlay
 from skysim.apps.gui.page.star_names import NAMES
 from skysim.results import stretch
+from skysim.sources.solar_system.bodies import NAMES as BODIES
 
 if TYPE_CHECKING:
     from skysim.apps.gui.page.page import Tab
@@ -179,7 +180,7 @@ class Sensor:
     def name(self, id: int) -> str:
         if self.prefix != "HIP":
             return f"{self.prefix} {id}"
-        return NAMES.get(id, f"HIP {id}" if id < 1_000_000 else f"star {id}")
+        return (NAMES | BODIES).get(id, f"HIP {id}" if id < 1_000_000 else f"star {id}")
 
     async def mouse(self, event: Any) -> None:
         """Handle the mouse: show data on what is under it; a click enlarges the pixels there."""

@@ -1,0 +1,1 @@
+"""Sun, Moon and planets: places, magnitudes and discs."""

@@ -1,0 +1,167 @@
+"""Discs in a frame: against a hundred thousand points drawn one by one, and against the light that they must have."""
+
+from __future__ import annotations
+
+import datetime
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from skysim.camera import bodies as drawing
+from skysim.camera.disc_image import Exposed, points_of
+from skysim.camera.optics import Optics
+from skysim.camera.render import Window, render
+from skysim.core.types import Floats, Mount, Trajectory
+from skysim.scene import loader
+from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.vehicle import SiteConfig
+from skysim.sources.photometry import Band
+from skysim.sources.solar_system.bodies import BodyLight, body_light
+from skysim.sources.solar_system.discs import light_map
+from skysim.sources.solar_system.observer import observe_from
+from skysim.sources.solar_system.places import place
+
+DATE = datetime.datetime(2012, 6, 24, 21)  # the Moon at a phase angle of 118 degrees
+BAND = Band.from_efficiency(0.5)
+SIZE = 120
+REST = (0.0, 0.0, 0.0)
+
+
+def camera(focal_px: float, psf: dict[str, object]) -> CameraConfig:
+    """A small chip whose lens has this focal length."""
+    base = loader.load("shefex2", {"camera.width_px": str(SIZE), "camera.height_px": str(SIZE)}).camera
+    kind = type(base.psf).model_validate(psf) if psf["kind"] == base.psf.kind else base.psf
+    return base.model_copy(update={"focal_length_m": focal_px * base.pixel_m, "psf": kind})
+
+
+def toward(direction: Floats, off_px: tuple[float, float], optics: Optics) -> Rotation:
+    """lab_from_cam that puts a direction so many pixels from the chip's center."""
+    z = direction
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
+    centered = Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z]))
+    tilt = np.array(off_px) / optics.camera.focal_px
+    return centered * Rotation.from_rotvec([tilt[1], -tilt[0], 0.0]) * Rotation.from_rotvec([0.0, 0.0, 0.4])
+
+
+def exposed_at(
+    optics: Optics, direction: Floats, off_px: tuple[float, float], rate: Floats, row_s: float = 0.0
+) -> Exposed:
+    attitude = toward(direction, off_px, optics)
+    t_s = np.linspace(0.0, 1.0, 101)
+    turn = Rotation.from_rotvec(rate * (t_s - 0.5)[:, None])
+    motion = Trajectory(t_s, attitude * turn, np.tile(rate, (len(t_s), 1)))
+    return Exposed(optics, motion, Mount(np.zeros(3), Rotation.identity()), Window(0.48, 0.04, row_s))
+
+
+def light(name: str, date: datetime.datetime = DATE) -> BodyLight:
+    seen = observe_from(date, SiteConfig())
+    return body_light(name, place(name, seen), seen.tt_jd, BAND)
+
+
+def brute_force(body: BodyLight, exposed: Exposed, across: int = 400) -> Floats:
+    """The disc as points on a fine lattice, each rendered as a star."""
+    axis = (np.arange(across) + 0.5) * (2 / across) - 1
+    x, y = np.meshgrid(axis, axis)
+    share = light_map(body.surface, axis)
+    lit = share > 0
+    image = np.zeros((SIZE, SIZE))
+    render(image, points_of(body, np.column_stack([x[lit], y[lit]]), share[lit]), *exposed)
+    return image
+
+
+GAUSS = {"kind": "gaussian", "sigma_px": 0.7}
+SHARP = {"kind": "gaussian", "sigma_px": 0.3}
+SLEW = np.array([0.02, 0.05, 0.0])
+CASES = {
+    "still": (2500.0, GAUSS, np.zeros(3), 0.0),
+    "sharp": (2500.0, SHARP, np.zeros(3), 0.0),
+    "small": (1000.0, GAUSS, np.zeros(3), 0.0),
+    "large": (9000.0, GAUSS, np.zeros(3), 0.0),
+    "streak": (2500.0, GAUSS, SLEW, 0.0),
+    "rolling": (2500.0, GAUSS, SLEW, 2e-4),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("name", ["moon", "sun"])
+def test_a_disc_is_its_points(name: str, case: str) -> None:
+    """Within a few thousandths of the brightest pixel; the Moon's limb is a cusp, which needs many points."""
+    focal_px, psf, rate, row_s = CASES[case]
+    optics, body = Optics.from_camera(camera(focal_px, psf)), light(name)
+    exposed = exposed_at(optics, body.place.direction, (0.3, -0.45), rate, row_s)
+    image = np.zeros((SIZE, SIZE))
+    (truth,) = drawing.render_bodies(image, [body], exposed)
+    wanted = brute_force(body, exposed, 600 if case == "large" else 400)
+    assert np.abs(image - wanted).max() < (6e-3 if name == "moon" else 1.5e-3) * wanted.max()
+    assert image.sum() == pytest.approx(wanted.sum(), rel=1e-4)
+    assert truth.electrons[0] == pytest.approx(wanted.sum(), rel=1e-4)
+
+
+def test_a_small_disc_and_a_point_have_the_light_and_center_of_theirs() -> None:
+    """Venus of 51" at a phase angle of 146 degrees: 2.5 px, then 0.12 px."""
+    body = light("venus", datetime.datetime(2012, 5, 20, 21))
+    for focal_px, limit in ((10_000.0, 5e-3), (500.0, 5e-3)):
+        optics = Optics.from_camera(camera(focal_px, GAUSS))
+        exposed = exposed_at(optics, body.place.direction, (0.3, -0.45), np.zeros(3))
+        image = np.zeros((SIZE, SIZE))
+        (truth,) = drawing.render_bodies(image, [body], exposed)
+        wanted = brute_force(body, exposed, 100)
+        assert np.abs(image - wanted).max() < limit * wanted.max()
+        columns = wanted.sum(axis=0) @ np.arange(SIZE) / wanted.sum()
+        assert truth.flux_xy_px[0, 0] == pytest.approx(columns, abs=2e-3)
+        assert truth.electrons[0] == pytest.approx(wanted.sum(), rel=1e-4)
+
+
+def test_the_electrons_are_those_of_the_magnitude() -> None:
+    """A disc gives what a star of its flux gives through the same lens."""
+    optics, body = Optics.from_camera(camera(2500.0, GAUSS)), light("moon")
+    exposed = exposed_at(optics, body.place.direction, (0.0, 0.0), np.zeros(3))
+    image = np.zeros((SIZE, SIZE))
+    drawing.render_bodies(image, [body], exposed)
+    assert image.sum() == pytest.approx(body.flux_e_s_m2 * optics.collecting_m2 * 0.04, rel=1e-4)
+
+
+def test_a_disc_half_off_the_chip_is_the_part_on_it() -> None:
+    optics, body = Optics.from_camera(camera(2500.0, GAUSS)), light("sun")
+    exposed = exposed_at(optics, body.place.direction, (SIZE / 2, 0.0), np.zeros(3))
+    image = np.zeros((SIZE, SIZE))
+    (truth,) = drawing.render_bodies(image, [body], exposed)
+    share = image.sum() / (body.flux_e_s_m2 * optics.collecting_m2 * 0.04)
+    assert 0.1 < share < 0.9
+    assert image.sum() == pytest.approx(brute_force(body, exposed, 200).sum(), rel=1e-3)
+    assert truth.electrons[0] == pytest.approx(image.sum(), rel=1e-9)
+    beyond = exposed_at(optics, body.place.direction, (2 * SIZE, 0.0), np.zeros(3))
+    assert drawing.render_bodies(image, [body], beyond) == []
+
+
+def test_the_moon_eclipses_the_sun() -> None:
+    """2017 August 21 at Carbondale: total from 18:20:10 to 18:22:50 UT, and less light before."""
+    site = SiteConfig(latitude_deg=37.727, longitude_deg=-89.217)
+    optics = Optics.from_camera(camera(2500.0, GAUSS))
+    left = []
+    for minute in (0, 10, 18, 21.5):
+        seen = observe_from(datetime.datetime(2017, 8, 21, 18) + datetime.timedelta(minutes=minute), site)
+        sun, moon = (body_light(name, place(name, seen), seen.tt_jd, BAND) for name in ("sun", "moon"))
+        exposed = exposed_at(optics, sun.place.direction, (0.0, 0.0), np.zeros(3))
+        image = np.zeros((SIZE, SIZE))
+        drawing.render_bodies(image, [sun, moon], exposed)
+        left.append(image.sum() / (sun.flux_e_s_m2 * optics.collecting_m2 * 0.04))
+    assert left == sorted(left, reverse=True)
+    assert left[0] > 0.1
+    assert left[-1] < 1e-6
+
+
+def test_a_star_behind_the_moon_is_hidden() -> None:
+    """Within its radius of 0.26 degrees, and by the vehicle's parts as before."""
+    moon = light("moon")
+    stars = points_of(moon, np.array([[0.0, 0.0], [0.7, 0.7], [0.0, 1.01]]))
+    hidden = drawing.behind([moon], None)
+    assert hidden is not None
+    assert hidden(stars).tolist() == [True, True, False]
+    by_both = drawing.behind([moon], lambda sources: np.array([False, False, True]))
+    assert by_both is not None
+    assert by_both(stars).all()
+    assert drawing.behind([], None) is None

@@ -1,0 +1,92 @@
+"""Places and magnitudes of Sun, Moon and planets are Skyfield's with JPL's DE421 (extra `oracle`).
+
+Skyfield has its own light time, deflection, aberration, Earth rotation and magnitudes; the shipped ephemeris is
+fitted to DE423.
+"""
+
+from __future__ import annotations
+
+import datetime
+import warnings
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from skysim.scene.sections.vehicle import SiteConfig
+from skysim.sources.solar_system import magnitudes, observer, places
+
+LIMIT_ARCSEC, LIMIT_MAG = 0.1, 0.001
+BARYCENTERS = ("jupiter", "saturn", "uranus", "neptune")
+NAMES = ("sun", "moon", "mercury", "venus", "mars", *BARYCENTERS)
+FIRST, DAYS = datetime.datetime(1972, 1, 2), 19_700  # to the end of 2025, where both have tables of UT1
+COUNT = 60
+
+
+class Skyfield(NamedTuple):
+    bodies: Any
+    time: Any
+    at_site: Any
+
+
+@pytest.fixture(scope="module")
+def skyfield() -> Skyfield:
+    api = pytest.importorskip("skyfield.api")
+    data = pytest.importorskip("skyfield_data")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # tables of UT1 that it has, but does not use here, are old
+        load = api.Loader(data.get_skyfield_data_path())
+    return Skyfield(load("de421.bsp"), load.timescale(builtin=True), api.wgs84.latlon)
+
+
+def observers(skyfield: Skyfield, on_ground: bool) -> Iterator[tuple[observer.Observer, Any, Any]]:
+    """Random times, and sites if on the ground: our observer, Skyfield's and its time."""
+    rng = np.random.default_rng(26)
+    for _ in range(COUNT):
+        time = FIRST + datetime.timedelta(days=rng.uniform(0, DAYS))
+        latitude_deg, longitude_deg = rng.uniform(-85, 85), rng.uniform(-180, 180)
+        site, theirs = SiteConfig(), skyfield.bodies["earth"]
+        if on_ground:
+            site = SiteConfig(latitude_deg=latitude_deg, longitude_deg=longitude_deg, height="2000 m")
+            theirs = theirs + skyfield.at_site(latitude_deg, longitude_deg, 2000.0)
+        their_time = skyfield.time.from_datetime(time.replace(tzinfo=datetime.UTC))
+        yield observer.observe_from(time, site), theirs.at(their_time), their_time
+
+
+def named(skyfield: Skyfield, name: str) -> Any:
+    return skyfield.bodies[f"{name} barycenter" if name in BARYCENTERS else name]
+
+
+@pytest.mark.parametrize("on_ground", [False, True], ids=["geocenter", "site"])
+def test_places_are_skyfield_s(skyfield: Skyfield, on_ground: bool) -> None:
+    worst = dict.fromkeys(NAMES, 0.0)
+    for ours, theirs, _ in observers(skyfield, on_ground):
+        for name in NAMES:
+            wanted = theirs.observe(named(skyfield, name)).apparent().xyz.au
+            direction = places.place(name, ours).direction
+            off = np.arctan2(np.linalg.norm(np.cross(wanted, direction)), wanted @ direction)
+            worst[name] = max(worst[name], np.degrees(off) * 3600)
+    assert max(worst.values()) < LIMIT_ARCSEC, worst
+
+
+def test_magnitudes_are_skyfield_s(skyfield: Skyfield) -> None:
+    """Its front end takes the Sun to be at the barycenter (0.18 mag for Mercury), so it is given the distances."""
+    library = pytest.importorskip("skyfield.magnitudelib")
+    worst = dict.fromkeys(NAMES[2:], 0.0)
+    for ours, theirs, time in observers(skyfield, False):
+        for name in worst:
+            seen = theirs.observe(named(skyfield, name))
+            to_body, from_sun = seen.xyz.au, theirs.xyz.au + seen.xyz.au - skyfield.bodies["sun"].at(time).xyz.au
+            args = [np.linalg.norm(from_sun), np.linalg.norm(to_body)]
+            args.append(np.degrees(np.arccos(from_sun @ to_body / args[0] / args[1])))
+            if name in ("saturn", "uranus"):
+                pole = getattr(library, f"_{name.upper()}_POLE")
+                args += [np.degrees(np.arccos(pole @ v / np.linalg.norm(v))) - 90 for v in (from_sun, to_body)]
+            if name == "neptune":
+                args.append(time.J)
+            wanted = float(getattr(library, f"_{name}_magnitude")(*args))
+            if np.isfinite(wanted):  # before 2000 it knows Neptune at small phase angles only
+                ours_mag = magnitudes.magnitude(name, places.place(name, ours), ours.tt_jd)
+                worst[name] = max(worst[name], abs(wanted - ours_mag))
+    assert max(worst.values()) < LIMIT_MAG, worst
