@@ -95,7 +95,9 @@ def test_a_noise_free_image_gives_the_true_attitude(name: str, start: str) -> No
     testbed = quiet(name, start)
     frame, truth = exposure.render_frame(testbed, 0)
     assert frame.image_dn.dtype == np.float64  # neither rounded nor clipped
-    assert error_deg(build_tracker(testbed).solve(frame.image_dn).attitude, truth) < 1e-6
+    # The tracker takes the center of an LED's light for the image of its center: 1e-3 px of 22.6" at most, five LEDs.
+    limit_deg = 1e-6 if name == "shefex2" else 1e-3 * 22.6 / 3600 / np.sqrt(5)
+    assert error_deg(build_tracker(testbed).solve(frame.image_dn).attitude, truth) < limit_deg
 
 
 @pytest.mark.slow

@@ -257,16 +257,18 @@ def test_a_texture_is_refused() -> None:
 
 @pytest.mark.slow
 def test_no_line_is_filtered_for_that_is_longer_than_any_star_s(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A lattice that closes to lines over the whole frame: filters of their length took a minute."""
+    """Lattices that close to lines of 1200 and of 600 px: filters of the length of the first took a minute."""
     taps: list[int] = []
     kept = detect.line_taps
     monkeypatch.setattr(detect, "line_taps", lambda streak: taps.append(1) or kept(streak))
     lattice = np.full((3000, 240), 10, np.uint8)
-    lattice[::3, ::6] = 231
-    blobs = detect.default(lattice)
+    lattice[:600:3, ::6] = 231
+    long = lattice.copy()
+    long[:1200:3, ::6] = 231
+    blobs = detect.default(long)
     assert max(map(abs, blobs.streak_px)) > detect.MAX_STREAK_PX
     assert not taps
-    short = detect.default(lattice[:600])
+    short = detect.default(lattice)
     assert max(map(abs, short.streak_px)) < detect.MAX_STREAK_PX
     assert taps
     stars, xy = field_of_stars(3)
