@@ -33,6 +33,7 @@ def town(light: NDArray, rng: np.random.Generator) -> None:
         photographs.add_star(light, x, y, 10 ** rng.uniform(3.3, 4.3), 1.1, 0.0, (0.0, 0.0))
 
 
+@pytest.mark.slow
 def test_a_picture_with_a_town_below_is_solved_by_its_upper_half() -> None:
     image, truth = drawn(replace(SHOT, limit_mag=5.4, spoil=town), 3)
     solver = plate_solver.make_solver(SHOT.fov_deg, None)
@@ -83,6 +84,7 @@ def test_edges_of_trees_are_no_streak_of_the_stars() -> None:
     assert np.mean(near < 1.0) >= 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [16, 29, 36])
 def test_faint_trails_are_detected_along_the_streak_of_binned_pixels(number: int) -> None:
     """Of trails that the detector sees in pieces, more than twice as many stars are then where they are."""

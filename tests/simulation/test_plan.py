@@ -497,6 +497,7 @@ def warned_of_bodies(ra_deg: float, dec_deg: float, **changes: str) -> list[str]
     return [line for line in check(scene).findings if line.startswith("light.bodies")]
 
 
+@pytest.mark.slow
 def test_bodies_in_the_field_and_near_it_are_warned_of() -> None:
     """The Moon at RA 154.9, Dec +4.8 of V -8.8; Mars of V 0.8 is 20 degrees from it."""
     (inside,) = warned_of_bodies(154.9, 2.0)

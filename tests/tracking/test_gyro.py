@@ -48,6 +48,7 @@ def test_frames_during_the_motion_get_the_same_rate() -> None:
         np.testing.assert_allclose(one.attitude.rate.rate_rad_s, other.attitude.rate.rate_rad_s, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_rate_is_honest_and_none_if_saturated() -> None:
     """Its error over the units of production: squared, over the claim, 3 in the mean (biases and noise are normal)."""
     nees = []
