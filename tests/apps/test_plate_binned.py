@@ -35,6 +35,7 @@ def blurred(drawn: tuple[NDArray, Rotation]) -> NDArray:
     return drawn[0]
 
 
+@pytest.mark.slow
 def test_a_picture_out_of_focus_is_solved_binned_and_says_so(drawn: tuple[NDArray, Rotation]) -> None:
     blurred, truth = drawn
     solver = plate_solver.make_solver(SHOT.fov_deg, None)

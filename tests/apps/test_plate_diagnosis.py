@@ -159,6 +159,7 @@ def test_what_is_left_for_an_unknown_field_is_a_narrow_one() -> None:
 # The catalog's depth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("focal", "expected"), [("60 mm", "5.7"), pytest.param("75 mm", "3.6", marks=pytest.mark.slow)]
 )

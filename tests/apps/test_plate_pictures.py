@@ -272,6 +272,7 @@ def test_stars_are_named_by_their_catalog() -> None:
 # What users call
 
 
+@pytest.mark.slow
 def test_python_gets_what_was_seen_and_tried(gray: NDArray, tmp_path: Path) -> None:
     path = with_exif(tmp_path / "x.png", gray, 2)  # as stored it is upright: seen, it is mirrored
     found = package.solve(path, fov_deg=FOV_DEG)
