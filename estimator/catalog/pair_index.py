@@ -157,10 +157,15 @@ def magnitude_range(index: PairIndex, magnitude: float, gate: float) -> tuple[in
 @jit
 def first_neighbor(index: PairIndex, star: int, low_rad: float) -> int:
     """Return the position in `neighbor` of a star's first neighbor at `low_rad` or farther, by bisection."""
-    begin, end = index.first[star], index.first[star + 1]
+    return first_from(index.separation_rad, index.first[star], index.first[star + 1], low_rad)
+
+
+@jit
+def first_from(values: Floats, begin: int, end: int, least: float) -> int:
+    """Return the first row in [begin, end) whose value is at least `least`, by bisection of sorted values; else end."""
     while begin < end:
         middle = (begin + end) // 2
-        if index.separation_rad[middle] < low_rad:
+        if values[middle] < least:
             begin = middle + 1
         else:
             end = middle

@@ -68,8 +68,6 @@ def solve_rolling(
     """
     best: Attitude | None = None
     for candidate, prior in candidates(camera, lights.sight, centroids, rate, exposure_s):
-        if best is not None and candidate.sign_known:
-            break
         attitude = _solve_with(camera, lights, centroids, solve_global, (candidate, prior), exposure_s)
         if attitude.solved and (best is None or _chance(attitude) < _chance(best)):
             best = attitude

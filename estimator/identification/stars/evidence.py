@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.catalog.pair_index import first_from
 from estimator.catalog.sky_index import MAG_SMOOTHING, MAG_STEP, SkyIndex, nearest
 from estimator.catalog.spatial_grid import cell_of, edge_cell
 from estimator.core import least_squares, vectors
@@ -307,7 +308,7 @@ def _count_missing(detections: Detections, sky: SkyIndex, R: Floats, focal_ratio
     left, right, top, bottom = field
     matched, faintest = 0, np.int64(0)
     if np.isfinite(detections.limit_mag):
-        faintest = _count_brighter(sky, detections.limit_mag) - 1
+        faintest = first_from(sky.mag, 0, len(sky.mag), detections.limit_mag) - 1
     for s in star:
         x, y, _ = project(sky.vectors, R, s)
         matched += left < x < right and top < y < bottom
@@ -384,20 +385,7 @@ def _fraction_brighter(sky: SkyIndex, mag: Floats) -> float:
         faintest = max(faintest, value)
     if not np.isfinite(faintest):
         return 1.0
-    return max(_count_brighter(sky, faintest + MAG_SMOOTHING), 1) / len(sky.mag)
-
-
-@jit
-def _count_brighter(sky: SkyIndex, mag: float) -> int:
-    """Number of stars brighter than a magnitude; they are sorted."""
-    low, high = 0, len(sky.mag)
-    while low < high:
-        middle = (low + high) // 2
-        if sky.mag[middle] < mag:
-            low = middle + 1
-        else:
-            high = middle
-    return low
+    return max(first_from(sky.mag, 0, len(sky.mag), faintest + MAG_SMOOTHING), 1) / len(sky.mag)
 
 
 @jit

@@ -39,7 +39,7 @@ def large_lights(image: NDArray, settings: Settings) -> Iterator[tuple[int, Cent
             area_px = found.area_px[found.flag & NO_STAR == 0][:BRIGHTEST]
             if not len(area_px) or np.median(area_px) < MIN_AREA_PX:
                 continue
-            camera = Camera.from_fov(small.shape[1], small.shape[0], 1.0)  # only its size is used
+            camera = camera_of(small)
             yield factor, enlarged(detect_and_centroid(small, camera, settings, Clock()), factor, settings)
         except ImageError:  # nothing is left, or there are thousands of lights
             continue
@@ -66,3 +66,8 @@ def enlarged(centroids: Centroids, factor: int, settings: Settings) -> Centroids
         streak_covariance_px2=None,
     )
     return out.take(out.sigma_px < MAX_SIGMA_PX)
+
+
+def camera_of(pixels: NDArray) -> Camera:
+    """A camera for the detection, which uses only its size."""
+    return Camera.from_fov(pixels.shape[1], pixels.shape[0], 1.0)

@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.detection.background import estimate_background
@@ -81,7 +80,7 @@ def trails(pixels: NDArray, settings: Settings) -> Iterator[Centroids]:
     The mean of n^2 pixels has n times the signal-to-noise ratio, and the trail is one piece there. With its streak the
     detector adds up the light along each trail in the pixels themselves.
     """
-    camera = Camera.from_fov(pixels.shape[1], pixels.shape[0], 1.0)  # only its size is used
+    camera = binned.camera_of(pixels)
     for factor in TRAIL_FACTORS:
         try:
             blobs = DETECTORS[settings.detector](binned.bin_pixels(pixels, factor), settings.threshold_sigma)
@@ -100,10 +99,9 @@ def without_clouds(pixels: NDArray, settings: Settings) -> Centroids:
     light = cv2.GaussianBlur(binned.bin_pixels(pixels, 1), (0, 0), 0.5)
     flat = cv2.morphologyEx(light, cv2.MORPH_TOPHAT, np.ones((TOPHAT_PX, TOPHAT_PX), np.uint8))
     try:
-        camera = Camera.from_fov(pixels.shape[1], pixels.shape[0], 1.0)  # only its size is used
         # The edges of trees leave as many lights as there are stars.
         more = replace(settings, max_blobs=2 * settings.max_blobs)
-        found = detect_and_centroid(flat, camera, more, Clock(), ROUND)
+        found = detect_and_centroid(flat, binned.camera_of(pixels), more, Clock(), ROUND)
         return replace(found, sigma_px=np.hypot(found.sigma_px, FLAT_SIGMA_PX))
     except ImageError:
         return Centroids.empty()

@@ -124,7 +124,8 @@ def source_kernels(
         widening = np.hypot(sigma, extra) / np.where(point, sigma, 1)
         sigma, sharp = (np.where(point, a * widening, a) for a in (sigma, sharp))
         reach = np.where(point, reach * np.maximum(widening, 1), reach)
-    return Kernels(kind.astype(np.int64), sigma, reach, sharp, spans, cache.tables[0], disk, ellipse.jinc_table())
+    bessel = ellipse.jinc_table() if disk.any() else np.empty(0, np.float32)  # it takes a while to build
+    return Kernels(kind.astype(np.int64), sigma, reach, sharp, spans, cache.tables[0], disk, bessel)
 
 
 def round_error(disks: DiskImages, drawn_px: Floats, variance_px2: Floats) -> Floats:

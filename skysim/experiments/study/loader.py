@@ -239,7 +239,7 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
         where = "a collimated display" if scene.motion.start != "profile" else "motion.start: profile"
         raise InputError(f"trial.start: random with {where}; allowed: scene")
     dome = isinstance(scene.light, DomeConfig)
-    for unused in {"dec_deg", "near"} if dome else {"tilt_deg"}:
+    for unused in ("dec_deg", "near") if dome else ("tilt_deg",):
         if unused in start.model_fields_set:
             raise InputError(
                 f"trial.start.{unused}: has no effect with light of kind {scene.light.kind}; allowed: none"

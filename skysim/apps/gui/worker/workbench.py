@@ -137,12 +137,12 @@ def id_prefix(testbed: Testbed) -> str:
 
 def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> tuple[Light, ...]:
     """The true lights of a frame, the brightest first."""
-    sources, magnitude = truth.sources, dict(magnitude) | {body.id: body.v_mag for body in truth.bodies}
+    sources, of_bodies = truth.sources, {body.id: body.v_mag for body in truth.bodies}
     rows = np.argsort(-sources.electrons)
     columns = zip(
         sources.id[rows].tolist(), sources.flux_xy_px[rows].tolist(), sources.electrons[rows].tolist(), strict=True
     )
-    return tuple(Light(id, x, y, e, magnitude.get(id, math.nan)) for id, (x, y), e in columns)
+    return tuple(Light(id, x, y, e, of_bodies.get(id, magnitude.get(id, math.nan))) for id, (x, y), e in columns)
 
 
 def magnitude_by_id(testbed: Testbed) -> dict[int, float]:

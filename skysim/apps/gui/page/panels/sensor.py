@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 ZOOM_PX = 160  # height of the enlarged pixels on the screen
 FIRST_START = "The first frame on a machine takes up to a minute, because the code is compiled."
+LABELS = NAMES | BODIES  # by number
 STRETCHES = list(stretch.CURVES)
 FRAME_NUMBERS = itertools.count(1)  # of frames, so that each has its own address
 FRAMES: dict[str, dict[int, bytes]] = {}  # JPEG by tab and number, the newest KEPT
@@ -180,7 +181,7 @@ class Sensor:
     def name(self, id: int) -> str:
         if self.prefix != "HIP":
             return f"{self.prefix} {id}"
-        return (NAMES | BODIES).get(id, f"HIP {id}" if id < 1_000_000 else f"star {id}")
+        return LABELS.get(id, f"HIP {id}" if id < 1_000_000 else f"star {id}")
 
     async def mouse(self, event: Any) -> None:
         """Handle the mouse: show data on what is under it; a click enlarges the pixels there."""
