@@ -12,8 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.timing import verdict, versus
-from skysim.camera.background import fill
 from skysim.camera.detector.detector import Detector, expose
+from skysim.camera.glow.background import fill
 from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render
 from skysim.core.types import Floats, Mount, Sources, Trajectory

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Clock
-from skysim.camera import background, display_glow
-from skysim.camera.bodies import behind, concatenated, render_bodies
 from skysim.camera.detector.detector import add_snr_and_saturation, expose, saturation_dn, smear
-from skysim.camera.disc_image import Exposed
+from skysim.camera.discs.bodies import behind, concatenated, render_bodies
+from skysim.camera.discs.disc_image import Exposed
+from skysim.camera.glow import background, display_glow
 from skysim.camera.render import Poses, in_view, project, render
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Frame, Truth

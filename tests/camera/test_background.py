@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.background import (
+from skysim.camera.glow.background import (
     BACKGROUNDS,
     NANOLAMBERT_V0,
     fill,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from skysim.camera import bodies as drawing
-from skysim.camera.disc_image import Exposed, points_of
+from skysim.camera.discs import bodies as drawing
+from skysim.camera.discs.disc_image import Exposed, points_of
 from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render
 from skysim.core.types import Floats, Mount, Trajectory

@@ -12,7 +12,7 @@ from typing import get_args
 import pytest
 from pydantic import BeforeValidator, ValidationError
 
-from skysim.camera.background import BACKGROUNDS
+from skysim.camera.glow.background import BACKGROUNDS
 from skysim.camera.optics import VIGNETTING
 from skysim.camera.psf.otf import PSFS
 from skysim.core.errors import InputError

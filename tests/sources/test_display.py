@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skysim.camera import display_glow
+from skysim.camera.glow import display_glow
 from skysim.core.errors import InputError
 from skysim.core.types import Sources
 from skysim.scene import loader

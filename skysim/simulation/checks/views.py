@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
 
-from skysim.camera import background
+from skysim.camera.glow import background
 from skysim.camera.optics import Optics
 from skysim.camera.psf.kernel import build_kernel
 from skysim.camera.psf.otf import blur_radius_px, field_sigma_px

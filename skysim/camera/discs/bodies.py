@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.camera.disc_image import DiscImage, Exposed, Hidden, disc_image, disc_on_chip, points_of
+from skysim.camera.discs.disc_image import DiscImage, Exposed, Hidden, disc_image, disc_on_chip, points_of
 from skysim.camera.render import OcclusionTest, in_view, poses, render
 from skysim.core.types import Floats, Sources, SourceTruth
 from skysim.sources.solar_system.bodies import BodyLight

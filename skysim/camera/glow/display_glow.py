@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.background import pixel_directions, viewing_geometry
+from skysim.camera.glow.background import pixel_directions, viewing_geometry
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats
 from skysim.scene.sections import layouts, leds, light

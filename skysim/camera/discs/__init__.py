@@ -1,0 +1,1 @@
+"""Images of bodies that are larger than a pixel: Sun, Moon and planets."""
