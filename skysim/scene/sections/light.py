@@ -12,6 +12,7 @@ from skysim.core.quantities.tolerance import LengthError
 from skysim.core.quantities.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
 from skysim.scene.sections.layouts import Layout, PixelsConfig
 from skysim.scene.sections.leds import LedConfig
+from skysim.scene.sections.orbit import SatellitesConfig
 
 SKY = "gaia_v8.0"  # as faint as any camera of a shipped scene detects
 Tilt = Annotated[Number, Field(ge=-45, le=45)]
@@ -255,6 +256,7 @@ class StarsConfig(ConfigModel):
     catalog   : a name in data/catalogs, or a file of `skysim catalog build`; the tracker has its own
     limit_mag : faintest V; all stars of the catalog if left out
     bodies    : Sun, Moon and planets; none if left out
+    satellites : artificial satellites; none if left out
     occlusion : whether the vehicle's parts hide stars
     """
 
@@ -262,6 +264,7 @@ class StarsConfig(ConfigModel):
     catalog: str = SKY
     limit_mag: Annotated[Number, Field(ge=0, le=15)] | None = None
     bodies: BodiesConfig | None = None
+    satellites: SatellitesConfig | None = None
     occlusion: bool = True
 
 
