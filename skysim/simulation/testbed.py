@@ -40,6 +40,7 @@ from skysim.sources.dome.layouts.led_list import led_list
 from skysim.sources.dome.led import Emitter
 from skysim.sources.dome.shell import surface
 from skysim.sources.orbit.camera_orbit import CameraOrbit, build_orbit, state_at
+from skysim.sources.orbit.earth import hidden_by_earth
 from skysim.sources.orbit.elements import Elements, read_elements
 from skysim.sources.orbit.satellites import MovingLight, View, known_satellites, random_satellites
 from skysim.sources.photometry import Band
@@ -251,11 +252,18 @@ def light_sources(scene: Scene, band: Band, orbit: CameraOrbit | None = None) ->
 
 
 def bodies_during(testbed: Testbed, t_s: float) -> list[BodyLight]:
-    """Sun, Moon and planets at a time since the scene's start; none where the scene has no `light.bodies`."""
+    """Sun, Moon and planets at a time since the scene's start; none where the scene has no `light.bodies`.
+
+    In an orbit those whose center is behind the Earth are left out.
+    """
     scene = testbed.scene
     if not isinstance(scene.light, StarsConfig) or scene.light.bodies is None:
         return []
-    return bodies_from(scene.light.bodies, observer_during(testbed, t_s), testbed.band)
+    observer = observer_during(testbed, t_s)
+    bodies = bodies_from(scene.light.bodies, observer, testbed.band)
+    if testbed.orbit is None:
+        return bodies
+    return [body for body in bodies if not hidden_by_earth(observer.from_earth.position_m, body.place.direction)]
 
 
 def state_from_earth(scene: Scene, orbit: CameraOrbit | None, t_s: float) -> GcrsState:
@@ -302,7 +310,8 @@ def lights_during(testbed: Testbed, view: View, t_s: float) -> Sources:
     near = testbed.sources.take(testbed.sources.place[:, :3] @ view.boresight > math.cos(min(reach_rad, math.pi)))
     before, now = (1e3 * observer_during(testbed, t).velocity_km_s for t in (0.0, t_s))
     direction = star_sources.seen_at_velocity(near.place[:, :3], before, now)
-    return replace(near, place=np.column_stack([direction, np.zeros(len(near))]))
+    visible = ~hidden_by_earth(state_at(testbed.orbit, t_s).position_m, direction)
+    return replace(near, place=np.column_stack([direction, np.zeros(len(near))])).take(visible)
 
 
 def build_tracker(testbed: Testbed) -> factory.Estimator:

@@ -110,6 +110,7 @@ CASES = [
         "3",
         {},
     ),
+    Case(SKY, {}, "tracker.orbit_velocity", "false", {"orbit": ORBIT}),
     Case(SKY, {**MOON, "orbit": ORBIT}, "site.longitude_deg", "20", {}),
     Case(SKY, {}, "vehicle.tilt_stop_deg", "20", {"vehicle.mount": "air_bearing"}),
     Case(DOME, {}, "vehicle.cmgs", CMGS, {"motion.control": "{actuators: cmgs}"}),

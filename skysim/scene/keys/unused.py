@@ -281,6 +281,12 @@ RULES = (
         "vehicle.disturbances.earth_rotation, or a vehicle.imu whose earth_rate is not none",
     ),
     Rule(
+        ("tracker.orbit_velocity",),
+        lambda scene: scene.orbit is None,
+        "the camera is on the ground",
+        "the section orbit",
+    ),
+    Rule(
         ("light.satellites.standard_mag",),
         lambda scene: bool(scene.light.satellites and not scene.light.satellites.file),
         "random satellites have their own magnitudes",

@@ -56,7 +56,29 @@ class SatellitesConfig(ConfigModel):
         return self
 
 
-class CircularOrbitConfig(ConfigModel):
+class ExclusionConfig(ConfigModel):
+    """When the tracker can be used in its orbit, for `skysim availability`.
+
+    sun_deg, moon_deg : least angle of the boresight from their centers;  earth_deg : from the Earth's limb
+    stars : least number of stars to `tracker.limit_mag` in a round field of the chip's area
+    """
+
+    sun_deg: Annotated[Number, Field(ge=0, lt=180)] = 0.0
+    earth_deg: Annotated[Number, Field(ge=0, lt=180)] = 0.0
+    moon_deg: Annotated[Number, Field(ge=0, lt=180)] = 0.0
+    stars: Annotated[int, Field(ge=0)] = 4
+
+
+class OrbitConfig(ConfigModel):
+    """The camera's orbit about the Earth: keys common to all kinds.
+
+    exclusion : limits of the tracker's use; none if left out
+    """
+
+    exclusion: ExclusionConfig | None = None
+
+
+class CircularOrbitConfig(OrbitConfig):
     """A circular orbit at the scene's start, in GCRS axes, turned by the Earth's flattening (J2).
 
     altitude     : above the Earth's equatorial radius, 6378.137 km
@@ -70,7 +92,7 @@ class CircularOrbitConfig(ConfigModel):
     argument_deg: Annotated[Number, Field(ge=-360, le=360)] = 0.0
 
 
-class TleOrbitConfig(ConfigModel):
+class TleOrbitConfig(OrbitConfig):
     """An orbit of mean elements (SGP4): a TLE, or an OMM as CSV, XML or JSON.
 
     number : the satellite's catalog number, for a file of several
@@ -81,7 +103,7 @@ class TleOrbitConfig(ConfigModel):
     number: Annotated[int, Field(ge=0, le=999_999_999)] | None = None
 
 
-class OemOrbitConfig(ConfigModel):
+class OemOrbitConfig(OrbitConfig):
     """An orbit of a CCSDS Orbit Ephemeris Message (OEM) in keyword = value notation."""
 
     kind: Literal["oem"]

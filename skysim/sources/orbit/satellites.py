@@ -24,6 +24,7 @@ from skysim.sources.stars import steady_points
 ID_BASE = 1_000_000_000  # a satellite's number is this + its catalog number
 RANDOM_BASE = 2_000_000_000  # a random one's is this + its number in the frame
 STANDARD_M = 1e6  # range of the standard magnitude
+OWN_M = 10.0  # a satellite nearer than this is the camera's own
 MARGIN_RAD = 1e-3  # beyond the field: light time and aberration
 SHORTEST_S = 1e-3  # time over which a path is differentiated
 
@@ -83,21 +84,25 @@ def known_satellites(
     """
     here, sun = observer_at(0.0), sun_m(tt_jd(time))
     states = gcrs_states(elements, time, np.zeros(1))
-    place_m, velocity_m_s, errors = states[0][:, 0], states[1][:, 0], states[2][:, 0]
+    others = np.flatnonzero(
+        (states[2][:, 0] == 0) & (np.linalg.norm(states[0][:, 0] - here.position_m, axis=1) > OWN_M)
+    )
+    place_m, velocity_m_s = states[0][others, 0], states[1][others, 0]
     to_m = place_m - here.position_m
-    range_m = np.maximum(np.linalg.norm(to_m, axis=1), 1.0)
+    range_m = np.linalg.norm(to_m, axis=1)
     across_m_s = np.linalg.norm(np.cross(to_m / range_m[:, None], velocity_m_s - here.velocity_m_s), axis=1)
     reach_rad = view.field_rad + MARGIN_RAD + (view.turn_rad + across_m_s / range_m * view.duration_s) / 2
     near = to_m @ view.boresight > np.cos(np.minimum(reach_rad, np.pi)) * range_m
     sunlit = sunlit_fraction(place_m, sun)
     hidden = hidden_by_earth(here.position_m, to_m / range_m[:, None], range_m)
-    for n in np.flatnonzero(near & (errors == 0) & (sunlit > 0) & ~hidden):
-        seen = path(elements.take([int(n)]), time, view.duration_s, observer_at)
+    for n in np.flatnonzero(near & (sunlit > 0) & ~hidden):
+        one = elements.take([int(others[n])])
+        seen = path(one, time, view.duration_s, observer_at)
         to_sun, to_camera = sun - place_m[n], -to_m[n]
         phase_rad = float(erfa.sepp(to_sun, to_camera))
         v_mag = magnitude(standard_mag, range_m[n], phase_rad, sunlit[n])
         about = (float(range_m[n] / 1e3), float(np.degrees(phase_rad)), float(sunlit[n]))
-        yield moving_light(ID_BASE + elements.numbers[n], elements.names[n], v_mag, seen, about)
+        yield moving_light(ID_BASE + one.numbers[0], one.names[0], v_mag, seen, about)
 
 
 def path(
