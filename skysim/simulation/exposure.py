@@ -7,6 +7,7 @@ The order is that of the light: background and display glow, the sources integra
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from skysim.camera.detector.detector import add_snr_and_saturation, expose, satu
 from skysim.camera.discs.bodies import behind, concatenated, render_bodies
 from skysim.camera.discs.disc_image import Exposed
 from skysim.camera.glow import background, display_glow
+from skysim.camera.glow.earth_glow import earth_light
 from skysim.camera.render import Poses, Window, in_view, project, render
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Frame, Truth
@@ -26,9 +28,11 @@ from skysim.simulation.testbed import (
     bodies_during,
     exposure_window,
     lights_during,
+    observer_during,
     satellites_during,
     time_tag_error_s,
 )
+from skysim.sources.orbit.earth import sun_m
 from skysim.sources.orbit.satellites import View, as_sources
 
 
@@ -49,6 +53,7 @@ def render_frame(
     # The canvas is reused for every frame: the background overwrites it, all else is added to it.
     glow = background.glow_map(scene.background, testbed.optics, cam_from_lab, testbed.band)
     background.fill(light_e, glow, window.exposure_s)
+    add_earth(light_e, testbed, cam_from_lab, middle_s, window.exposure_s)
     camera_m = lab_from_body.apply(testbed.mount.camera_body_m)
     black_level = display_glow.black_glow(scene.light, testbed.optics, cam_from_lab, camera_m, testbed.band)
     if black_level is not None:
@@ -89,6 +94,20 @@ def render_frame(
     truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, hidden_ids, seen, streaked)
     tagged_s = middle_s + time_tag_error_s(scene, index)
     return Frame(index, image, tagged_s, window.exposure_s, saturation_dn(camera.detector)), truth
+
+
+def add_earth(light_e: NDArray[Any], testbed: Testbed, cam_from_lab: Rotation, t_s: float, exposure_s: float) -> None:
+    """Add the Earth's light at a time to the image, in place, where the scene's orbit has it."""
+    config = testbed.scene.orbit.earth if testbed.scene.orbit else None
+    if config is None:
+        return
+    here = observer_during(testbed, t_s)
+    position_m = here.from_earth.position_m
+    glow = earth_light(config, position_m, sun_m(here.tt_jd), testbed.optics, cam_from_lab, testbed.band)
+    if glow is not None:
+        own = np.empty_like(light_e)
+        background.fill(own, glow, exposure_s)
+        light_e += own
 
 
 def view_of(testbed: Testbed, window: Window, cam_from_lab: Rotation, middle_s: float) -> View:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from skysim.core.io.yaml_reader import existing_file
-from skysim.core.quantities.units import ConfigModel, Length, Number
+from skysim.core.quantities.units import ConfigModel, Fraction, Length, Number
 
 ElementsFile = Annotated[str, AfterValidator(existing_file)]
 Magnitude = Annotated[Number, Field(ge=-30, le=30)]
@@ -69,12 +69,25 @@ class ExclusionConfig(ConfigModel):
     stars: Annotated[int, Field(ge=0)] = 4
 
 
+class EarthConfig(ConfigModel):
+    """The Earth's light in the field: lit ground, the air above its limb, and the airglow.
+
+    albedo  : of the ground with its clouds
+    airglow : V surface brightness of the layer seen from straight above
+    """
+
+    albedo: Fraction = 0.3
+    airglow_mag_arcsec2: Annotated[Number, Field(ge=10, le=30)] = 22.0
+
+
 class OrbitConfig(ConfigModel):
     """The camera's orbit about the Earth: keys common to all kinds.
 
+    earth     : the Earth's light; if left out it is dark, but hides stars
     exclusion : limits of the tracker's use; none if left out
     """
 
+    earth: EarthConfig | None = None
     exclusion: ExclusionConfig | None = None
 
 

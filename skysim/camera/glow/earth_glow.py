@@ -1,0 +1,69 @@
+"""The Earth's light as seen from an orbit: its lit side, the air above its limb, and the airglow."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from skysim.camera.glow.background import pixel_directions, viewing_geometry
+from skysim.camera.optics import Optics
+from skysim.core.types import Floats
+from skysim.scene.sections.orbit import EarthConfig
+from skysim.sources.orbit.earth import RADIUS_M, TO_SPHERE
+from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
+from skysim.sources.solar_system.magnitudes import SUN_MAG
+
+NODE_PX = 4.0  # spacing of the nodes: the limb is blurred over so many pixels
+AIR_M = 8e3  # scale height of the air
+LAYER = 1 + 85e3 / RADIUS_M, 1 + 95e3 / RADIUS_M  # bottom and top of the airglow, in radii of the Earth
+
+
+def earth_radiance(config: EarthConfig, observer_m: Floats, toward: Floats, sun_m: Floats, band: Band) -> Floats:
+    """(M,) photo-electrons s^-1 m^-2 sr^-1 in directions (M, 3), GCRS axes; the ellipsoid is stretched to a sphere.
+
+    Ground: Lambert's law, albedo E mu0 / pi, with the Sun's irradiance E and the cosine mu0 of its zenith distance.
+    Air: above the limb the ground's value at the tangent point times exp(-h / 8 km), h its height.
+    Airglow: a uniform layer from 85 to 95 km. With the impact parameter b of the line, the path in it is
+    sqrt(top^2 - b^2) - sqrt(bottom^2 - b^2), twice where the line misses the ground (van Rhijn 1921), over the
+    layer's thickness. It is brightest at b = bottom, 72 times as bright as from above. Clouds and seas are left out.
+    """
+    place, along = observer_m * TO_SPHERE, toward * TO_SPHERE
+    along = along / np.linalg.norm(along, axis=1, keepdims=True)
+    inward = -(along @ place)
+    impact = np.sqrt(np.maximum(place @ place - inward**2, 0.0))
+    ground, down = (impact < 1) & (inward > 0), inward > 0
+    path = inward - np.sqrt(np.maximum(1 - impact**2, 0.0))  # to the ground, or to the tangent point
+    mu0 = (place + path[:, None] * along) @ (sun_m / np.linalg.norm(sun_m)) / np.maximum(impact, 1.0)
+    irradiance = float(star_flux_e_s_m2(SUN_MAG, *SUN, band))
+    height_m = np.maximum(impact - 1, 0.0) * RADIUS_M
+    day = down * config.albedo * irradiance / np.pi * np.maximum(mu0, 0.0) * np.exp(-height_m / AIR_M)
+    half_chords = [np.sqrt(np.maximum(radius**2 - impact**2, 0.0)) for radius in LAYER]
+    layers = (half_chords[1] - half_chords[0]) / (LAYER[1] - LAYER[0]) * np.where(ground, 1, 2) * down
+    return np.asarray(day + layers * float(sky_radiance_e_s_m2_sr(config.airglow_mag_arcsec2, band)))
+
+
+def earth_light(
+    config: EarthConfig, observer_m: Floats, sun_m: Floats, optics: Optics, cam_from_lab: Rotation, band: Band
+) -> Floats | None:
+    """(h, w) electrons s^-1 px^-1 of the Earth at nodes for `background.fill`; None where it is not in the field."""
+    boresight = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
+    distance_m = float(np.linalg.norm(observer_m))
+    from_nadir_rad = math.acos(max(min(float(-boresight @ observer_m) / distance_m, 1.0), -1.0))
+    reach_rad = math.asin(min(LAYER[1] * RADIUS_M / distance_m, 1.0))
+    if from_nadir_rad > reach_rad + optics.field_rad:
+        return None
+    toward, pixel_sr, shape = fine_directions(optics)
+    view = viewing_geometry(toward, pixel_sr, optics, cam_from_lab, band)
+    radiance = earth_radiance(config, observer_m, view.toward_lab, sun_m, band)
+    return np.asarray((radiance * view.etendue_m2_sr()).reshape(shape))
+
+
+@lru_cache(maxsize=4)
+def fine_directions(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
+    """Viewing directions and solid angles of pixels at nodes, NODE_PX apart, and their (h, w)."""
+    w, h = (math.ceil((size - 1) / NODE_PX) + 1 for size in (optics.camera.width_px, optics.camera.height_px))
+    x, y = np.meshgrid(np.linspace(0, optics.camera.width_px - 1, w), np.linspace(0, optics.camera.height_px - 1, h))
+    return *pixel_directions(np.column_stack([x.ravel(), y.ravel()]), optics), (h, w)
