@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.quantities.utc import in_utc
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Sources, StarSources
 from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import Band, star_flux_e_s_m2
 
@@ -90,11 +90,11 @@ def sources(
     return steady_points(selected.hip, direction, flux, selected.v_mag)
 
 
-def steady_points(ids: NDArray[np.int64], direction: Floats, flux_e_s_m2: Floats, magnitude: Floats) -> Sources:
+def steady_points(ids: NDArray[np.int64], direction: Floats, flux_e_s_m2: Floats, magnitude: Floats) -> StarSources:
     """Steady points of light at infinity: (N, 3) unit vectors, (N,) photo-electrons s^-1 m^-2 and V magnitudes."""
     count = len(ids)
     zeros, ones = np.zeros(count), np.ones(count)
-    return Sources(
+    return StarSources(
         id=ids,
         place=np.column_stack([direction, zeros]),
         normal=np.zeros((count, 3)),
