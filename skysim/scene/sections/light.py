@@ -344,7 +344,20 @@ class StrayLightConfig(ConfigModel):
         return self
 
 
-Glow = Annotated[UniformGlowConfig | SkyGlowConfig | MoonGlowConfig | StrayLightConfig, Field(discriminator="kind")]
+class FaintStarsGlowConfig(ConfigModel):
+    """Light of all stars fainter than a V magnitude, by galactic latitude, for skies of kind stars.
+
+    fainter_than_mag : where the catalog, or its limit_mag, ends
+    """
+
+    kind: Literal["faint_stars"]
+    fainter_than_mag: Annotated[Number, Field(ge=6, le=15)]
+
+
+Glow = Annotated[
+    UniformGlowConfig | SkyGlowConfig | MoonGlowConfig | StrayLightConfig | FaintStarsGlowConfig,
+    Field(discriminator="kind"),
+]
 
 
 Light = DomeConfig | StarsConfig | CollimatedDisplayConfig
