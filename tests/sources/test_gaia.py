@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.stats import kstest
 
 from skysim.core.errors import InputError
 from skysim.core.paths import CATALOGS
@@ -14,6 +15,7 @@ from skysim.scene import loader
 from skysim.simulation.testbed import build_testbed, build_tracker
 from skysim.sources import catalog, gaia
 from skysim.sources.catalog import Catalog
+from skysim.sources.stars import varied
 
 ARCSEC_RAD = np.pi / 648_000
 MIRAS = 40534, 97629  # R Cnc and chi Cyg: V 6.6 and 6.3 in Hipparcos, beyond 8 in Gaia
@@ -182,6 +184,47 @@ def test_the_tracker_is_wrong_about_doubles_by_as_much_as_they_moved(sky: Catalo
     assert len(seen) == 2
     assert np.linalg.norm(np.diff(at(sky, 2016.0)[seen], axis=0)) / ARCSEC_RAD == pytest.approx(2.4, abs=0.05)
     assert light_mag(sky.v_mag[seen]) == pytest.approx(2.74, abs=0.05)  # Bright Star Catalogue
+
+
+def test_variable_stars_scatter_as_hipparcos_saw_them(sky: Catalog) -> None:
+    """One draw for each star: normal, with its own deviation; others keep their magnitudes."""
+    drawn = varied(sky, 3)
+    variable = sky.scatter_mag > 0
+    assert 3_500 < np.sum(variable) < 5_000
+    np.testing.assert_array_equal(drawn.v_mag[~variable], sky.v_mag[~variable])
+    score = (drawn.v_mag - sky.v_mag)[variable] / sky.scatter_mag[variable]
+    assert kstest(score, "norm").pvalue > 0.01
+    assert not np.array_equal(varied(sky, 4).v_mag, drawn.v_mag)
+
+
+def test_a_star_varies_alike_in_a_shallower_catalog(sky: Catalog) -> None:
+    bright = sky.to_limit(6.0)
+    deep = varied(sky, 3).v_mag[np.isin(sky.hip, bright.hip)]
+    np.testing.assert_array_equal(varied(bright, 3).v_mag, deep)
+
+
+def test_long_period_variables_scatter_and_standard_stars_do_not(sky: Catalog) -> None:
+    """Mira and Betelgeuse vary by magnitudes and tenths, Vega by hundredths (General Catalogue of Variable Stars)."""
+    scatter = dict(zip(sky.hip.tolist(), sky.scatter_mag.tolist(), strict=True))
+    mira, betelgeuse, vega, sirius = (scatter[hip] for hip in (10826, 27989, 91262, 32349))
+    assert mira > 1.0
+    assert 0.05 < betelgeuse < 0.5
+    assert max(vega, sirius) < 0.03
+
+
+def test_a_sky_without_variable_stars_refuses_a_seed_of_them() -> None:
+    keys = {"light.catalog": "hipparcos_hp6.5", "light.variability_seed": "1"}
+    with pytest.raises(InputError, match=r"light\.variability_seed: hipparcos_hp6\.5 has no variable stars"):
+        build_testbed(loader.load("shefex2", keys))
+
+
+def test_the_tracker_does_not_know_how_bright_a_variable_is() -> None:
+    """The scene's stars shine as drawn; the tracker's catalog and the stars' places are as before."""
+    steady, varying = (build_testbed(loader.load("shefex2", keys)) for keys in ({}, {"light.variability_seed": "1"}))
+    common = np.isin(varying.sources.id, steady.sources.id)
+    places = dict(zip(steady.sources.id.tolist(), steady.sources.place[:, :3].tolist(), strict=True))
+    assert [places[n] for n in varying.sources.id[common].tolist()] == varying.sources.place[common, :3].tolist()
+    assert np.sum(np.isin(steady.sources.strength, varying.sources.strength)) < len(steady.sources) - 3_000
 
 
 def test_colors_of_gaia_are_johnson_s() -> None:

@@ -254,6 +254,8 @@ class StarsConfig(ConfigModel):
 
     catalog   : a name in data/catalogs, or a file of `skysim catalog build`; the tracker has its own
     limit_mag : faintest V; all stars of the catalog if left out
+    variability_seed : of the magnitudes of variable stars at the scene's time, which scatter as Hipparcos saw them;
+        means if left out
     bodies    : Sun, Moon and planets; none if left out
     occlusion : whether the vehicle's parts hide stars
     """
@@ -261,6 +263,7 @@ class StarsConfig(ConfigModel):
     kind: Literal["stars"]
     catalog: str = SKY
     limit_mag: Annotated[Number, Field(ge=0, le=15)] | None = None
+    variability_seed: Annotated[int, Field(ge=0)] | None = None
     bodies: BodiesConfig | None = None
     occlusion: bool = True
 
