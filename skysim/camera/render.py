@@ -109,7 +109,7 @@ def render(
     all_poses = poses(trajectory, mount, t_s)
     # Coarse selection with a few poses, before the sources are projected at all of them.
     few_poses = Poses(*(samples[:: len(t_s) // 8] for samples in all_poses))
-    candidates = sources.take(in_view(sources, optics, few_poses))
+    candidates = sources.take(in_view(sources, optics, few_poses)) if sources.motion is None else sources
     if occluded:
         candidates = candidates.take(~occluded(candidates))
     emitter, middle = emitter or Emitter(), len(t_s) // 2
@@ -163,7 +163,7 @@ def image_tracks(
     sources: Sources, optics: Optics, poses: Poses, t_s: Floats, emitter: Emitter
 ) -> tuple[Tracks, Floats, Floats]:
     """The tracks of N sources, their mean distances (N,) in m (1 for stars) and mean field-angle cosines (N,)."""
-    xy, distance_m, cos_out, cos_in = project(sources, optics, poses)
+    xy, distance_m, cos_out, cos_in = project(sources, optics, poses, t_s - t_s[len(t_s) // 2])
     throughput = optics.throughput(cos_in)
     rate = np.where(
         sources.place[:, 3] > 0,
@@ -175,12 +175,17 @@ def image_tracks(
     return tracks, distance_m.mean(axis=0), cos_in.mean(axis=0)
 
 
-def project(sources: Sources, optics: Optics, poses: Poses) -> tuple[Floats, Floats, Floats, Floats]:
-    """Project N sources at each of K poses.
+NOW = np.zeros(1)
+
+
+def project(
+    sources: Sources, optics: Optics, poses: Poses, after_s: Floats = NOW
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Project N sources at each of K poses, (K,) seconds after mid-exposure.
 
     Returns (K, N, 2) pixels, (K, N) distances in m (1 for stars), (K, N) cosines at the emitter and at the aperture.
     """
-    offset = sources.place[None, :, :3] - sources.place[None, :, 3:] * poses.camera_m[:, None, :]
+    offset = sources.places_at(after_s) - sources.place[None, :, 3:] * poses.camera_m[:, None, :]
     distance = np.sqrt(np.einsum("knj,knj->kn", offset, offset))
     offset /= distance[:, :, None]
     cos_out = -np.einsum("knj,nj->kn", offset, sources.normal)

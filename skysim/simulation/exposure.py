@@ -17,11 +17,19 @@ from skysim.camera.detector.detector import add_snr_and_saturation, expose, satu
 from skysim.camera.discs.bodies import behind, concatenated, render_bodies
 from skysim.camera.discs.disc_image import Exposed
 from skysim.camera.glow import background, display_glow
-from skysim.camera.render import Poses, in_view, project, render
+from skysim.camera.render import Poses, Window, in_view, project, render
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Frame, Truth
 from skysim.dynamics import multibody
-from skysim.simulation.testbed import Testbed, bodies_during, exposure_window, time_tag_error_s
+from skysim.simulation.testbed import (
+    Testbed,
+    bodies_during,
+    exposure_window,
+    lights_during,
+    satellites_during,
+    time_tag_error_s,
+)
+from skysim.sources.orbit.satellites import View, as_sources
 
 
 def render_frame(
@@ -45,7 +53,8 @@ def render_frame(
     black_level = display_glow.black_glow(scene.light, testbed.optics, cam_from_lab, camera_m, testbed.band)
     if black_level is not None:
         light_e += black_level * window.exposure_s
-    light = testbed.clocks.pulses_at(testbed.sources, middle_s) if testbed.clocks else testbed.sources
+    view = view_of(testbed, window, cam_from_lab, middle_s)
+    light = lights_during(testbed, view, middle_s)
     bodies = bodies_during(testbed, middle_s)
     occludes = partial(multibody.occluded, testbed.obstacles, lab_from_body) if testbed.obstacles else None
     sources = render(
@@ -61,6 +70,12 @@ def render_frame(
     if bodies:
         exposed = Exposed(testbed.optics, testbed.trajectory, testbed.mount, window)
         sources = concatenated([sources, *render_bodies(light_e, bodies, exposed, occludes)])
+    satellites = satellites_during(testbed, view, middle_s, index)
+    if satellites:
+        hidden = behind(bodies, occludes)
+        streaks = as_sources(satellites, testbed.band)
+        drawn = render(light_e, streaks, testbed.optics, testbed.trajectory, testbed.mount, window, None, hidden)
+        sources = concatenated([sources, drawn])
     smear(light_e, window.exposure_s, testbed.detector.shutter)
     # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
     sources = add_snr_and_saturation(sources, light_e, window.exposure_s, testbed.detector)
@@ -69,9 +84,18 @@ def render_frame(
     clock.lap("detector")
     rate_cam = testbed.mount.cam_from_body.apply(testbed.trajectory.rate_at(middle_s))
     seen = tuple(body.truth() for body in bodies if body.id in sources.id)
-    truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, occluded_ids(testbed, lab_from_body), seen)
+    streaked = tuple(light.truth for light in satellites if light.truth.id in sources.id)
+    hidden_ids = occluded_ids(testbed, lab_from_body)
+    truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, hidden_ids, seen, streaked)
     tagged_s = middle_s + time_tag_error_s(scene, index)
     return Frame(index, image, tagged_s, window.exposure_s, saturation_dn(camera.detector)), truth
+
+
+def view_of(testbed: Testbed, window: Window, cam_from_lab: Rotation, middle_s: float) -> View:
+    """What the camera can see in the exposure."""
+    duration_s = window.close_s(testbed.scene.camera.height_px) - window.open_s
+    turn_rad = float(np.linalg.norm(testbed.trajectory.rate_at(middle_s))) * duration_s
+    return View(cam_from_lab.inv().apply([0.0, 0.0, 1.0]), testbed.optics.field_rad, turn_rad, duration_s)
 
 
 def occluded_ids(testbed: Testbed, lab_from_body: Rotation) -> NDArray[np.int64]:

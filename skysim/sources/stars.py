@@ -75,6 +75,18 @@ def varied(stars: Catalog, seed: int) -> Catalog:
     return replace(stars, v_mag=stars.v_mag + stars.scatter_mag * draws[numbered])
 
 
+def seen_at_velocity(apparent_direction: Floats, from_m_s: Floats, to_m_s: Floats) -> Floats:
+    """Apparent directions (N, 3) of stars for another velocity of the observer.
+
+    from_m_s, to_m_s : (3,) barycentric velocities, before and after
+    The aberration of the first velocity is undone by that of its opposite, and that of the second applied (`erfa.ab`).
+    """
+    direction = apparent_direction
+    for beta in (-np.asarray(from_m_s) / C_M_S, np.asarray(to_m_s) / C_M_S):
+        direction = erfa.ab(direction, beta, 1.0, np.sqrt(1.0 - beta @ beta))
+    return np.asarray(direction)
+
+
 def days_since_j2000_tt(time: datetime.datetime) -> float:
     """Terrestrial Time as days from J2000.0 (JD 2451545.0)."""
     return (in_utc(time) + TT_MINUS_UTC - J2000_TT) / DAY

@@ -12,6 +12,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "skysim run simsat_slew --frames 2 --scene-3d",
     ),
     "check": ("skysim check afit_simsat", 'skysim check afit_simsat --set light.led.intensity="60 mcd"'),
+    "availability": (
+        "skysim availability shefex2 --set orbit='{kind: circular, altitude: 500 km, inclination_deg: 97.4,"
+        " exclusion: {sun_deg: 90, earth_deg: 45}}'",
+    ),
     "render": ("skysim render shefex2 --frames 1 --preview",),
     "stream": (
         "skysim stream shefex2 --folder out/stream --frames 5",

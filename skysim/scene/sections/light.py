@@ -12,6 +12,7 @@ from skysim.core.quantities.tolerance import LengthError
 from skysim.core.quantities.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
 from skysim.scene.sections.layouts import Layout, PixelsConfig
 from skysim.scene.sections.leds import LedConfig
+from skysim.scene.sections.orbit import SatellitesConfig
 
 SKY = "gaia_v8.0"  # as faint as any camera of a shipped scene detects
 Tilt = Annotated[Number, Field(ge=-45, le=45)]
@@ -257,6 +258,7 @@ class StarsConfig(ConfigModel):
     variability_seed : of the magnitudes of variable stars at the scene's time, which scatter as Hipparcos saw them;
         means if left out
     bodies    : Sun, Moon and planets; none if left out
+    satellites : artificial satellites; none if left out
     occlusion : whether the vehicle's parts hide stars
     """
 
@@ -265,6 +267,7 @@ class StarsConfig(ConfigModel):
     limit_mag: Annotated[Number, Field(ge=0, le=15)] | None = None
     variability_seed: Annotated[int, Field(ge=0)] | None = None
     bodies: BodiesConfig | None = None
+    satellites: SatellitesConfig | None = None
     occlusion: bool = True
 
 
