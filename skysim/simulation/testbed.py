@@ -21,7 +21,7 @@ from skysim.camera.render import Window
 from skysim.core.errors import InputError
 from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import CAMERA_TIMING, random_stream
-from skysim.core.types import Floats, Mount, Sources, Telemetry, Trajectory
+from skysim.core.types import Floats, Mount, Sources, StarSources, Telemetry, Trajectory
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.controllers.adapter import ControllerSource
 from skysim.dynamics.controllers.interface import Factory
@@ -245,6 +245,10 @@ def light_sources(scene: Scene, band: Band, orbit: CameraOrbit | None = None) ->
     stars = catalog.read_for("light.catalog", scene.light.catalog)
     if isinstance(scene.light, CollimatedDisplayConfig):
         return display.display_sources(scene.light, stars, scene.start_time, band)
+    if scene.light.variability_seed is not None:
+        if not stars.scatter_mag.any():
+            raise InputError(f"light.variability_seed: {scene.light.catalog} has no variable stars; allowed: gaia_v8.0")
+        stars = star_sources.varied(stars, scene.light.variability_seed)
     velocity_m_s: Floats | tuple[float, ...] = star_sources.AT_REST
     if scene.light.bodies or scene.light.satellites or orbit:
         velocity_m_s = state_from_earth(scene, orbit, 0.0).velocity_m_s
@@ -304,10 +308,10 @@ def lights_during(testbed: Testbed, view: View, t_s: float) -> Sources:
     """
     if testbed.clocks:
         return testbed.clocks.pulses_at(testbed.sources, t_s)
-    if testbed.orbit is None:
+    if testbed.orbit is None or not isinstance(testbed.sources, StarSources):
         return testbed.sources
     reach_rad = 1.25 * view.field_rad + 0.02 + view.turn_rad
-    near = testbed.sources.take(testbed.sources.place[:, :3] @ view.boresight > math.cos(min(reach_rad, math.pi)))
+    near = testbed.sources.take(testbed.sources.within(view.boresight, reach_rad))
     before, now = (1e3 * observer_during(testbed, t).velocity_km_s for t in (0.0, t_s))
     direction = star_sources.seen_at_velocity(near.place[:, :3], before, now)
     visible = ~hidden_by_earth(state_at(testbed.orbit, t_s).position_m, direction)

@@ -13,8 +13,8 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "check": ("skysim check afit_simsat", 'skysim check afit_simsat --set light.led.intensity="60 mcd"'),
     "availability": (
-        "skysim availability shefex2 --set orbit='{kind: circular, altitude: 500 km, inclination_deg: 97.4,"
-        " exclusion: {sun_deg: 90, earth_deg: 45}}'",
+        "skysim availability orbit.yaml --law zenith --off-deg 30",
+        "skysim availability orbit.yaml --span year --picture out/year.png",
     ),
     "render": ("skysim render shefex2 --frames 1 --preview",),
     "stream": (
