@@ -34,6 +34,7 @@ from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, Sta
 from skysim.scene.sections.motion import PointingConfig
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
+from skysim.sources.air.air import Air, Sky
 from skysim.sources.dome import display
 from skysim.sources.dome.clocks import Clocks, build_clocks
 from skysim.sources.dome.layouts.led_list import led_list
@@ -79,6 +80,7 @@ class Testbed:
                 is the expectation itself, and float32 otherwise
     trajectory: the simulated motion, jitter included; telemetry: what the vehicle's computers did in it
     clocks    : the LED controllers' oscillators in this run; None where all light is steady
+    air       : over the site of a sky scene with `light.air`
     obstacles : occluders of the sources; None where the scene has light.occlusion off
     imu_samples: every sample of the IMU; None without one
     reports   : the star tracker's reports on frames solved during the motion (for the filter), by frame index
@@ -101,6 +103,7 @@ class Testbed:
     canvas: NDArray[Any]
     trajectory: Trajectory
     clocks: Clocks | None = None
+    air: Air | None = None
     obstacles: multibody.Obstacles | None = None
     telemetry: Telemetry | None = None
     imu_samples: imu.Increments | None = None
@@ -189,12 +192,21 @@ def build_testbed(
         np.empty((scene.camera.height_px, scene.camera.width_px), dtype),
         Trajectory.at_rest(lab_from_body_start(scene, mount, profiles), 1.0),
         build_clocks(scene.light, sources, scene.seed),
+        build_air(scene, band),
         build_obstacles(scene, vehicle),
         programs=programs,
         profiles=profiles,
         controller=controller,
         tracker=tracker,
     )
+
+
+def build_air(scene: Scene, band: Band) -> Air | None:
+    """The air over the scene's site; None without the section `light.air`."""
+    if not isinstance(scene.light, StarsConfig) or scene.light.air is None:
+        return None
+    stars = catalog.read_for("light.catalog", scene.light.catalog)
+    return Air.from_config(scene.light.air, scene.site, stars, band)
 
 
 def build_obstacles(scene: Scene, vehicle: multibody.VehicleModel) -> multibody.Obstacles | None:
@@ -235,7 +247,7 @@ def light_sources(scene: Scene, band: Band) -> Sources:
     if isinstance(scene.light, CollimatedDisplayConfig):
         return display.display_sources(scene.light, stars, scene.start_time, band)
     velocity_m_s: Floats | tuple[float, ...] = star_sources.AT_REST
-    if scene.light.bodies:
+    if scene.light.bodies or scene.light.air:
         velocity_m_s = observe_from(scene.start_time, scene.site).from_earth_m_s
     return star_sources.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity(), band, velocity_m_s)
 
@@ -245,8 +257,18 @@ def bodies_during(testbed: Testbed, t_s: float) -> list[BodyLight]:
     scene = testbed.scene
     if not isinstance(scene.light, StarsConfig) or scene.light.bodies is None:
         return []
-    time = scene.start_time + datetime.timedelta(seconds=t_s)
-    return bodies_at(scene.light.bodies, scene.site, time, testbed.band)
+    bodies, sky = bodies_at(scene.light.bodies, scene.site, time_at(scene, t_s), testbed.band), sky_during(testbed, t_s)
+    return [sky.body_seen(body) for body in bodies] if sky else bodies
+
+
+def time_at(scene: Scene, t_s: float) -> datetime.datetime:
+    """UTC at a time since the scene's start."""
+    return scene.start_time + datetime.timedelta(seconds=t_s)
+
+
+def sky_during(testbed: Testbed, t_s: float) -> Sky | None:
+    """The air at a time since the scene's start; None where the scene has none."""
+    return testbed.air.at(time_at(testbed.scene, t_s)) if testbed.air else None
 
 
 def build_tracker(testbed: Testbed) -> factory.Estimator:

@@ -38,6 +38,7 @@ class Case(NamedTuple):
 DOME, SKY, BENCH = "afit_simsat", "shefex2", "collimated_display"
 DIRECT = {"light.led.drive": "{kind: direct}"}
 MOON = {"light.bodies": "{}", "start_time": "2012-06-24T21:00:00", "motion.start": "{ra_deg: 154.5, dec_deg: 5}"}
+AIR = {"light.air": "{}", "site": "{latitude_deg: 53, longitude_deg: 9}", "start_time": "2012-06-24T21:00:00"}
 CASES = [
     Case(DOME, {}, "tracker.catalog", "gaia_v8.0", {}),
     Case(DOME, {}, "tracker.limit_mag", "4", {}),
@@ -102,6 +103,7 @@ CASES = [
     Case(SKY, MOON, "site.latitude_deg", "-50", {**MOON, "site.longitude_deg": "20"}),
     Case(SKY, {}, "site.longitude_deg", "20", MOON),
     Case(SKY, MOON, "site.height", "9 km", {**MOON, "site.longitude_deg": "20"}),
+    Case(SKY, AIR, "light.air.seeing_arcsec", "1", {**AIR, "camera.focal_length": "200 mm"}),
     Case(SKY, {}, "vehicle.tilt_stop_deg", "20", {"vehicle.mount": "air_bearing"}),
     Case(DOME, {}, "vehicle.cmgs", CMGS, {"motion.control": "{actuators: cmgs}"}),
     Case(DOME, {"vehicle.imu": IMU}, "vehicle.imu.gyro.bias_time", "9 s", {"vehicle.imu.gyro.bias_deg_h": "1"}),

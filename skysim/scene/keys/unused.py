@@ -19,6 +19,7 @@ from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import Files, location_of, parse_yaml
 from skysim.core.quantities.units import ConfigModel
 from skysim.scene.scene import Scene
+from skysim.scene.sections.air import NEGLIGIBLE_PX
 from skysim.scene.sections.camera import DetectorConfig
 from skysim.scene.sections.layouts import (
     CelestialConfig,
@@ -118,6 +119,20 @@ def earth_unused(scene: Scene) -> bool:
 
 def has_bodies(scene: Scene) -> bool:
     return getattr(scene.light, "bodies", None) is not None
+
+
+def has_air(scene: Scene) -> bool:
+    return getattr(scene.light, "air", None) is not None
+
+
+def seen_from_ground(scene: Scene) -> bool:
+    """Whether what is seen depends on the place on the Earth."""
+    return has_air(scene) or (has_bodies(scene) and scene.site.longitude_deg is not None)
+
+
+def seeing_is_narrow(scene: Scene) -> bool:
+    air = getattr(scene.light, "air", None)
+    return air is not None and not air.seeing_px(scene.camera.focal_px)
 
 
 RULES = (
@@ -255,9 +270,9 @@ RULES = (
     ),
     Rule(
         ("site.longitude_deg", "site.height"),
-        lambda scene: not has_bodies(scene),
+        lambda scene: not (has_bodies(scene) or has_air(scene)),
         "nothing depends on the place on the Earth",
-        "light.bodies",
+        "light.bodies or light.air",
     ),
     Rule(
         ("site.height",),
@@ -267,10 +282,16 @@ RULES = (
     ),
     Rule(
         ("site.latitude_deg",),
-        lambda scene: earth_unused(scene) and not (has_bodies(scene) and scene.site.longitude_deg is not None),
+        lambda scene: earth_unused(scene) and not seen_from_ground(scene),
         "nothing depends on the Earth's rotation",
-        "vehicle.disturbances.earth_rotation, a vehicle.imu whose earth_rate is not none, or light.bodies with a"
-        " site.longitude_deg",
+        "vehicle.disturbances.earth_rotation, a vehicle.imu whose earth_rate is not none, or light.bodies or light.air"
+        " with a site.longitude_deg",
+    ),
+    Rule(
+        ("light.air.seeing_arcsec",),
+        seeing_is_narrow,
+        f"its standard deviation is below {NEGLIGIBLE_PX:g} px",
+        "a longer camera.focal_length or smaller camera.pixel",
     ),
     Rule(
         ("site.x_azimuth_deg",),

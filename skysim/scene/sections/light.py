@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, field_va
 
 from skysim.core.quantities.tolerance import LengthError
 from skysim.core.quantities.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
+from skysim.scene.sections.air import AirConfig
 from skysim.scene.sections.layouts import Layout, PixelsConfig
 from skysim.scene.sections.leds import LedConfig
 
@@ -255,6 +256,7 @@ class StarsConfig(ConfigModel):
     catalog   : a name in data/catalogs, or a file of `skysim catalog build`; the tracker has its own
     limit_mag : faintest V; all stars of the catalog if left out
     bodies    : Sun, Moon and planets; none if left out
+    air       : the atmosphere over `site`, which needs a longitude; none if left out
     occlusion : whether the vehicle's parts hide stars
     """
 
@@ -262,6 +264,7 @@ class StarsConfig(ConfigModel):
     catalog: str = SKY
     limit_mag: Annotated[Number, Field(ge=0, le=15)] | None = None
     bodies: BodiesConfig | None = None
+    air: AirConfig | None = None
     occlusion: bool = True
 
 
