@@ -24,7 +24,14 @@ from skysim.tracking.external import adapter
 from skysim.tracking.external.adapter import ExternalTracker
 from skysim.tracking.external.function import FunctionTracker
 from skysim.tracking.external.interface import OWN
-from skysim.tracking.onboard_model import assumed_camera, assumed_dome, assumed_lever, onboard_catalog, surveyed_dome
+from skysim.tracking.onboard_model import (
+    assumed_air,
+    assumed_camera,
+    assumed_dome,
+    assumed_lever,
+    onboard_catalog,
+    surveyed_dome,
+)
 from skysim.tracking.settings import assumed_settings
 
 UserTracker = ExternalTracker | FunctionTracker  # each frame must reach it once, in order
@@ -58,7 +65,7 @@ def build_tracker(scene: Scene, mount: Mount, sources: Sources, programs: Mappin
         directions = display.lab_from_icrs(scene.light).apply(directions)
     if scene.tracker.name != OWN:
         return ExternalTracker.start(scene, camera, settings, adapter.star_map(stars, directions), programs)
-    return StarTracker(camera, stars, directions, settings)
+    return StarTracker(camera, stars, directions, settings, air=assumed_air(scene))
 
 
 def solve_frame(
@@ -75,6 +82,8 @@ def solve_frame(
     if isinstance(estimator, UserTracker):
         return estimator.solve_frame(frame, streak_px)
     try:
+        if isinstance(estimator, StarTracker):
+            return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s)
         return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s)
     except ImageError as error:
         return Report(Attitude(str(error)), Centroids.empty())

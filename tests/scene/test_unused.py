@@ -103,6 +103,7 @@ CASES = [
     Case(SKY, MOON, "site.latitude_deg", "-50", {**MOON, "site.longitude_deg": "20"}),
     Case(SKY, {}, "site.longitude_deg", "20", MOON),
     Case(SKY, MOON, "site.height", "9 km", {**MOON, "site.longitude_deg": "20"}),
+    Case(SKY, {}, "tracker.refraction", "true", AIR),
     Case(SKY, AIR, "light.air.seeing_arcsec", "1", {**AIR, "camera.focal_length": "200 mm"}),
     Case(SKY, {}, "vehicle.tilt_stop_deg", "20", {"vehicle.mount": "air_bearing"}),
     Case(DOME, {}, "vehicle.cmgs", CMGS, {"motion.control": "{actuators: cmgs}"}),

@@ -12,7 +12,8 @@ from skysim.core.errors import InputError
 from skysim.core.types import Truth
 from skysim.scene.loader import load
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import Testbed, build_testbed, sky_during
+from skysim.simulation.testbed import Testbed, build_testbed, build_tracker, sky_during
+from skysim.tracking.factory import solve_frame
 
 TIME = "2012-06-24T23:00:00"
 AIR = {
@@ -23,6 +24,8 @@ AIR = {
     "motion.jitter": "[]",
     "light.occlusion": "false",
 }
+
+NO_AIR = ("start_time", "camera.detector.noise", "motion.jitter", "light.occlusion")
 
 
 def bed(**keys: str) -> Testbed:
@@ -123,3 +126,32 @@ def test_air_needs_a_site() -> None:
         load("shefex2", AIR | {"light.air.glow": "{}", "start_time": "1960-01-01T00:00:00"})
     with pytest.raises(InputError, match="outside the circle"):
         load("shefex2", AIR | {"light.air.horizon": "{azimuth_deg: [0, 360], altitude_deg: [0, 20]}"})
+
+
+def errors_arcsec(testbed: Testbed, altitude_deg: float, index: int = 0) -> tuple[float, float]:
+    """Error across the boresight and rms residual in px of a frame."""
+    cam_from_lab = level(testbed, altitude_deg) if testbed.air else level(bed(), altitude_deg)
+    at_rest = testbed.at_rest(cam_from_lab.inv() * testbed.mount.cam_from_body, index)
+    frame, truth = render_frame(at_rest, index)
+    attitude = solve_frame(build_tracker(testbed), frame).attitude
+    assert attitude.cam_from_ref is not None
+    error = (attitude.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec() * 206264.8
+    return float(np.hypot(*error[:2])), attitude.rms_px
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("altitude_deg", [60.0, 25.0])
+def test_a_tracker_that_knows_its_site_is_as_good_as_without_air(altitude_deg: float) -> None:
+    """Noise is off: what is left is the centroiding's own error, and 0.3" of the ground's aberration."""
+    told, later = {"tracker.refraction": "true"}, {"exposure.first": "600 s"}
+    without = errors_arcsec(build_testbed(load("shefex2", {key: AIR[key] for key in NO_AIR})), altitude_deg)
+    undone = errors_arcsec(bed(**told), altitude_deg)
+    assert undone[0] < without[0] + 1.0
+    assert undone[1] == pytest.approx(without[1], abs=0.02)
+    assert errors_arcsec(bed(**told, **later), altitude_deg)[0] < without[0] + 1.0
+
+
+@pytest.mark.slow
+def test_a_tracker_that_does_not_is_off_by_the_refraction() -> None:
+    """57.6" tan(30 degrees) at an altitude of 60 degrees."""
+    assert errors_arcsec(bed(), 60.0)[0] == pytest.approx(33.2, abs=1.5)

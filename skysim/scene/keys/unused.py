@@ -288,6 +288,12 @@ RULES = (
         " with a site.longitude_deg",
     ),
     Rule(
+        ("tracker.refraction",),
+        lambda scene: not has_air(scene) or external(scene),
+        "there is no air, or an external tracker that is not told of it",
+        "light.air and tracker.name: own",
+    ),
+    Rule(
         ("light.air.seeing_arcsec",),
         seeing_is_narrow,
         f"its standard deviation is below {NEGLIGIBLE_PX:g} px",

@@ -101,6 +101,7 @@ class TrackerConfig(ConfigModel):
     gyro : whether the tracker gets the mean rate that `vehicle.imu` measures during each exposure, unless saturated,
         for smear and a rolling shutter. Without it, as in the published labs, both follow from the frame alone
     brightest : only this many of the brightest detections of a frame are used
+    refraction : whether the tracker knows `site`, weather and the time, and undoes the refraction of `light.air`
     exposure_control : every frame is exposed for `exposure.time` if left out
     """
 
@@ -120,6 +121,7 @@ class TrackerConfig(ConfigModel):
     assumed_distortion: tuple[Number, Number, Number, Number, Number] | None = None
     assumed_row_time_s: Annotated[Time, Field(ge=0)] | None = None
     gyro: bool = False
+    refraction: bool = False
     brightest: Annotated[int, Field(ge=3, le=1000)] | None = None
     assumed_camera_body_m: tuple[Length, Length, Length] | None = None
     survey: SurveyErrorsConfig = SurveyErrorsConfig()
