@@ -46,6 +46,7 @@ from skysim.scene.sections.light import DomeConfig
 from skysim.simulation import exposure, run
 from skysim.simulation.exposure import occlusion_test
 from skysim.simulation.testbed import MARGIN_S, Testbed, exposure_window, sky_during
+from skysim.sources.air.air import topocentric_axes
 from skysim.sources.solar_system.observer import observe_from
 from skysim.sources.solar_system.places import place
 from skysim.tracking import factory
@@ -218,8 +219,11 @@ def random_attitude(setup: Setup, rng: np.random.Generator) -> Rotation:
 
 
 def lab_from_body_pole(name: str, scene: Scene) -> Floats:
-    """(4,) wxyz of a rotation that takes z to the Sun, the Moon or a planet at the scene's start."""
-    x, y, z = place(name, observe_from(scene.start_time, scene.site)).direction
+    """(4,) wxyz of a rotation that takes z to the Sun, the Moon, a planet or the zenith at the scene's start."""
+    if name == "zenith":
+        x, y, z = topocentric_axes(scene.start_time, scene.site)[2]
+    else:
+        x, y, z = place(name, observe_from(scene.start_time, scene.site)).direction
     return zyz(math.atan2(y, x), math.acos(z), 0.0)
 
 
