@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from skysim.core.quaternion import interpolate
@@ -151,7 +153,21 @@ class Sources:
 
     def take(self, which: NDArray[Any]) -> Sources:
         """The chosen sources, by mask or index."""
-        return Sources(*(getattr(self, name)[which] for name in self.__slots__))
+        return Sources(*(getattr(self, name)[which] for name in Sources.__slots__))
+
+
+class StarSources(Sources):
+    """Stars alone, which are found by direction: the time of a frame does not grow with the catalog."""
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Search tree of the directions."""
+        return cKDTree(self.place[:, :3])
+
+    def within(self, direction: Floats, angle_rad: float) -> NDArray[np.int64]:
+        """Rows, in order, of the stars within an angle of a unit vector."""
+        chord = 2.0 * np.sin(min(angle_rad, np.pi) / 2.0)
+        return np.array(self.tree.query_ball_point(direction, chord, return_sorted=True), dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True)

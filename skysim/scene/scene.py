@@ -90,6 +90,8 @@ class Scene(ConfigModel):
         if self.motion.start != "profile" and sky != isinstance(self.motion.start, PointingConfig):
             keys = "ra_deg, dec_deg, roll_deg" if sky else "roll_deg, pitch_deg, yaw_deg"
             raise ValueError(f"motion.start: light of kind {self.light.kind} requires {keys}")
+        if not sky and any(glow.kind == "faint_stars" for glow in self.background):
+            raise ValueError(f"background: faint_stars requires light of kind stars, not {self.light.kind}")
         read_s = getattr(self.camera.shutter, "row_time_s", 0.0) * (self.camera.height_px - 1)
         if read_s > 1 / self.exposure.rate_hz:
             raise ValueError(

@@ -246,6 +246,10 @@ def light_sources(scene: Scene, band: Band) -> Sources:
     stars = catalog.read_for("light.catalog", scene.light.catalog)
     if isinstance(scene.light, CollimatedDisplayConfig):
         return display.display_sources(scene.light, stars, scene.start_time, band)
+    if scene.light.variability_seed is not None:
+        if not stars.scatter_mag.any():
+            raise InputError(f"light.variability_seed: {scene.light.catalog} has no variable stars; allowed: gaia_v8.0")
+        stars = star_sources.varied(stars, scene.light.variability_seed)
     velocity_m_s: Floats | tuple[float, ...] = star_sources.AT_REST
     if scene.light.bodies or scene.light.air:
         velocity_m_s = observe_from(scene.start_time, scene.site).from_earth_m_s

@@ -25,6 +25,7 @@ from skysim.scene.sections.leds import CosineLobeConfig
 from skysim.scene.sections.motion import JitterLineConfig, MotionConfig
 from skysim.sources.dome.led import Emitter
 from skysim.sources.photometry import SUN, Band, led_strength_e_s_sr, star_flux_e_s_m2
+from skysim.sources.stars import steady_points
 
 FLAT = Band.from_efficiency(1.0)
 
@@ -561,6 +562,28 @@ def test_a_star_that_crosses_the_field_between_two_poses_is_kept() -> None:
     assert len(on_chip) >= 10
     assert set(on_chip) <= set(kept)
     assert len(kept) < 600
+
+
+@pytest.mark.parametrize("angles", [[0.0], [0.0, 0.02], list(np.linspace(-0.6, 0.6, 9))])
+def test_a_field_of_a_deep_catalog_costs_only_the_stars_near_it(
+    monkeypatch: pytest.MonkeyPatch, angles: list[float]
+) -> None:
+    """The rows are those of a pass over all stars; those tested are as many as the cone's part of the sky holds."""
+    rng = np.random.default_rng(5)
+    rays = rng.standard_normal((25_000, 3))
+    stars = steady_points(
+        np.arange(25_000), rays / np.linalg.norm(rays, axis=1, keepdims=True), np.ones(25_000), np.zeros(25_000)
+    )
+    turns = Rotation.from_rotvec(np.outer(angles, [0, 1, 0])).as_matrix()
+    poses = rendering.Poses(turns, np.zeros((len(angles), 3)))
+    tested = []
+    in_cone = rendering._in_cone
+    monkeypatch.setattr(rendering, "_in_cone", lambda place, *more: tested.append(len(place)) or in_cone(place, *more))
+    rows = rendering.in_view(stars, LENS, poses)
+    monkeypatch.setattr(rendering, "MIN_TREE_STARS", 10**9)
+    assert rows.tolist() == rendering.in_view(stars, LENS, poses).tolist()
+    assert tested[1] == 25_000
+    assert len(rows) <= tested[0] < (0.05 * 25_000 if len(angles) < 3 else 25_001)
 
 
 def test_a_patch_holds_the_bend_of_a_path_between_two_samples() -> None:
