@@ -24,6 +24,7 @@ from estimator.attitude.motion import covariance_of
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.attitude.systematic import with_focal_error
 from estimator.catalog import catalog, pair_index, quad_index, sky_index
+from estimator.catalog.refraction import SiteAir
 from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
@@ -43,6 +44,8 @@ from estimator.trackers.residuals.refinement import NO_MATCH, FieldMatcher
 from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
 
 NO_STARS = "too few stars detected"
+AIR_ROUNDS = 2  # by which refraction is undone at another time than the air's epoch
+SAME_AIR_S = 1.0  # the zenith moves by 15" a second, and a refraction by 0.02"
 MIN_ERROR_PX = 0.005  # least centroid error of a star: a calibrated lens, a catalog's places
 
 
@@ -93,6 +96,7 @@ class StarTracker:
     focal_uncertainty : relative; 0 for a calibrated camera, 0.05 if the field of view is only known to 5 %.
         Unless it is 0, the focal length and, with enough stars, the radial distortion are fitted in each frame.
     searches : of the default identifier; empty for those that suit the focal uncertainty
+    air      : over the tracker's site, whose refraction is undone; None in space
 
     Raises ImageError for anything that is not as described here, an unknown algorithm of the settings included.
     """
@@ -105,13 +109,16 @@ class StarTracker:
         settings: Settings = SETTINGS,
         focal_uncertainty: float = 0.0,
         searches: tuple[SearchModel, ...] = (),
+        air: SiteAir | None = None,
     ) -> None:
         checks.of_type("camera", camera, Camera)
         default = getattr(settings, "identifier", "default") == "default"
         check_algorithms(settings, ["default"] if default else _published(), SOLVERS)
         focal_uncertainty = checks.number("focal_uncertainty", focal_uncertainty, 0.0, 0.5, "0 to 0.5, relative")
         stars, vectors = catalog.checked(stars), checks.unit_rows("vectors", vectors, len(stars))
-        self.camera, self.settings = camera, settings
+        if air is not None:
+            vectors = air.seen(vectors, 0.0)
+        self.camera, self.settings, self.air = camera, settings, air
         self.focal_uncertainty = focal_uncertainty
         self.searches = searches or (UNCALIBRATED_SEARCHES if focal_uncertainty else CALIBRATED_SEARCHES)
         apparent_stars = replace(stars, vectors=vectors)
@@ -181,14 +188,18 @@ class StarTracker:
         streak_px: tuple[float, float] | None = None,
         rate: RateEstimate | None = None,
         exposure_s: float | None = None,
+        t_s: float = 0.0,
     ) -> Report:
         """Solve one frame. Raises ImageError for bad input; any other failure is reported in the status.
 
         streak_px : (dx, dy) that stars move during the exposure, from the gyro; None: unknown, or from `rate`
         rate      : of the camera, from the gyro; None: with a rolling shutter it is estimated from the frame
         exposure_s: to estimate the rate from streaks; None if unknown
+        t_s       : time of the frame since the air's epoch
         """
         solve = functools.partial(self.solve_centroids, rate=rate, exposure_s=exposure_s)
+        if self.air is not None:
+            solve = functools.partial(self._solve_through_air, solve, self.air, t_s)
         return process_frame(image, self.camera, self.settings, solve, streak_px, rate, exposure_s)
 
     def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
@@ -249,6 +260,29 @@ class StarTracker:
             solve = functools.partial(self._solve_global, clock=clock, effort=effort)
             return solve_rolling(self.camera, lights, centroids, solve, rate, exposure_s)
         return with_streak_rate(self._solve_global(centroids, clock, effort), centroids, exposure_s, rate)
+
+    def _solve_through_air(
+        self,
+        solve: Callable[[Centroids, Clock | None], Attitude],
+        air: SiteAir,
+        t_s: float,
+        centroids: Centroids,
+        clock: Clock | None = None,
+    ) -> Attitude:
+        """Solve centroids seen through the air. The catalog is as seen at the air's epoch; the Earth has turned since.
+
+        The attitude tells where the zenith is, and so where the stars would have been seen at the epoch; they are
+        solved again there. The second time the first one's error of a refraction, some arcseconds, does not matter.
+        """
+        attitude = solve(centroids, clock)
+        for _ in range(AIR_ROUNDS if abs(t_s) > SAME_AIR_S else 0):
+            if attitude.cam_from_ref is None:
+                break
+            now = attitude.cam_from_ref.inv().apply(self.camera.rays(centroids.xy_px))
+            at_epoch = air.seen(air.without_air(now, t_s), 0.0)
+            xy_px = self.camera.pixels(attitude.cam_from_ref.apply(at_epoch))
+            attitude = solve(replace(centroids, xy_px=xy_px), clock)
+        return attitude
 
     def with_errors(self, centroids: Centroids) -> Centroids:
         """The centroids with their total errors as covariances."""

@@ -38,12 +38,14 @@ class Optics:
     collecting_m2 : entrance pupil's area times transmission
     fold_r        : tangent of the field angle at which strong barrel distortion folds back: no image beyond
     field_rad     : greatest field angle (from the boresight) on the chip
+    blur_px       : standard deviation of a Gaussian blur before the lens (seeing)
     """
 
     camera: CameraConfig
     collecting_m2: float
     fold_r: float
     field_rad: float
+    blur_px: float = 0.0
 
     @classmethod
     def from_camera(cls, camera: CameraConfig) -> Optics:

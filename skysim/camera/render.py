@@ -116,8 +116,9 @@ def render(
     tracks, distance_m, cos_in = image_tracks(candidates, optics, all_poses, t_s, emitter)
     mid_px = tracks.xy_px[middle]
     disks = led_images(candidates, optics, Poses(*(samples[middle] for samples in all_poses)), emitter)
+    is_led = candidates.place[:, 3] > 0
     kernels = source_kernels(
-        optics.camera, mid_px, candidates.radius_m, candidates.place[:, 3] > 0, distance_m, cos_in, disks
+        optics.camera, mid_px, candidates.radius_m, is_led, distance_m, cos_in, disks, optics.blur_px
     )
     table = draw(image, tracks, kernels, STEP * kernels.sharp_px, window)
     # Only sources that gave light to the chip are reported.

@@ -124,6 +124,20 @@ class Scene(ConfigModel):
         return self
 
     @model_validator(mode="after")
+    def check_air(self) -> Scene:
+        """Check that the air has a site, and that the ephemeris of the Sun and the Moon that light it holds."""
+        air, (first, last) = getattr(self.light, "air", None), BODIES_YEARS
+        if air and self.orbit:
+            raise ValueError("light.air: the camera is in an orbit, above the air; allowed: light.air or orbit")
+        if air and self.site.longitude_deg is None:
+            raise ValueError("light.air: requires site.longitude_deg")
+        if air and air.glow and not first <= self.start_time.year <= last:
+            raise ValueError(f"light.air.glow: start_time {self.start_time} is outside {first} to {last}")
+        if air and air.glow and any(glow.kind in ("sky", "moon") for glow in self.background):
+            raise ValueError("light.air.glow: conflicts with a background of kind sky or moon; allowed: one of the two")
+        return self
+
+    @model_validator(mode="after")
     def check_exposure_limits(self) -> Scene:
         """Check that any exposure the exposure control may select ends before the next one begins."""
         control, period_s = self.tracker.exposure_control, 1 / self.exposure.rate_hz

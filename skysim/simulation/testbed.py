@@ -34,6 +34,7 @@ from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, Sta
 from skysim.scene.sections.motion import PointingConfig
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
+from skysim.sources.air.air import Air, Sky
 from skysim.sources.dome import display
 from skysim.sources.dome.clocks import Clocks, build_clocks
 from skysim.sources.dome.layouts.led_list import led_list
@@ -83,6 +84,7 @@ class Testbed:
                 is the expectation itself, and float32 otherwise
     trajectory: the simulated motion, jitter included; telemetry: what the vehicle's computers did in it
     clocks    : the LED controllers' oscillators in this run; None where all light is steady
+    air       : over the site of a sky scene with `light.air`
     obstacles : occluders of the sources; None where the scene has light.occlusion off
     imu_samples: every sample of the IMU; None without one
     reports   : the star tracker's reports on frames solved during the motion (for the filter), by frame index
@@ -107,6 +109,7 @@ class Testbed:
     canvas: NDArray[Any]
     trajectory: Trajectory
     clocks: Clocks | None = None
+    air: Air | None = None
     obstacles: multibody.Obstacles | None = None
     telemetry: Telemetry | None = None
     imu_samples: imu.Increments | None = None
@@ -198,6 +201,7 @@ def build_testbed(
         np.empty((scene.camera.height_px, scene.camera.width_px), dtype),
         Trajectory.at_rest(lab_from_body_start(scene, mount, profiles), 1.0),
         build_clocks(scene.light, sources, scene.seed),
+        build_air(scene, band),
         build_obstacles(scene, vehicle),
         programs=programs,
         profiles=profiles,
@@ -206,6 +210,14 @@ def build_testbed(
         orbit=orbit,
         satellites=read_elements(satellites.file) if satellites and satellites.file else None,
     )
+
+
+def build_air(scene: Scene, band: Band) -> Air | None:
+    """The air over the scene's site; None without the section `light.air`."""
+    if not isinstance(scene.light, StarsConfig) or scene.light.air is None:
+        return None
+    stars = catalog.read_for("light.catalog", scene.light.catalog)
+    return Air.from_config(scene.light.air, scene.site, stars, band)
 
 
 def build_obstacles(scene: Scene, vehicle: multibody.VehicleModel) -> multibody.Obstacles | None:
@@ -250,7 +262,7 @@ def light_sources(scene: Scene, band: Band, orbit: CameraOrbit | None = None) ->
             raise InputError(f"light.variability_seed: {scene.light.catalog} has no variable stars; allowed: gaia_v8.0")
         stars = star_sources.varied(stars, scene.light.variability_seed)
     velocity_m_s: Floats | tuple[float, ...] = star_sources.AT_REST
-    if scene.light.bodies or scene.light.satellites or orbit:
+    if scene.light.bodies or scene.light.satellites or scene.light.air or orbit:
         velocity_m_s = state_from_earth(scene, orbit, 0.0).velocity_m_s
     return star_sources.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity(), band, velocity_m_s)
 
@@ -265,6 +277,8 @@ def bodies_during(testbed: Testbed, t_s: float) -> list[BodyLight]:
         return []
     observer = observer_during(testbed, t_s)
     bodies = bodies_from(scene.light.bodies, observer, testbed.band)
+    if sky := sky_during(testbed, t_s):
+        return [sky.body_seen(body) for body in bodies]
     if testbed.orbit is None:
         return bodies
     return [body for body in bodies if not hidden_by_earth(observer.from_earth.position_m, body.place.direction)]
@@ -274,13 +288,13 @@ def state_from_earth(scene: Scene, orbit: CameraOrbit | None, t_s: float) -> Gcr
     """The camera's state in the GCRS at a time since the scene's start: in its orbit, else at the site."""
     if orbit:
         return state_at(orbit, t_s)
-    time = scene.start_time + datetime.timedelta(seconds=t_s)
+    time = time_at(scene, t_s)
     return site_in_gcrs(time, tt_jd(time), scene.site)
 
 
 def observer_during(testbed: Testbed, t_s: float) -> Observer:
     """The camera among the bodies of the solar system, at a time since the scene's start."""
-    time = testbed.scene.start_time + datetime.timedelta(seconds=t_s)
+    time = time_at(testbed.scene, t_s)
     return observe_at(time, state_from_earth(testbed.scene, testbed.orbit, t_s))
 
 
@@ -289,7 +303,7 @@ def satellites_during(testbed: Testbed, view: View, t_s: float, index: int) -> l
     scene, found = testbed.scene, list[MovingLight]()
     config = scene.light.satellites if isinstance(scene.light, StarsConfig) else None
     if config and testbed.satellites:
-        time = scene.start_time + datetime.timedelta(seconds=t_s)
+        time = time_at(scene, t_s)
 
         def observer_at(after_s: float) -> GcrsState:
             return state_from_earth(scene, testbed.orbit, t_s + after_s)
@@ -316,6 +330,16 @@ def lights_during(testbed: Testbed, view: View, t_s: float) -> Sources:
     direction = star_sources.seen_at_velocity(near.place[:, :3], before, now)
     visible = ~hidden_by_earth(state_at(testbed.orbit, t_s).position_m, direction)
     return replace(near, place=np.column_stack([direction, np.zeros(len(near))])).take(visible)
+
+
+def time_at(scene: Scene, t_s: float) -> datetime.datetime:
+    """UTC at a time since the scene's start."""
+    return scene.start_time + datetime.timedelta(seconds=t_s)
+
+
+def sky_during(testbed: Testbed, t_s: float) -> Sky | None:
+    """The air at a time since the scene's start; None where the scene has none."""
+    return testbed.air.at(time_at(testbed.scene, t_s)) if testbed.air else None
 
 
 def build_tracker(testbed: Testbed) -> factory.Estimator:

@@ -26,7 +26,14 @@ from skysim.tracking.external import adapter
 from skysim.tracking.external.adapter import ExternalTracker
 from skysim.tracking.external.function import FunctionTracker
 from skysim.tracking.external.interface import OWN
-from skysim.tracking.onboard_model import assumed_camera, assumed_dome, assumed_lever, onboard_catalog, surveyed_dome
+from skysim.tracking.onboard_model import (
+    assumed_air,
+    assumed_camera,
+    assumed_dome,
+    assumed_lever,
+    onboard_catalog,
+    surveyed_dome,
+)
 from skysim.tracking.orbit_velocity import OrbitStarTracker, in_orbit
 from skysim.tracking.settings import assumed_settings
 
@@ -67,7 +74,7 @@ def build_tracker(scene: Scene, mount: Mount, sources: Sources, programs: Mappin
         return ExternalTracker.start(scene, camera, settings, adapter.star_map(stars, directions), programs)
     if orbit:
         return OrbitStarTracker(camera, stars, directions, settings, orbit)
-    return StarTracker(camera, stars, directions, settings)
+    return StarTracker(camera, stars, directions, settings, air=assumed_air(scene))
 
 
 def solve_frame(
@@ -84,9 +91,11 @@ def solve_frame(
     if isinstance(estimator, UserTracker):
         return estimator.solve_frame(frame, streak_px)
     try:
-        report = estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s)
         if isinstance(estimator, OrbitStarTracker):
+            report = estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s)
             return replace(report, attitude=estimator.corrected(report.attitude, frame.t_mid_s))
-        return report
+        if isinstance(estimator, StarTracker):
+            return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s)
+        return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s)
     except ImageError as error:
         return Report(Attitude(str(error)), Centroids.empty())

@@ -9,17 +9,20 @@ import numpy as np
 
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
+from estimator.catalog.refraction import SiteAir
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
 from skysim.core.types import Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig, RollingShutterConfig
-from skysim.scene.sections.light import DomeConfig
+from skysim.scene.sections.light import DomeConfig, StarsConfig
+from skysim.sources.air.air import weather_of
 from skysim.sources.catalog import require_catalog
 from skysim.sources.dome.layouts import registry
 from skysim.sources.dome.shell import surface
 from skysim.sources.dome.survey import survey_errors
+from skysim.sources.photometry import Band
 from skysim.tracking import dome_map_file
 
 
@@ -40,6 +43,17 @@ def assumed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
     if covariance_m2 is not None:
         sigma_m = float(survey_errors.across_sigma_m(position_m, covariance_m2).max())
     return LedMap(sources.id, position_m, *ellipsoid, board, sigma_m, covariance_m2, common_m)
+
+
+def assumed_air(scene: Scene) -> SiteAir | None:
+    """The air that the tracker undoes with `tracker.refraction`: the site, the date and the weather as they are."""
+    light, site = scene.light, scene.site
+    if not (scene.tracker.refraction and isinstance(light, StarsConfig) and light.air) or site.longitude_deg is None:
+        return None
+    band = Band.from_efficiency(scene.camera.detector.quantum_efficiency)
+    weather = weather_of(light.air, site, band)
+    air = weather.pressure_hpa, weather.temperature_c, weather.wavelength_m
+    return SiteAir(site.latitude_deg, site.longitude_deg, scene.start_time, *air)
 
 
 def assumed_lever(scene: Scene, mount: Mount) -> Lever:

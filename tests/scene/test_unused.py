@@ -39,6 +39,7 @@ DOME, SKY, BENCH = "afit_simsat", "shefex2", "collimated_display"
 DIRECT = {"light.led.drive": "{kind: direct}"}
 MOON = {"light.bodies": "{}", "start_time": "2012-06-24T21:00:00", "motion.start": "{ra_deg: 154.5, dec_deg: 5}"}
 ORBIT = "{kind: circular, altitude: 500 km, inclination_deg: 97}"
+AIR = {"light.air": "{}", "site": "{latitude_deg: 53, longitude_deg: 9}", "start_time": "2012-06-24T21:00:00"}
 CASES = [
     Case(DOME, {}, "tracker.catalog", "gaia_v8.0", {}),
     Case(DOME, {}, "tracker.limit_mag", "4", {}),
@@ -112,6 +113,8 @@ CASES = [
     ),
     Case(SKY, {}, "tracker.orbit_velocity", "false", {"orbit": ORBIT}),
     Case(SKY, {**MOON, "orbit": ORBIT}, "site.longitude_deg", "20", {}),
+    Case(SKY, {}, "tracker.refraction", "true", AIR),
+    Case(SKY, AIR, "light.air.seeing_arcsec", "1", {**AIR, "camera.focal_length": "200 mm"}),
     Case(SKY, {}, "vehicle.tilt_stop_deg", "20", {"vehicle.mount": "air_bearing"}),
     Case(DOME, {}, "vehicle.cmgs", CMGS, {"motion.control": "{actuators: cmgs}"}),
     Case(DOME, {"vehicle.imu": IMU}, "vehicle.imu.gyro.bias_time", "9 s", {"vehicle.imu.gyro.bias_deg_h": "1"}),

@@ -97,7 +97,8 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> StarImag
     points = points_of(body, phase_px @ np.linalg.inv(disc.px_from_radius).T)
     tracks, distance_m, cos_in = image_tracks(points, optics, all_poses, t_s, Emitter())
     xy_px, middle = tracks.xy_px, len(t_s) // 2
-    kernels = source_kernels(camera, xy_px[middle], points.radius_m, np.zeros(len(points), bool), distance_m, cos_in)
+    is_led, blur_px = np.zeros(len(points), bool), optics.blur_px
+    kernels = source_kernels(camera, xy_px[middle], points.radius_m, is_led, distance_m, cos_in, blur_px=blur_px)
     reach_px = kernels.reach_px.max() + 2
     low = np.floor(np.nanmin(xy_px, axis=(0, 1)) - reach_px).astype(np.int64)
     width, height = (np.ceil(np.nanmax(xy_px, axis=(0, 1)) + reach_px).astype(np.int64) - low + 1).tolist()
@@ -114,7 +115,8 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> StarImag
 def star_kernel(optics: Optics, xy_px: Floats) -> Kernels:
     """The kernel of a star at a place on the chip."""
     one = np.ones(1)
-    return source_kernels(optics.camera, xy_px[None], 0 * one, np.zeros(1, bool), one, one)
+    is_led = np.zeros(1, bool)
+    return source_kernels(optics.camera, xy_px[None], 0 * one, is_led, one, one, blur_px=optics.blur_px)
 
 
 class DiscImage(NamedTuple):

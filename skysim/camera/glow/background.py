@@ -105,14 +105,26 @@ def moonlight_nl(
     moon_zenith_deg: float,
     field_zenith_deg: float,
 ) -> Floats:
+    """`moonlight_through_nl` with the air masses of these zenith distances."""
+    masses = air_mass(moon_zenith_deg), air_mass(field_zenith_deg)
+    return moonlight_through_nl(separation_deg, phase_angle_deg, extinction_mag, *masses)
+
+
+def moonlight_through_nl(
+    separation_deg: float | Floats,
+    phase_angle_deg: float,
+    extinction_mag: float,
+    moon_masses: float,
+    field_masses: float | Floats,
+) -> Floats:
     """V surface brightness of moonlight scattered once by the air, in nanolamberts; shape of separation_deg.
 
     B = f(rho) I 10^(-0.4 k X(Zm)) (1 - 10^(-0.4 k X(Z))), I = 10^(-0.4 (3.84 + 0.026 |a| + 4e-9 a^4)),
     X = (1 - 0.96 sin^2 Z)^-1/2 (Krisciunas & Schaefer 1991, PASP 103, 1033: eqs 3, 15, 20).
     """
     illuminance = 10 ** (-0.4 * (3.84 + 0.026 * abs(phase_angle_deg) + 4e-9 * phase_angle_deg**4))
-    transmitted = 10 ** (-0.4 * extinction_mag * air_mass(moon_zenith_deg))
-    scattered = 1 - 10 ** (-0.4 * extinction_mag * air_mass(field_zenith_deg))
+    transmitted = 10 ** (-0.4 * extinction_mag * moon_masses)
+    scattered = 1 - 10 ** (-0.4 * extinction_mag * field_masses)
     return np.asarray(scattering(separation_deg) * illuminance * transmitted * scattered)
 
 
@@ -177,14 +189,21 @@ def angular_separation_deg(vectors: Floats, vector: Floats) -> Floats:
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(vectors, vector), axis=-1), vectors @ vector))
 
 
-def glow_map(glows: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band: Band) -> Floats:
+def glow_map(
+    glows: Sequence[Glow],
+    optics: Optics,
+    cam_from_lab: Rotation,
+    band: Band,
+    sky_light: Callable[[ViewingGeometry], Floats] | None = None,
+) -> Floats:
     """(h, w) electrons s^-1 px^-1 of all extended light, at nodes evenly spread over the chip up to its edges.
 
     `fill` interpolates the frame from it, to 1e-3 for maps as smooth as these (test_background). Cusps are smoothed:
     that of two_stops on the axis by up to 2 % within a node of it, and that at the Moon if it is in the field.
     One node is enough where no light depends on the position, or there is none.
+    sky_light : of the scene's air (`air_glow`), if it has any
     """
-    if all(glow.kind in ("uniform", "stray") for glow in glows):
+    if sky_light is None and all(glow.kind in ("uniform", "stray") for glow in glows):
         (toward, pixel_sr), shape = pixel_directions(np.array([optics.camera.center_px]), optics), (1, 1)
     else:
         toward, pixel_sr, shape = node_directions(optics)
@@ -192,6 +211,8 @@ def glow_map(glows: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band
     total = np.zeros(len(toward))
     for glow in glows:
         total += BACKGROUNDS[glow.kind](glow, view)
+    if sky_light is not None:
+        total += sky_light(view)
     return total.reshape(shape)
 
 

@@ -73,6 +73,7 @@ def source_kernels(
     distance_m: Floats,
     cos_field: Floats,
     disks: DiskImages | None = None,
+    blur_px: float = 0.0,
 ) -> Kernels:
     """The kernels of N sources.
 
@@ -82,10 +83,13 @@ def source_kernels(
     is_led     : (N,) LEDs, which may be out of focus by their own distance_m; stars are at infinity
     cos_field  : (N,) of the angle from the boresight
     disks      : their geometric images, NaN for stars; None draws all disks round
+    blur_px    : standard deviation of a blur of all of them
     Raises InputError for a source too far out of focus.
     """
     position = np.where(np.isnan(xy_px), camera.center_px, xy_px)
     extra = field_sigma_px(camera.psf, camera, position)
+    if blur_px:
+        extra = np.hypot(extra, blur_px)
     emitter = np.where(is_led, radius_m / distance_m, 0.0) * camera.focal_px
     blur = blur_radius_px(camera, np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf))
     size = np.array([camera.width_px, camera.height_px])
@@ -121,7 +125,7 @@ def source_kernels(
     # Contiguous: columns of a table would be another array type, for which the renderer is compiled once more.
     kind, sigma, reach, sharp = np.ascontiguousarray(np.array(cache.kernels).reshape(-1, 4)[rows].T)
     spans = np.array(cache.spans, dtype=np.int64).reshape(-1, 4)[rows]
-    if gaussian and camera.psf.corner_sigma_px:
+    if gaussian and (blur_px or camera.psf.corner_sigma_px):
         point = kind == GAUSS
         widening = np.hypot(sigma, extra) / np.where(point, sigma, 1)
         sigma, sharp = (np.where(point, a * widening, a) for a in (sigma, sharp))

@@ -171,6 +171,8 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
     if isinstance(trial, FlightTrial) and trial.start:
         check_random_start(scene, trial.start)
     near = getattr(trial.start if isinstance(trial, FlightTrial) else trial, "near", None)
+    if near and near.body == "zenith" and scene.site.longitude_deg is None:
+        raise InputError("trial.near.body: zenith requires site.longitude_deg in the scene")
     if near and not BODIES_YEARS[0] <= scene.start_time.year <= BODIES_YEARS[1]:
         first, last = BODIES_YEARS
         raise InputError(f"trial.near: start_time {scene.start_time} is outside {first} to {last}; allowed: none")

@@ -30,7 +30,7 @@ Declination = Annotated[Number, Field(ge=-90, le=90)]
 SeedKey = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*[._]seed$")]
 Tilt = Annotated[Number, Field(ge=0, le=90)]
 Angle = Annotated[Number, Field(ge=0, le=180)]
-BodyName = Literal["sun", "moon", "mercury", "venus", "mars", "jupiter", "saturn", "uranus", "neptune"]
+BodyName = Literal["zenith", "sun", "moon", "mercury", "venus", "mars", "jupiter", "saturn", "uranus", "neptune"]
 
 
 def check_rising(ends: tuple[float, float]) -> tuple[float, float]:
@@ -41,7 +41,7 @@ def check_rising(ends: tuple[float, float]) -> tuple[float, float]:
 
 
 class NearBody(ConfigModel):
-    """Directions within two angles of the Sun, the Moon or a planet, where it is at the scene's start.
+    """Directions within two angles of the Sun, the Moon, a planet or the zenith of `site`, at the scene's start.
 
     body : also where the scene's light has no bodies, so that frames with and without it can be compared
     """

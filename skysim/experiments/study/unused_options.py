@@ -31,10 +31,18 @@ from skysim.tracking import settings
 
 STREAK_ALGORITHMS = ("default", "streak")  # detectors and centroiders that use the streak measured by a gyro
 DYNAMICS = (
-    *("motion", "filter", "site", "vehicle.imu", "vehicle.wheels", "vehicle.fans", "vehicle.drag"),
+    *("motion", "filter", "vehicle.imu", "vehicle.wheels", "vehicle.fans", "vehicle.drag"),
     *("vehicle.disturbances", "vehicle.mass", "vehicle.inertia", "vehicle.center_of_mass", "vehicle.torque_limit"),
     "vehicle.tilt_stop_deg",
 )
+
+
+def on_ground(scene: Scene, trial: Trial) -> bool:
+    """Whether what a trial sees depends on the site."""
+    near = getattr(trial, "near", None)
+    return unused.seen_from_ground(scene) or (near is not None and near.body == "zenith")
+
+
 DETECTOR = tuple(
     f"camera.detector.{key}"
     for key in (
@@ -90,6 +98,12 @@ RULES = (
         lambda scene, trial: not isinstance(trial, FlightTrial),
         "a trial of one attitude does not simulate the motion",
         "trial.kind: flight",
+    ),
+    Rule(
+        ("site",),
+        lambda scene, trial: not isinstance(trial, FlightTrial) and not on_ground(scene, trial),
+        "a trial of one attitude does not simulate the motion, and its sky is that of space",
+        "trial.kind: flight, light.air, light.bodies with a site.longitude_deg, or trial.near.body: zenith",
     ),
     Rule(
         ("exposure.frames",),

@@ -19,6 +19,7 @@ from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import Files, location_of, parse_yaml
 from skysim.core.quantities.units import ConfigModel
 from skysim.scene.scene import Scene
+from skysim.scene.sections.air import NEGLIGIBLE_PX
 from skysim.scene.sections.camera import DetectorConfig
 from skysim.scene.sections.layouts import (
     CelestialConfig,
@@ -120,6 +121,20 @@ def seen_from_earth(scene: Scene) -> bool:
     """Whether bodies or satellites are seen from the Earth: from its center or from a site."""
     bodies, satellites = (getattr(scene.light, key, None) for key in ("bodies", "satellites"))
     return scene.orbit is None and bool(bodies or (satellites and satellites.file))
+
+
+def has_air(scene: Scene) -> bool:
+    return getattr(scene.light, "air", None) is not None
+
+
+def seen_from_ground(scene: Scene) -> bool:
+    """Whether what is seen depends on the place on the Earth."""
+    return has_air(scene) or (seen_from_earth(scene) and scene.site.longitude_deg is not None)
+
+
+def seeing_is_narrow(scene: Scene) -> bool:
+    air = getattr(scene.light, "air", None)
+    return air is not None and not air.seeing_px(scene.camera.focal_px)
 
 
 RULES = (
@@ -257,9 +272,9 @@ RULES = (
     ),
     Rule(
         ("site.longitude_deg", "site.height"),
-        lambda scene: not seen_from_earth(scene),
+        lambda scene: not (seen_from_earth(scene) or has_air(scene)),
         "nothing depends on the place on the Earth",
-        "light.bodies or light.satellites.file, without an orbit",
+        "light.bodies, light.satellites.file or light.air, without an orbit",
     ),
     Rule(
         ("site.height",),
@@ -269,10 +284,22 @@ RULES = (
     ),
     Rule(
         ("site.latitude_deg",),
-        lambda scene: earth_unused(scene) and not (seen_from_earth(scene) and scene.site.longitude_deg is not None),
+        lambda scene: earth_unused(scene) and not seen_from_ground(scene),
         "nothing depends on the Earth's rotation",
-        "vehicle.disturbances.earth_rotation, a vehicle.imu whose earth_rate is not none, or light.bodies with a"
-        " site.longitude_deg",
+        "vehicle.disturbances.earth_rotation, a vehicle.imu whose earth_rate is not none, or light.bodies or light.air"
+        " with a site.longitude_deg",
+    ),
+    Rule(
+        ("tracker.refraction",),
+        lambda scene: not has_air(scene) or external(scene),
+        "there is no air, or an external tracker that is not told of it",
+        "light.air and tracker.name: own",
+    ),
+    Rule(
+        ("light.air.seeing_arcsec",),
+        seeing_is_narrow,
+        f"its standard deviation is below {NEGLIGIBLE_PX:g} px",
+        "a longer camera.focal_length or smaller camera.pixel",
     ),
     Rule(
         ("site.x_azimuth_deg",),

@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, field_va
 
 from skysim.core.quantities.tolerance import LengthError
 from skysim.core.quantities.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
+from skysim.scene.sections.air import AirConfig
 from skysim.scene.sections.layouts import Layout, PixelsConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.scene.sections.orbit import SatellitesConfig
@@ -259,6 +260,7 @@ class StarsConfig(ConfigModel):
         means if left out
     bodies    : Sun, Moon and planets; none if left out
     satellites : artificial satellites; none if left out
+    air       : the atmosphere over `site`, which needs a longitude; none if left out
     occlusion : whether the vehicle's parts hide stars
     """
 
@@ -268,6 +270,7 @@ class StarsConfig(ConfigModel):
     variability_seed: Annotated[int, Field(ge=0)] | None = None
     bodies: BodiesConfig | None = None
     satellites: SatellitesConfig | None = None
+    air: AirConfig | None = None
     occlusion: bool = True
 
 

@@ -102,6 +102,7 @@ class TrackerConfig(ConfigModel):
         for smear and a rolling shutter. Without it, as in the published labs, both follow from the frame alone
     orbit_velocity : whether the tracker gets the velocity of the scene's `orbit`, and corrects for its aberration (5")
     brightest : only this many of the brightest detections of a frame are used
+    refraction : whether the tracker knows `site`, weather and the time, and undoes the refraction of `light.air`
     exposure_control : every frame is exposed for `exposure.time` if left out
     """
 
@@ -122,6 +123,7 @@ class TrackerConfig(ConfigModel):
     assumed_row_time_s: Annotated[Time, Field(ge=0)] | None = None
     gyro: bool = False
     orbit_velocity: bool = True
+    refraction: bool = False
     brightest: Annotated[int, Field(ge=3, le=1000)] | None = None
     assumed_camera_body_m: tuple[Length, Length, Length] | None = None
     survey: SurveyErrorsConfig = SurveyErrorsConfig()

@@ -25,6 +25,7 @@ from scipy import special
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.glow import background
+from skysim.camera.glow.air_glow import sky_light
 from skysim.camera.optics import Optics
 from skysim.camera.psf.kernel import build_kernel
 from skysim.camera.psf.otf import blur_radius_px, field_sigma_px
@@ -32,7 +33,7 @@ from skysim.camera.render import Poses, project
 from skysim.core.types import Floats, Sources
 from skysim.dynamics import multibody
 from skysim.simulation.checks.attitudes import Attitudes
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.testbed import Testbed, sky_during
 from skysim.sources.dome.led import irradiance_e_s_m2
 
 STEP = 1e-6  # relative displacement of a light, for the numerical derivative of its image
@@ -118,9 +119,8 @@ class CameraModel(NamedTuple):
         """The camera of a test bed, with the background at its initial attitude."""
         camera, detector = testbed.scene.camera, testbed.scene.camera.detector
         cam_from_lab = testbed.mount.cam_from_body * testbed.trajectory.lab_from_body[0].inv()
-        glow_e_s = float(
-            background.glow_map(testbed.scene.background, testbed.optics, cam_from_lab, testbed.band).mean()
-        )
+        glows, lit = testbed.scene.background, sky_light(sky_during(testbed, testbed.scene.exposure.first_s))
+        glow_e_s = float(background.glow_map(glows, testbed.optics, cam_from_lab, testbed.band, lit).mean())
         dark_e_s = detector.dark_e_s * 2.0**detector.doublings
         background_e = (glow_e_s + dark_e_s) * testbed.scene.exposure.time_s
         pattern_e2 = (detector.dsnu * dark_e_s * testbed.scene.exposure.time_s) ** 2 + detector.column_offset_e**2

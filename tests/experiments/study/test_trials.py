@@ -5,6 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy import units as u
+from astropy.coordinates import AltAz, EarthLocation, SkyCoord
+from astropy.time import Time
+from astropy.utils import iers
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
@@ -63,6 +67,23 @@ def test_attitudes_are_even_over_what_is_allowed(spec, key):
         assert stats.kstest(share, "uniform").pvalue > 1e-4
     assert (level >= 0).all()
     assert (level <= 1).all()
+
+
+def test_attitudes_near_the_zenith_are_at_their_altitudes():
+    """Of the site at the scene's start, by astropy's AltAz."""
+    site = {"latitude_deg": 53.1, "longitude_deg": 8.8}
+    near = {"body": "zenith", "off_deg": [57.0, 63.0]}
+    ready = setups.prepared_setup(SKY, {"start_time": "2012-10-29T22:00:00", "site": site, "trial.near": near})
+    rng = np.random.default_rng(4)
+    drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(200)])
+    x, y, z = drawn.apply(ready.testbed.mount.cam_from_body.inv().apply([0, 0, 1])).T
+    place = EarthLocation.from_geodetic(8.8, 53.1)
+    with iers.conf.set_temp("auto_download", False):
+        boresight = SkyCoord(np.arctan2(y, x) * u.rad, np.arcsin(z) * u.rad)
+        altitude_deg = boresight.transform_to(AltAz(location=place, obstime=Time("2012-10-29T22:00:00"))).alt.deg
+    assert altitude_deg.min() > 27 - 0.01  # aberration
+    assert altitude_deg.max() < 33 + 0.01
+    assert altitude_deg.std() > 1
 
 
 def test_attitudes_near_a_body_are_even_about_it():

@@ -24,7 +24,6 @@ from skysim.core import quaternion
 from skysim.core.paths import ROOT
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Frame, Mount, Trajectory, Truth
-from skysim.dynamics import multibody
 from skysim.experiments.study.execution.outcomes import (
     FAILED,
     Outcome,
@@ -45,7 +44,9 @@ from skysim.experiments.study.plan import (
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation import exposure, run
-from skysim.simulation.testbed import MARGIN_S, Testbed, exposure_window
+from skysim.simulation.exposure import occlusion_test
+from skysim.simulation.testbed import MARGIN_S, Testbed, exposure_window, sky_during
+from skysim.sources.air.air import topocentric_axes
 from skysim.sources.solar_system.observer import observe_from
 from skysim.sources.solar_system.places import place
 from skysim.tracking import factory
@@ -172,7 +173,7 @@ def flown_lights(testbed: Testbed, index: int) -> tuple[TrueLights, float]:
     window, rows = exposure_window(testbed.scene, index, testbed.exposures_s[index]), testbed.scene.camera.height_px
     middle_s, exposed_s = window.middle_s(rows), window.exposure_s * np.linspace(0, 1, STREAK_POSES)
     lab_from_body = testbed.trajectory.attitude_at(middle_s)
-    visible, xy_px, _ = visible_rows(testbed, lab_from_body)
+    visible, xy_px, _ = visible_rows(testbed, lab_from_body, middle_s)
     poses = render.poses(testbed.trajectory, testbed.mount, window.open_s + exposed_s)
     path_px = render.project(testbed.sources.take(visible), testbed.optics, poses)[0]
     streak_px = np.linalg.norm(np.diff(path_px, axis=0), axis=2).sum(axis=0)
@@ -218,8 +219,11 @@ def random_attitude(setup: Setup, rng: np.random.Generator) -> Rotation:
 
 
 def lab_from_body_pole(name: str, scene: Scene) -> Floats:
-    """(4,) wxyz of a rotation that takes z to the Sun, the Moon or a planet at the scene's start."""
-    x, y, z = place(name, observe_from(scene.start_time, scene.site)).direction
+    """(4,) wxyz of a rotation that takes z to the Sun, the Moon, a planet or the zenith at the scene's start."""
+    if name == "zenith":
+        x, y, z = topocentric_axes(scene.start_time, scene.site)[2]
+    else:
+        x, y, z = place(name, observe_from(scene.start_time, scene.site)).direction
     return zyz(math.atan2(y, x), math.acos(z), 0.0)
 
 
@@ -239,19 +243,24 @@ def visible_sources(testbed: Testbed, lab_from_body: Rotation) -> tuple[Floats, 
     return visible_rows(testbed, lab_from_body)[1:]
 
 
-def visible_rows(testbed: Testbed, lab_from_body: Rotation) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """As `visible_sources`, after the sources' (N,) rows in `testbed.sources`."""
+def visible_rows(
+    testbed: Testbed, lab_from_body: Rotation, t_s: float = 0.0
+) -> tuple[NDArray[np.int64], Floats, Floats]:
+    """As `visible_sources` at a time, after the sources' (N,) rows in `testbed.sources`."""
     R_lab_from_body = lab_from_body.as_matrix()
     R_cam_from_lab = testbed.mount.cam_from_body.as_matrix() @ R_lab_from_body.T
     poses = Poses(R_cam_from_lab[None], (R_lab_from_body @ testbed.mount.camera_body_m)[None])
     rows = in_view(testbed.sources, testbed.optics, poses)
-    near = testbed.sources.take(rows)
+    near, sky = testbed.sources.take(rows), sky_during(testbed, t_s)
+    if sky:
+        near = sky.stars_seen(near)
     tracks, _, _ = image_tracks(near, testbed.optics, poses, ANY_TIME_S, testbed.emitter)
     xy_px, (width_px, height_px) = tracks.xy_px[0], testbed.canvas.shape[::-1]
     x, y = xy_px.T
     visible = np.flatnonzero((x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5))
-    if testbed.obstacles is not None:
-        visible = visible[~multibody.occluded(testbed.obstacles, lab_from_body, near.take(visible))]
+    occludes = occlusion_test(testbed, lab_from_body, sky)
+    if occludes:
+        visible = visible[~occludes(near.take(visible))]
     duty_cycle = np.minimum(near.on_s / near.period_s, 1.0)
     electrons = tracks.rate_e_s[0] * duty_cycle * testbed.scene.exposure.time_s
     return rows[visible], xy_px[visible], electrons[visible]

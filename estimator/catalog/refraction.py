@@ -1,0 +1,147 @@
+"""Refraction as a tracker on the ground undoes it: where the zenith is at a time, and where stars are without air.
+
+Independent of the simulator: a two-term formula with the refractivity of Edlen, and low-precision sidereal time and
+precession, against its integral along the ray and its nutation.
+"""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimator.catalog.catalog import utc
+from estimator.core import checks
+from estimator.core.arrays import Floats
+
+J2000 = datetime.datetime(2000, 1, 1, 12)
+DAY_S = 86400.0
+ARCSEC_RAD = np.pi / 648_000
+LOWEST_RAD = np.radians(85.0)  # of the apparent zenith distance; the formula fails nearer to the horizon
+RAISING_STEPS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class SiteAir:
+    """The air over a site, as a tracker there knows it.
+
+    latitude_deg, longitude_deg : geodetic, east positive
+    epoch        : UTC of t = 0, naive or aware
+    pressure_hpa, temperature_c : at the site
+    wavelength_m : of the refracted light
+
+    Raises ImageError for a number out of range or a date that cannot be read.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    epoch: datetime.datetime | str
+    pressure_hpa: float = 1013.25
+    temperature_c: float = 15.0
+    wavelength_m: float = 600e-9
+
+    def __post_init__(self) -> None:
+        checks.number("latitude_deg", self.latitude_deg, -90, 90, "-90 to 90")
+        checks.number("longitude_deg", self.longitude_deg, -360, 360, "-360 to 360")
+        checks.number("pressure_hpa", self.pressure_hpa, 0, 1200, "0 to 1200")
+        checks.number("temperature_c", self.temperature_c, -100, 60, "-100 to 60")
+        checks.number("wavelength_m", self.wavelength_m, 3e-7, 3e-6, "3e-7 to 3e-6")
+        utc(self.epoch)
+
+    def zenith(self, t_s: float) -> Floats:
+        """(3,) zenith in ICRS axes t_s seconds after the epoch."""
+        epoch = utc(self.epoch)
+        if epoch.tzinfo is not None:
+            epoch = epoch.astimezone(datetime.UTC).replace(tzinfo=None)
+        days = (epoch - J2000).total_seconds() / DAY_S + t_s / DAY_S
+        return zenith_icrs(days, np.radians(self.latitude_deg), np.radians(self.longitude_deg))
+
+    def seen(self, directions: Floats, t_s: float) -> Floats:
+        """(N, 3) unit vectors of stars as they are seen, from those without air (N, 3), in ICRS axes."""
+        return raised(directions, self.zenith(t_s), *self._constants)
+
+    def without_air(self, directions: Floats, t_s: float) -> Floats:
+        """(N, 3) unit vectors of stars without air, from those seen (N, 3), in ICRS axes."""
+        return lowered(directions, self.zenith(t_s), *self._constants)
+
+    @property
+    def _constants(self) -> tuple[float, float]:
+        return refraction_constants(self.pressure_hpa, self.temperature_c, self.wavelength_m)
+
+
+def zenith_icrs(days: float, latitude_rad: float, longitude_rad: float) -> Floats:
+    """(3,) zenith of a site in ICRS axes, days after J2000.0 in UTC: within 20" (nutation, UT1 - UTC).
+
+    Greenwich mean sidereal time is 280.46061837 + 360.98564736629 d + 0.000387933 T^2 degrees; precession turns the
+    mean equator of date by the angles of IAU 1976 (Lieske et al. 1977, A&A 58, 1). Source: Meeus (1998), ch. 12, 21.
+    """
+    centuries = days / 36525
+    sidereal_deg = 280.46061837 + 360.98564736629 * days + 0.000387933 * centuries**2
+    hour = np.radians(sidereal_deg % 360) + longitude_rad
+    of_date = np.array([np.cos(latitude_rad) * np.cos(hour), np.cos(latitude_rad) * np.sin(hour), np.sin(latitude_rad)])
+    zeta, z, theta = ARCSEC_RAD * np.array(
+        [
+            2306.2181 * centuries + 0.30188 * centuries**2,
+            2306.2181 * centuries + 1.09468 * centuries**2,
+            2004.3109 * centuries - 0.42665 * centuries**2,
+        ]
+    )
+    return _about_z(zeta) @ _about_y(-theta) @ _about_z(z) @ of_date
+
+
+def _about_z(angle: float) -> Floats:
+    """(3, 3) components in axes turned by the angle about z."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+
+
+def _about_y(angle: float) -> Floats:
+    """(3, 3) components in axes turned by the angle about y."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, -s], [0, 1.0, 0], [s, 0, c]])
+
+
+def refraction_constants(pressure_hpa: float, temperature_c: float, wavelength_m: float) -> tuple[float, float]:
+    """A and B in radians of R = A tan z + B tan^3 z, z the apparent zenith distance.
+
+    A = g (1 - beta), B = -g (beta - g / 2), with the refractivity g of dry air (Edlen 1953, as in Stone 1996, PASP 108,
+    1051) and beta = 0.001254 T / 273.15 K, the scale height of the air over the Earth's radius. Within 0.2" of
+    ray tracing above 15 degrees of altitude.
+    """
+    per_um2, t_k = (1e-6 / wavelength_m) ** 2, temperature_c + 273.15
+    standard = 1e-6 * (64.328 + 29498.1 / (146 - per_um2) + 255.4 / (41 - per_um2))
+    refractivity = standard * pressure_hpa / 1013.25 * 288.15 / t_k
+    beta = 0.001254 * t_k / 273.15
+    return refractivity * (1 - beta), -refractivity * (beta - refractivity / 2)
+
+
+def lowered(directions: Floats, zenith: Floats, a_rad: float, b_rad: float) -> Floats:
+    """(N, 3) unit vectors turned away from the zenith (3,) by the refraction of constants A and B."""
+    directions, zenith_rad, up = _vertical(directions, zenith)
+    bending = _bending(zenith_rad, a_rad, b_rad)
+    return np.cos(bending)[:, None] * directions - np.sin(bending)[:, None] * up
+
+
+def raised(directions: Floats, zenith: Floats, a_rad: float, b_rad: float) -> Floats:
+    """(N, 3) unit vectors turned toward the zenith (3,): the inverse of `lowered`, by iteration to 1e-9 rad."""
+    directions, zenith_rad, up = _vertical(directions, zenith)
+    bending = np.zeros(len(directions))
+    for _ in range(RAISING_STEPS):
+        bending = _bending(np.maximum(zenith_rad - bending, 0.0), a_rad, b_rad)
+    return np.cos(bending)[:, None] * directions + np.sin(bending)[:, None] * up
+
+
+def _vertical(directions: Floats, zenith: Floats) -> tuple[Floats, Floats, Floats]:
+    """The checked directions, their zenith distances (N,), and (N, 3) unit vectors across them toward the zenith."""
+    directions = checks.floats("directions", directions, (None, 3))
+    cosine = directions @ zenith
+    across = zenith - cosine[:, None] * directions
+    sine = np.linalg.norm(across, axis=1)
+    return directions, np.arctan2(sine, cosine), across / np.maximum(sine, 1e-12)[:, None]
+
+
+def _bending(zenith_rad: Floats, a_rad: float, b_rad: float) -> Floats:
+    """(N,) A tan z + B tan^3 z, constant beyond LOWEST_RAD."""
+    tangent = np.tan(np.minimum(zenith_rad, LOWEST_RAD))
+    return a_rad * tangent + b_rad * tangent**3

@@ -1,0 +1,112 @@
+"""The sky's glow over a site at a time: airglow, moonlight and twilight, and nothing below the skyline."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from skysim.camera.glow.background import (
+    NANOLAMBERT_V0,
+    ViewingGeometry,
+    angular_separation_deg,
+    moonlight_through_nl,
+    scattering,
+)
+from skysim.core.types import Floats
+from skysim.scene.sections.air import AirGlowConfig
+from skysim.sources.air.air import Sky
+from skysim.sources.air.starlight import air_mass
+from skysim.sources.photometry import sky_radiance_e_s_m2_sr
+from skysim.sources.solar_system.observer import observe_from
+from skysim.sources.solar_system.places import Place, place
+
+SUN_MAG = -26.74
+ERG_NL = 1.02e-15  # erg s^-1 cm^-2 um^-1 arcsec^-2 in a nanolambert (Schaefer 1998)
+V_ZERO_MAG = -11.05  # of the V magnitude in erg s^-1 cm^-2 um^-1 (Schaefer 1998)
+NEAREST_DEG = 0.25  # to the Sun: the scattering functions are those at its limb
+
+
+def sky_light(sky: Sky | None) -> Callable[[ViewingGeometry], Floats] | None:
+    """The light of `air_glow` for a frame's geometry; None where the scene has no such glow."""
+    if sky is None or sky.air.config.glow is None:
+        return None
+    return partial(air_glow, sky.air.config.glow, sky)
+
+
+def air_glow(config: AirGlowConfig, sky: Sky, view: ViewingGeometry) -> Floats:
+    """(M,) electrons per second and pixel of the sky's glow, with the Sun's color; 0 below the skyline."""
+    zenith_rad = math.pi / 2 - sky.altitude_rad(view.toward_lab)
+    extinction_mag, above = sky.air.config.extinction_mag, ~sky.below_horizon(view.toward_lab)
+    nanolamberts = airglow_nl(config.dark_mag_arcsec2, zenith_rad, extinction_mag)
+    if config.moonlight:
+        nanolamberts = nanolamberts + moonlight(sky, view.toward_lab, zenith_rad)
+    if config.twilight:
+        sun = seen_place("sun", sky).direction
+        nanolamberts = nanolamberts + sunlight_nl(
+            angular_separation_deg(view.toward_lab, sun),
+            float(np.degrees(sky.altitude_rad(sun[None])[0])),
+            np.degrees(zenith_rad),
+            extinction_mag,
+        )
+    radiance = float(sky_radiance_e_s_m2_sr(0.0, view.band)) / NANOLAMBERT_V0
+    return np.asarray(radiance * nanolamberts * above * view.etendue_m2_sr())
+
+
+def seen_place(name: str, sky: Sky) -> Place:
+    """The place of a body, raised by refraction."""
+    at = place(name, observe_from(sky.time, sky.air.site))
+    return at._replace(direction=sky.air.refraction.apparent(at.direction[None], sky.zenith)[0])
+
+
+def diffuse_air_mass(zenith_rad: Floats | float) -> Floats:
+    """Length of the line of sight in a thin shell that emits or scatters, over that at the zenith; 5 on the horizon.
+
+    X = (1 - 0.96 sin^2 Z)^-1/2: van Rhijn's (1921) law with (R / (R + h))^2 = 0.96, h = 131 km (Garstang 1989, PASP
+    101, 306; KS91 eq. 3).
+    """
+    return np.asarray((1 - 0.96 * np.sin(zenith_rad) ** 2) ** -0.5)
+
+
+def airglow_nl(zenith_mag_arcsec2: float, zenith_rad: Floats, extinction_mag: float) -> Floats:
+    """The moonless sky: B(Z) = B(0) X 10^(-0.4 k (X - 1)), brighter toward the horizon, then extinct (KS91 eq. 2).
+
+    In nanolamberts, here and below; all of the sky, with zodiacal light and starlight, is taken as airglow.
+    """
+    masses = diffuse_air_mass(zenith_rad)
+    at_zenith = NANOLAMBERT_V0 * 10 ** (-0.4 * zenith_mag_arcsec2)
+    return np.asarray(at_zenith * masses * 10 ** (-0.4 * extinction_mag * (masses - 1)))
+
+
+def moonlight(sky: Sky, directions: Floats, zenith_rad: Floats) -> Floats:
+    """Moonlight scattered by the air (KS91) with the Moon where it is; none while it is below the horizon."""
+    moon = seen_place("moon", sky)
+    altitude_rad = float(sky.altitude_rad(moon.direction[None])[0])
+    if altitude_rad < 0:
+        return np.zeros(len(directions))
+    return moonlight_through_nl(
+        angular_separation_deg(directions, moon.direction),
+        math.degrees(moon.phase_rad),
+        sky.air.config.extinction_mag,
+        float(diffuse_air_mass(math.pi / 2 - altitude_rad)),
+        diffuse_air_mass(zenith_rad),
+    )
+
+
+def sunlight_nl(from_sun_deg: Floats, sun_altitude_deg: float, zenith_deg: Floats, extinction_mag: float) -> Floats:
+    """Sunlight scattered by the air, in twilight or by day, whichever is less: Schaefer (1998), Sky & Telescope 95, 57.
+
+    Twilight: B = 10^(-0.4 (m - m0 + 32.5 - h - Z / (360 k))) (100 / rho) (1 - 10^(-0.4 k)), a magnitude for each degree
+    of the Sun's altitude h; by day B = 10^(-0.4 (m - m0 + 43.27)) (1 - 10^(-0.4 k X)) (f(rho) t + 440000 (1 - t)),
+    with the scattering function f of moonlight, t = 10^(-0.4 k X(sun)) and all angles in degrees.
+    """
+    off_deg = np.maximum(from_sun_deg, NEAREST_DEG)
+    k, bright_mag = max(extinction_mag, 1e-3), SUN_MAG - V_ZERO_MAG
+    twilight = 10 ** (-0.4 * (bright_mag + 32.5 - sun_altitude_deg - zenith_deg / (360 * k)))
+    twilight = twilight * (100 / off_deg) * (1 - 10 ** (-0.4 * k))
+    passed = 10 ** (-0.4 * k * float(air_mass(np.radians(sun_altitude_deg))))
+    scattered = 1 - 10 ** (-0.4 * k * air_mass(np.radians(90 - zenith_deg)))
+    day = 10 ** (-0.4 * (bright_mag + 43.27)) * scattered * (scattering(off_deg) * passed + 440_000 * (1 - passed))
+    return np.asarray(np.minimum(twilight, day) / ERG_NL)

@@ -1,0 +1,1 @@
+"""The air over a site: refraction, extinction, scintillation and the horizon."""

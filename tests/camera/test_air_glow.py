@@ -1,0 +1,111 @@
+"""The sky's glow over a site: airglow, twilight and moonlight against published measurements and geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from skysim.camera.glow.air_glow import airglow_nl, diffuse_air_mass, seen_place, sky_light, sunlight_nl
+from skysim.camera.glow.background import NANOLAMBERT_V0, glow_map
+from skysim.scene.loader import load
+from skysim.scene.sections.light import SkyGlowConfig
+from skysim.simulation.testbed import Testbed, build_testbed, sky_during
+
+SITE = "{latitude_deg: 53.1, longitude_deg: 8.8, height: 10 m}"
+
+
+def bed(time: str, **glow: str) -> Testbed:
+    keys = {"start_time": time, "site": SITE, "light.air.glow.twilight": "true"}
+    return build_testbed(load("shefex2", keys | {f"light.air.{key}": value for key, value in glow.items()}))
+
+
+def mag_arcsec2(nanolamberts: float) -> float:
+    return float(-2.5 * np.log10(nanolamberts / NANOLAMBERT_V0))
+
+
+def test_airglow_grows_as_the_path_through_its_shell() -> None:
+    """The path through a thin shell 131 km above a sphere, by the geometry of two spheres."""
+    zenith = np.radians(np.linspace(0, 85, 50))
+    inner, outer = 6371.0, 6371.0 / np.sqrt(0.96)
+
+    def path_km(z: np.ndarray, r: float) -> np.ndarray:
+        return np.sqrt(r**2 - (inner * np.sin(z)) ** 2) - inner * np.cos(z)
+
+    thin = (path_km(zenith, outer + 0.01) - path_km(zenith, outer)) / 0.01
+    np.testing.assert_allclose(diffuse_air_mass(zenith), thin, rtol=1e-4)
+    dark = airglow_nl(21.7, zenith, 0.0)
+    assert mag_arcsec2(float(dark[0])) == pytest.approx(21.7, abs=1e-9)
+    assert (np.diff(dark) > 0).all()
+    assert airglow_nl(21.7, zenith, 0.3)[-1] < dark[-1] * 10 ** (-0.4 * 0.3 * 2)
+
+
+def test_twilight_at_the_zenith_is_that_of_paranal() -> None:
+    """Patat, Ugolnikov & Postylyakov (2006), A&A 455, 385: V = 11.84 + 1.518 x - 0.057 x^2, x = depression - 5.
+
+    Measured over 5 to 12 degrees, before the night's own light matters, where the air takes 0.13 mag. Schaefer's law,
+    a magnitude for each degree, is fainter at first.
+    """
+    for depression, tolerance_mag in ((5.0, 1.2), (6.0, 0.8), (8.0, 0.2), (10.0, 0.1), (12.0, 0.4)):
+        x = depression - 5
+        measured = 11.84 + 1.518 * x - 0.057 * x**2
+        ours = mag_arcsec2(float(sunlight_nl(np.array([90 + depression]), -depression, np.zeros(1), 0.13)[0]))
+        assert ours == pytest.approx(measured, abs=tolerance_mag)
+
+
+def test_daylight_is_as_bright_as_the_day() -> None:
+    """A clear sky has some 5,000 cd m^-2 near the Sun and 2,000 far from it; 10.8e4 cd m^-2 are 0 mag arcsec^-2."""
+    day = sunlight_nl(np.array([20.0, 60.0, 90.0]), 45.0, np.full(3, 45.0), 0.172)
+    assert (np.diff(day) < 0).all()
+    luminance = 10.8e4 * 10 ** (-0.4 * np.array([mag_arcsec2(one) for one in day]))
+    assert 3000 < luminance[0] < 9000
+    assert 1000 < luminance[2] < 3000
+    falling = [float(sunlight_nl(np.array([90.0]), h, np.array([45.0]), 0.172)[0]) for h in (5, 0, -3, -6, -12, -18)]
+    assert (np.diff(falling) < 0).all()
+
+
+def test_the_moon_lights_the_sky_only_above_the_horizon() -> None:
+    full_up, full_down = "2012-06-03T23:00:00", "2012-06-04T10:00:00"
+    mean = {}
+    for name, time in (("up", full_up), ("down", full_down)):
+        for moonlight in ("true", "false"):
+            testbed = bed(time, **{"glow.moonlight": moonlight, "glow.twilight": "false"})
+            sky = sky_during(testbed, 0.0)
+            assert sky is not None
+            moon = sky.altitude_rad(seen_place("moon", sky).direction[None])[0]
+            assert (moon > 0) == (name == "up")
+            pointing = up_pointing(testbed)
+            mean[name, moonlight] = float(glow_map((), testbed.optics, pointing, testbed.band, sky_light(sky)).mean())
+    assert mean["up", "true"] > 3 * mean["up", "false"]
+    assert mean["down", "true"] == mean["down", "false"]
+
+
+def up_pointing(testbed: Testbed) -> Rotation:
+    """cam_from_icrs of a camera that looks at the zenith."""
+    sky = sky_during(testbed, 0.0)
+    assert sky is not None
+    north, east, up = sky.axes
+    return Rotation.from_matrix(np.stack([-east, -north, up]))
+
+
+def test_below_the_skyline_there_is_no_glow() -> None:
+    testbed = bed("2012-06-24T23:00:00")
+    sky = sky_during(testbed, 0.0)
+    assert sky is not None
+    north, east, up = sky.axes
+    level = Rotation.from_matrix(np.stack([east, -up, north]))  # looks north along the ground
+    glow = glow_map((), testbed.optics, level, testbed.band, sky_light(sky))
+    half = len(glow) // 2
+    assert (glow[:half] > 0).all()
+    assert not glow[half + 1 :].any()
+    assert (np.diff(glow[: half - 1].mean(axis=1)) != 0).all()
+
+
+def test_dark_glow_is_that_of_the_told_sky() -> None:
+    """At the zenith, moonless and at night: as a background of kind sky of the same magnitude."""
+    testbed = bed("2012-12-13T23:00:00", **{"glow.dark_mag_arcsec2": "21", "extinction_mag": "0"})
+    ours = glow_map((), testbed.optics, up_pointing(testbed), testbed.band, sky_light(sky_during(testbed, 0.0)))
+    told = SkyGlowConfig(kind="sky", mag_arcsec2=21)
+    even = glow_map((told,), testbed.optics, up_pointing(testbed), testbed.band)
+    center = tuple(size // 2 for size in ours.shape)
+    assert ours[center] == pytest.approx(even[center], rel=2e-3)

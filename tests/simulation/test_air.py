@@ -1,0 +1,157 @@
+"""Frames of a scene with air: where the stars are, how bright, and what the skyline hides."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from skysim.core.errors import InputError
+from skysim.core.types import Truth
+from skysim.scene.loader import load
+from skysim.simulation.exposure import render_frame
+from skysim.simulation.testbed import Testbed, build_testbed, build_tracker, sky_during
+from skysim.tracking.factory import solve_frame
+
+TIME = "2012-06-24T23:00:00"
+AIR = {
+    "site": "{latitude_deg: 53.1, longitude_deg: 8.8, height: 10 m}",
+    "start_time": TIME,
+    "light.air.scintillation": "false",
+    "camera.detector.noise": "false",
+    "motion.jitter": "[]",
+    "light.occlusion": "false",
+}
+
+NO_AIR = ("start_time", "camera.detector.noise", "motion.jitter", "light.occlusion")
+
+
+def bed(**keys: str) -> Testbed:
+    return build_testbed(load("shefex2", AIR | keys))
+
+
+def level(testbed: Testbed, altitude_deg: float) -> Rotation:
+    """cam_from_icrs of a camera toward the south at an altitude, the zenith up in its image."""
+    sky = sky_during(testbed, 0.0)
+    assert sky is not None
+    north, _, up = sky.axes
+    h = np.radians(altitude_deg)
+    z, y = -np.cos(h) * north + np.sin(h) * up, -np.sin(h) * north - np.cos(h) * up
+    return Rotation.from_matrix(np.stack([np.cross(y, z), y, z]))
+
+
+def frame_at(testbed: Testbed, altitude_deg: float, index: int = 0) -> Truth:
+    """The truth of a frame of the camera at rest."""
+    cam_from_lab = level(testbed, altitude_deg)
+    return render_frame(testbed.at_rest(cam_from_lab.inv() * testbed.mount.cam_from_body, index), index)[1]
+
+
+def test_stars_are_raised_and_dimmed_in_the_frame() -> None:
+    """Against the same frame without air: up in the image by A tan Z + B tan^3 Z, fainter by Kasten & Young's law."""
+    testbed = bed()
+    empty = replace(testbed, air=None)
+    cam_from_lab = level(testbed, 30.0)
+    through = frame_at(testbed, 30.0).sources
+    at_rest = empty.at_rest(cam_from_lab.inv() * empty.mount.cam_from_body)
+    without = render_frame(at_rest, 0)[1].sources
+    both, ours, bare = np.intersect1d(through.id, without.id, return_indices=True)
+    assert len(both) > 30
+    focal_px = testbed.scene.camera.focal_px
+    x, y = ((without.xy_px[bare] - np.array(testbed.scene.camera.center_px)) / focal_px).T
+    tilt = np.radians(30.0)
+    altitude = np.arcsin((np.sin(tilt) - y * np.cos(tilt)) / np.sqrt(1 + x**2 + y**2))
+    moved_px = through.xy_px[ours] - without.xy_px[bare]
+    near_center = np.hypot(x, y) < 0.03
+    raised_arcsec = -moved_px[:, 1] / focal_px / np.radians(1 / 3600)
+    cot = 1 / np.tan(altitude)
+    wanted = 57.6 * cot - 0.066 * cot**3  # arcsec, sea level, 15 C, 0.7 um
+    np.testing.assert_allclose(raised_arcsec[near_center], wanted[near_center], rtol=0.02)
+    lost_mag = -2.5 * np.log10(through.electrons[ours] / without.electrons[bare])
+    inside = (np.abs(without.xy_px[bare] - testbed.scene.camera.center_px) < [280, 200]).all(axis=1)
+    h_deg = np.degrees(altitude)
+    masses = 1 / (np.sin(altitude) + 0.50572 * (h_deg + 6.07995) ** -1.6364)
+    np.testing.assert_allclose(lost_mag[inside], 0.172 * masses[inside], rtol=0.02)
+
+
+def test_the_skyline_hides_stars_and_the_truth_says_which() -> None:
+    low = {"light.air.horizon": "{azimuth_deg: [0, 180], altitude_deg: [20, 20]}"}
+    free, hilly = (frame_at(bed(**keys), 20.0) for keys in ({}, low))
+    gone = np.setdiff1d(free.sources.id, hilly.sources.id)
+    assert 0.2 < len(gone) / len(free.sources.id) < 0.8
+    assert np.isin(hilly.hidden, free.sources.id).all()
+    lowest_px = hilly.sources.xy_px[:, 1].max()
+    center_y = bed().scene.camera.center_px[1]
+    assert lowest_px < center_y + 3  # a circle of altitude 20 degrees rises by 4 px to the sides
+    np.testing.assert_array_equal(np.sort(hilly.hidden), np.sort(gone[np.isin(gone, hilly.hidden)]))
+    assert len(frame_at(bed(), -20.0).sources.id) == 0
+
+
+def test_stars_twinkle_by_frame_and_star() -> None:
+    testbed = bed(**{"light.air.scintillation": "true"})
+    sources = [frame_at(testbed, 60.0, index).sources for index in (0, 0, 1)]
+    same = [one.electrons for one in sources]
+    np.testing.assert_array_equal(same[0], same[1])
+    still = frame_at(bed(), 60.0).sources
+    ratios = []
+    for index in range(12):
+        seen = frame_at(testbed, 60.0, index).sources
+        _, a, b = np.intersect1d(seen.id, still.id, return_indices=True)
+        ratios.append(seen.electrons[a] / still.electrons[b])
+    ratio = np.concatenate(ratios)
+    camera, exposure_s = testbed.scene.camera, testbed.scene.exposure.time_s
+    variance = 10e-6 * 1.56**2 * camera.pupil_m ** (-4 / 3) / exposure_s / np.sin(np.radians(60)) ** 3
+    assert ratio.mean() == pytest.approx(1, abs=4 * np.sqrt(variance / len(ratio)))
+    assert ratio.var() == pytest.approx(variance, rel=0.25)
+
+
+def test_seeing_widens_images_by_its_variance() -> None:
+    """20" at the zenith before a lens of 200 mm; at 30 degrees of altitude 2^0.6 times that."""
+    keys, areas = {"camera.focal_length": "200 mm", "camera.f_number": "4"}, []
+    for seeing in ({}, {"light.air.seeing_arcsec": "20"}):
+        truth = frame_at(bed(**keys, **seeing), 30.0).sources
+        assert len(truth.id)
+        areas.append(float(np.median(truth.area_px)) / (4 * np.pi))
+    wanted_px = 20 / np.sqrt(8 * np.log(2)) * np.radians(1 / 3600) * 0.2 / 9.9e-6 * 2**0.6
+    assert areas[1] - areas[0] == pytest.approx(wanted_px**2, rel=0.03)
+
+
+def test_air_needs_a_site() -> None:
+    with pytest.raises(InputError, match=r"light\.air: requires site\.longitude_deg"):
+        load("shefex2", {"light.air": "{}"})
+    with pytest.raises(InputError, match="conflicts with a background of kind sky"):
+        load("shefex2", AIR | {"light.air.glow": "{}", "background": "[{kind: sky, mag_arcsec2: 21}]"})
+    with pytest.raises(InputError, match="outside 1972 to 2100"):
+        load("shefex2", AIR | {"light.air.glow": "{}", "start_time": "1960-01-01T00:00:00"})
+    with pytest.raises(InputError, match="outside the circle"):
+        load("shefex2", AIR | {"light.air.horizon": "{azimuth_deg: [0, 360], altitude_deg: [0, 20]}"})
+
+
+def errors_arcsec(testbed: Testbed, altitude_deg: float, index: int = 0) -> tuple[float, float]:
+    """Error across the boresight and rms residual in px of a frame."""
+    cam_from_lab = level(testbed, altitude_deg) if testbed.air else level(bed(), altitude_deg)
+    at_rest = testbed.at_rest(cam_from_lab.inv() * testbed.mount.cam_from_body, index)
+    frame, truth = render_frame(at_rest, index)
+    attitude = solve_frame(build_tracker(testbed), frame).attitude
+    assert attitude.cam_from_ref is not None
+    error = (attitude.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec() * 206264.8
+    return float(np.hypot(*error[:2])), attitude.rms_px
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("altitude_deg", [60.0, 25.0])
+def test_a_tracker_that_knows_its_site_is_as_good_as_without_air(altitude_deg: float) -> None:
+    """Noise is off: what is left is the centroiding's own error, and 0.3" of the ground's aberration."""
+    told, later = {"tracker.refraction": "true"}, {"exposure.first": "600 s"}
+    without = errors_arcsec(build_testbed(load("shefex2", {key: AIR[key] for key in NO_AIR})), altitude_deg)
+    undone = errors_arcsec(bed(**told), altitude_deg)
+    assert undone[0] < without[0] + 1.0
+    assert undone[1] == pytest.approx(without[1], abs=0.02)
+    assert errors_arcsec(bed(**told, **later), altitude_deg)[0] < without[0] + 1.0
+
+
+@pytest.mark.slow
+def test_a_tracker_that_does_not_is_off_by_the_refraction() -> None:
+    """57.6" tan(30 degrees) at an altitude of 60 degrees."""
+    assert errors_arcsec(bed(), 60.0)[0] == pytest.approx(33.2, abs=1.5)

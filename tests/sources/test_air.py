@@ -1,0 +1,201 @@
+"""Refraction, extinction and scintillation against other implementations and published numbers."""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.coordinates import AltAz, EarthLocation, SkyCoord
+from astropy.time import Time
+from astropy.utils import iers
+
+from skysim.core.types import Floats
+from skysim.scene.sections.air import AirConfig, HorizonConfig
+from skysim.scene.sections.vehicle import SiteConfig
+from skysim.sources import catalog, stars
+from skysim.sources.air import starlight
+from skysim.sources.air.air import Air, horizon_rad, mean_wavelength_m
+from skysim.sources.air.refraction import Atmosphere, Refraction, Weather, refraction_rad
+from skysim.sources.photometry import Band
+from skysim.sources.solar_system.bodies import BODIES, bodies_at
+from skysim.sources.solar_system.observer import observe_from
+
+BAND = Band.from_efficiency(0.5)
+ARCSEC = 1 / 206264.806
+SITES = [(53.1, 8.8, 10.0), (-23.2, -45.9, 600.0), (28.3, 343.5, 2390.0)]
+
+
+def site_of(place: tuple[float, float, float]) -> SiteConfig:
+    latitude, longitude, height = place
+    return SiteConfig(latitude_deg=latitude, longitude_deg=longitude, height=f"{height} m")
+
+
+def air_at(place: tuple[float, float, float], **keys: Any) -> Air:
+    return Air.from_config(AirConfig(**keys), site_of(place), catalog.read_for("x", "hipparcos_hp6.5"), BAND)
+
+
+def horizontal(axes: Floats, directions: Floats) -> tuple[Floats, Floats]:
+    """Azimuth and altitude in radians."""
+    north, east, up = axes @ directions.T
+    return np.arctan2(east, north), np.arcsin(up)
+
+
+@pytest.mark.parametrize("place", SITES)
+@pytest.mark.parametrize("weather", [(1013.25, 15.0, 0.5, 550.0), (980.0, -10.0, 0.0, 450.0), (700.0, 5.0, 0.9, 900.0)])
+def test_refraction_is_that_of_astropy(place: tuple[float, float, float], weather: tuple[float, ...]) -> None:
+    """Within 0.1" down to 15 degrees of AltAz with air less AltAz without: ERFA's A tan Z + B tan^3 Z.
+
+    The altitudes themselves are within the polar motion, which moves AltAz's zenith by up to 0.5", not ours.
+    """
+    pressure_hpa, temperature_c, humidity, nm = weather
+    time, stars_of = datetime.datetime(2012, 6, 24, 23, 10), catalog.read_for("x", "hipparcos_hp6.5").to_limit(4.0)
+    still = np.zeros(len(stars_of))
+    stars_of = replace(stars_of, pm_ra_rad_yr=still, pm_dec_rad_yr=still, parallax_rad=still)
+    directions = stars.apparent(stars_of, time, observe_from(time, site_of(place)).from_earth_m_s)
+    keys = {"pressure_hpa": pressure_hpa, "temperature_c": temperature_c, "humidity": humidity}
+    sky = air_at(place, **keys, wavelength=f"{nm} nm").at(time)
+    azimuth, altitude = horizontal(sky.axes, directions)
+    seen_azimuth, seen_altitude = horizontal(sky.axes, sky.air.refraction.apparent(directions, sky.zenith))
+    location = EarthLocation.from_geodetic(place[1] * u.deg, place[0] * u.deg, place[2] * u.m)
+    at = AltAz(location=location, obstime=Time(time))
+    air = {"pressure": pressure_hpa * u.hPa, "temperature": temperature_c * u.deg_C}
+    through_air = at.replicate_without_data(**air, relative_humidity=humidity, obswl=nm * u.nm)
+    with iers.conf.set_temp("auto_download", False):
+        icrs = SkyCoord(stars_of.ra_rad * u.rad, stars_of.dec_rad * u.rad)
+        without, seen = icrs.transform_to(at), icrs.transform_to(through_air)
+    high = seen_altitude > np.radians(15)
+    assert high.sum() > 50
+    raised = (seen_altitude - altitude) - (seen.alt.rad - without.alt.rad)
+    assert np.abs(raised[high]).max() < 0.1 * ARCSEC
+    np.testing.assert_allclose(seen_azimuth, azimuth, atol=1e-9)
+    assert np.abs(altitude - without.alt.rad).max() < 0.6 * ARCSEC
+
+
+def test_refraction_is_the_published_one() -> None:
+    """ERFA's documentation of `refco`: ray tracing of Hohenkerk & Sinclair, 1005 hPa, 7 C, 80 %, 574 nm."""
+    published = {
+        10: 10.27,
+        30: 33.61,
+        45: 58.16,
+        60: 100.51,
+        70: 158.63,
+        74: 200.35,
+        76: 229.45,
+        78: 267.44,
+        80: 319.13,
+    }
+    air = Atmosphere.from_weather(Weather(0.0, np.radians(50.0), 1005.0, 7.0, 0.8, 574e-9))
+    ours = refraction_rad(np.radians(list(published)), air) / ARCSEC
+    np.testing.assert_allclose(ours, list(published.values()), rtol=2.5e-4, atol=0.006)
+
+
+def test_refraction_on_the_horizon_is_half_a_degree() -> None:
+    """The Nautical Almanac's 34' at 1010 hPa and 10 C; a table is as good as the integral, and no air bends nothing."""
+    weather = Weather(0.0, np.radians(45.0), 1010.0, 10.0, 0.5, 590e-9)
+    air = Atmosphere.from_weather(weather)
+    assert refraction_rad(np.array([np.pi / 2]), air)[0] / ARCSEC / 60 == pytest.approx(34, abs=1)
+    zenith_rad = np.radians(np.linspace(0.1, 89.9, 300))
+    bending_rad = refraction_rad(zenith_rad, air)
+    np.testing.assert_allclose(
+        Refraction(weather).bending_rad(zenith_rad + bending_rad), bending_rad, atol=1e-3 * ARCSEC
+    )
+    none = Refraction(weather._replace(pressure_hpa=0.0))
+    assert not none.bending_rad(zenith_rad).any()
+
+
+def test_bodies_rise_as_stars_do() -> None:
+    """The Moon is raised by the refraction of its place, and its bright limb stays across the line of sight."""
+    time, air = datetime.datetime(2012, 6, 24, 20, 0), air_at(SITES[0])
+    for body in bodies_at(_bodies(), air.site, time, BAND):
+        sky = air.at(time)
+        seen = sky.body_seen(body)
+        moved = np.arccos(min(float(seen.place.direction @ body.place.direction), 1.0))
+        zenith_rad = np.arccos(body.place.direction @ sky.zenith)
+        assert moved == pytest.approx(float(air.refraction.bending_rad(np.array([zenith_rad]))[0]), abs=1e-7)
+        assert seen.place.direction @ sky.zenith >= body.place.direction @ sky.zenith
+        assert abs(seen.place.toward_sun @ seen.place.direction) < 1e-12
+        assert seen.id == BODIES[body.name].id
+        assert seen.flux_e_s_m2 < body.flux_e_s_m2
+
+
+def _bodies() -> Any:
+    from skysim.scene.sections.light import BodiesConfig
+
+    return BodiesConfig()
+
+
+def kasten_young(altitude_rad: Floats) -> Floats:
+    """Kasten & Young 1989, Applied Optics 28, 4735: another fit to another atmosphere."""
+    h_deg = np.degrees(altitude_rad)
+    return 1 / (np.sin(altitude_rad) + 0.50572 * (h_deg + 6.07995) ** -1.6364)
+
+
+def test_air_masses_are_those_of_kasten_and_young() -> None:
+    altitude = np.radians(np.linspace(3, 90, 200))
+    np.testing.assert_allclose(starlight.air_mass(altitude), kasten_young(altitude), rtol=0.012)
+    assert starlight.air_mass(np.array([0.0]))[0] == pytest.approx(38.75, abs=0.01)  # Pickering's own value
+    assert starlight.air_mass(np.array([-0.1]))[0] == starlight.air_mass(np.array([0.0]))[0]
+
+
+def test_stars_are_extinct_by_air_mass_and_color() -> None:
+    time, k, k_color = datetime.datetime(2012, 6, 24, 23), 0.3, -0.05
+    air = air_at(SITES[0], extinction_mag=k, color_extinction_mag=k_color)
+    cat = catalog.read_for("x", "hipparcos_hp6.5")
+    all_stars = stars.sources(cat, time, None, _identity(), BAND)
+    sky = air.at(time)
+    seen = sky.stars_seen(all_stars)
+    altitude = horizontal(sky.axes, seen.place[:, :3])[1]
+    high = (altitude > np.radians(5)) & np.isfinite(cat.b_v) & (np.abs(cat.b_v) > 0.01) & (cat.b_v < 1.5)
+    high &= cat.v_i != 0
+    lost_mag = -2.5 * np.log10(seen.strength / all_stars.strength)[high]
+    wanted = kasten_young(altitude[high]) * (k + k_color * np.maximum(cat.b_v[high], -0.3))
+    np.testing.assert_allclose(lost_mag, wanted, rtol=0.01)
+    assert seen.id.tolist() == all_stars.id.tolist()
+
+
+def _identity() -> Any:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.identity()
+
+
+def test_scintillation_is_young_s() -> None:
+    """Young (1967): sigma = 0.09 D^(-2/3) X^1.75 exp(-h / 8000 m) / sqrt(2 t), D in cm; C_Y is 1 in it, X^3 near it."""
+    for aperture_m, exposure_s, height_m in [(0.1, 1.0, 0.0), (0.5, 10.0, 2400.0)]:
+        variance = starlight.scintillation_variance(np.ones(1), aperture_m, exposure_s, height_m)[0] / starlight.C_Y**2
+        young = 0.09 * (aperture_m * 100) ** (-2 / 3) * np.exp(-height_m / 8000) / np.sqrt(2 * exposure_s)
+        assert np.sqrt(variance) == pytest.approx(young, rel=0.1)
+    assert starlight.scintillation_variance(np.array([2.0]), 0.1, 1.0, 0.0)[0] == pytest.approx(
+        8 * starlight.scintillation_variance(np.array([1.0]), 0.1, 1.0, 0.0)[0]
+    )
+    for variance in (1e-4, 0.3):
+        factor = starlight.scintillation(np.full(200_000, variance), np.random.default_rng(5))
+        assert factor.mean() == pytest.approx(1, abs=5 * np.sqrt(variance / 200_000))
+        assert factor.var() == pytest.approx(variance, rel=0.05)
+        assert factor.min() > 0
+
+
+def test_a_skyline_goes_around_the_circle() -> None:
+    skyline = HorizonConfig(azimuth_deg=(10, 90, 350), altitude_deg=(4, 20, 8))
+    at_deg = [350, 0, 10, 50, 220, 370]
+    wanted = [8, 6, 4, 12, 14, 4]
+    np.testing.assert_allclose(np.degrees(horizon_rad(skyline, np.radians(at_deg))), wanted, atol=1e-9)
+    sky = air_at(SITES[0], horizon={"azimuth_deg": (0, 180), "altitude_deg": (10, 30)}).at(
+        datetime.datetime(2012, 1, 1)
+    )
+    az, alt = np.radians([0.0, 0.0, 90.0, 90.0]), np.radians([9.9, 10.1, 19.9, 20.1])
+    directions = np.stack([np.cos(alt) * np.cos(az), np.cos(alt) * np.sin(az), np.sin(alt)], axis=1) @ sky.axes
+    assert sky.below_horizon(directions).tolist() == [True, False, True, False]
+
+
+def test_the_wavelength_of_refraction_is_the_band_s() -> None:
+    """Of a flat band from 400 to 1000 nm by Planck's law at 5772 K, counted in photons."""
+    m = np.linspace(400e-9, 1000e-9, 2001)
+    photons = m**-4 / np.expm1(0.014387769 / (m * 5772))
+    assert mean_wavelength_m(BAND) == pytest.approx(np.sum(m * photons) / np.sum(photons), abs=2e-9)
+    narrow = Band(np.array([500e-9, 501e-9]), np.ones(2))
+    assert mean_wavelength_m(narrow) == pytest.approx(500.5e-9, abs=0.1e-9)
