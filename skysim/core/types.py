@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -152,6 +153,11 @@ class Sources:
     def take(self, which: NDArray[Any]) -> Sources:
         """The chosen sources, by mask or index."""
         return Sources(*(getattr(self, name)[which] for name in self.__slots__))
+
+
+def with_sources(parts: Sequence[Sources]) -> Sources:
+    """All sources of several sets, in their order."""
+    return Sources(*(np.concatenate([getattr(part, name) for part in parts]) for name in Sources.__slots__))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,12 +1,15 @@
 """Render one frame with its truth.
 
 The order is that of the light: background and display glow, the sources integrated along their paths
-(camera/render.py), charge smear of the shutter, then the detector (camera/detector).
+(camera/render.py), ghosts and glare of the lens (camera/stray), charge smear of the shutter, then the detector
+(camera/detector).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +20,14 @@ from skysim.camera.detector.detector import add_snr_and_saturation, expose, satu
 from skysim.camera.discs.bodies import behind, concatenated, render_bodies
 from skysim.camera.discs.disc_image import Exposed
 from skysim.camera.glow import background, display_glow
-from skysim.camera.render import Poses, in_view, project, render
+from skysim.camera.render import OcclusionTest, Poses, in_view, project, render
+from skysim.camera.stray import ghosts, glare, wall
 from skysim.core.random_streams import DETECTOR, random_stream
-from skysim.core.types import Frame, Truth
+from skysim.core.types import Floats, Frame, Sources, SourceTruth, Truth, with_sources
 from skysim.dynamics import multibody
 from skysim.simulation.testbed import Testbed, bodies_during, exposure_window, time_tag_error_s
+from skysim.sources.dome.led import Emitter
+from skysim.sources.solar_system.bodies import BodyLight
 
 
 def render_frame(
@@ -40,27 +46,25 @@ def render_frame(
     light_e = testbed.canvas
     # The canvas is reused for every frame: the background overwrites it, all else is added to it.
     glow = background.glow_map(scene.background, testbed.optics, cam_from_lab, testbed.band)
-    background.fill(light_e, glow, window.exposure_s)
     camera_m = lab_from_body.apply(testbed.mount.camera_body_m)
+    if testbed.reflecting:
+        glow = glow + wall.wall_glow(testbed.reflecting, testbed.optics, cam_from_lab, camera_m, testbed.band)
+    background.fill(light_e, glow, window.exposure_s)
     black_level = display_glow.black_glow(scene.light, testbed.optics, cam_from_lab, camera_m, testbed.band)
     if black_level is not None:
         light_e += black_level * window.exposure_s
-    light = testbed.clocks.pulses_at(testbed.sources, middle_s) if testbed.clocks else testbed.sources
+    light = lit_sources(testbed, middle_s, cam_from_lab, camera_m)
     bodies = bodies_during(testbed, middle_s)
     occludes = partial(multibody.occluded, testbed.obstacles, lab_from_body) if testbed.obstacles else None
-    sources = render(
-        light_e,
-        light,
-        testbed.optics,
-        testbed.trajectory,
-        testbed.mount,
-        window,
-        testbed.emitter,
-        behind(bodies, occludes),
-    )
-    if bodies:
-        exposed = Exposed(testbed.optics, testbed.trajectory, testbed.mount, window)
-        sources = concatenated([sources, *render_bodies(light_e, bodies, exposed, occludes)])
+    exposed = Exposed(testbed.optics, testbed.trajectory, testbed.mount, window)
+    sources = draw_lights(light_e, light, bodies, exposed, testbed.emitter, occludes)
+    for number, ghost in enumerate(camera.ghosts, 1):
+        by_ghost = exposed._replace(optics=ghosts.ghost_optics(testbed.optics, ghost))
+        drawn = draw_lights(light_e, light, bodies, by_ghost, testbed.emitter, occludes)
+        sources = concatenated([sources, ghosts.as_ghosts(drawn, number)])
+    if camera.glare:
+        glare.add_glare(light_e, camera.glare)
+        sources = glare.without_glare(sources, camera.glare)
     smear(light_e, window.exposure_s, testbed.detector.shutter)
     # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
     sources = add_snr_and_saturation(sources, light_e, window.exposure_s, testbed.detector)
@@ -72,6 +76,29 @@ def render_frame(
     truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, occluded_ids(testbed, lab_from_body), seen)
     tagged_s = middle_s + time_tag_error_s(scene, index)
     return Frame(index, image, tagged_s, window.exposure_s, saturation_dn(camera.detector)), truth
+
+
+def lit_sources(testbed: Testbed, t_s: float, cam_from_lab: Rotation, camera_m: Floats) -> Sources:
+    """The stars, or the LEDs with their pulses about a time, and the images of LEDs that a camera there sees."""
+    sources = testbed.clocks.pulses_at(testbed.sources, t_s) if testbed.clocks else testbed.sources
+    if not (testbed.reflecting and testbed.reflecting.config.mirrors):
+        return sources
+    return with_sources(
+        [sources, wall.images_in_wall(testbed.reflecting, sources, testbed.optics, cam_from_lab, camera_m)]
+    )
+
+
+def draw_lights(
+    image: NDArray[Any],
+    lights: Sources,
+    bodies: Sequence[BodyLight],
+    exposed: Exposed,
+    emitter: Emitter,
+    occludes: OcclusionTest | None,
+) -> SourceTruth:
+    """Add stars or LEDs and bodies to the (H, W) image, in place; return the truth of those that gave light."""
+    sources = render(image, lights, *exposed, emitter, behind(bodies, occludes))
+    return concatenated([sources, *render_bodies(image, bodies, exposed, occludes)]) if bodies else sources
 
 
 def occluded_ids(testbed: Testbed, lab_from_body: Rotation) -> NDArray[np.int64]:

@@ -38,6 +38,7 @@ from skysim.sources.dome import display
 from skysim.sources.dome.clocks import Clocks, build_clocks
 from skysim.sources.dome.layouts.led_list import led_list
 from skysim.sources.dome.led import Emitter
+from skysim.sources.dome.reflection.dome import ReflectingDome, reflecting_dome
 from skysim.sources.dome.shell import surface
 from skysim.sources.photometry import Band
 from skysim.sources.solar_system.bodies import BodyLight, bodies_at
@@ -80,6 +81,7 @@ class Testbed:
     trajectory: the simulated motion, jitter included; telemetry: what the vehicle's computers did in it
     clocks    : the LED controllers' oscillators in this run; None where all light is steady
     obstacles : occluders of the sources; None where the scene has light.occlusion off
+    reflecting : the dome's reflections; None without light.reflection
     imu_samples: every sample of the IMU; None without one
     reports   : the star tracker's reports on frames solved during the motion (for the filter), by frame index
     update_statuses: the filter's status of each of those updates
@@ -102,6 +104,7 @@ class Testbed:
     trajectory: Trajectory
     clocks: Clocks | None = None
     obstacles: multibody.Obstacles | None = None
+    reflecting: ReflectingDome | None = None
     telemetry: Telemetry | None = None
     imu_samples: imu.Increments | None = None
     reports: dict[int, Report] = field(default_factory=dict)
@@ -190,6 +193,7 @@ def build_testbed(
         Trajectory.at_rest(lab_from_body_start(scene, mount, profiles), 1.0),
         build_clocks(scene.light, sources, scene.seed),
         build_obstacles(scene, vehicle),
+        reflecting_dome(scene.light, sources),
         programs=programs,
         profiles=profiles,
         controller=controller,

@@ -37,6 +37,8 @@ class Case(NamedTuple):
 
 DOME, SKY, BENCH = "afit_simsat", "shefex2", "collimated_display"
 DIRECT = {"light.led.drive": "{kind: direct}"}
+FLAT = {"light.surface": "{kind: flat, apex: 48 in}"}
+FLOOR = "{share: 0.5, depth: 1 m, radius: 1 m}"
 MOON = {"light.bodies": "{}", "start_time": "2012-06-24T21:00:00", "motion.start": "{ra_deg: 154.5, dec_deg: 5}"}
 CASES = [
     Case(DOME, {}, "tracker.catalog", "gaia_v8.0", {}),
@@ -71,6 +73,20 @@ CASES = [
         "light.layout.hardware_seed",
         "7",
         {"light.led.scatter": "0.1"},
+    ),
+    Case(
+        DOME,
+        FLAT | {"light.reflection": f"{{floor: {FLOOR}}}"},
+        "light.reflection.specular",
+        "0.1",
+        {"light.surface": "{kind: sphere, apex: 48 in, radius: 48 in}"},
+    ),
+    Case(
+        DOME,
+        FLAT | {"light.reflection": "{specular: 0.1}"},
+        "light.reflection.diffuse",
+        "0.5",
+        {"light.reflection": f"{{diffuse: 0.5, floor: {FLOOR}}}"},
     ),
     Case(SKY, {"camera.detector.dark_e_s": "0"}, "camera.detector.dsnu", "0.5", {"camera.detector.dark_e_s": "20"}),
     Case(SKY, {"camera.detector.hot_e_s": "0"}, "camera.detector.hot_pixels", "0.01", {"camera.detector.hot_e_s": "9"}),

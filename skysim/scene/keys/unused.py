@@ -116,6 +116,15 @@ def earth_unused(scene: Scene) -> bool:
     return not scene.vehicle.disturbances.earth_rotation and (imu is None or imu.earth_rate == "none")
 
 
+def flat_wall(scene: Scene) -> bool:
+    return isinstance(scene.light, DomeConfig) and scene.light.surface.kind == "flat"
+
+
+def has_floor(scene: Scene) -> bool:
+    reflection = getattr(scene.light, "reflection", None)
+    return reflection is not None and reflection.floor is not None
+
+
 def has_bodies(scene: Scene) -> bool:
     return getattr(scene.light, "bodies", None) is not None
 
@@ -192,6 +201,18 @@ RULES = (
         steady,
         "the drive direct has no pulses to time",
         "another light.led.drive",
+    ),
+    Rule(
+        ("light.reflection.specular", "light.reflection.refractive_index"),
+        flat_wall,
+        "a flat wall has no image of the LEDs on it",
+        "another light.surface",
+    ),
+    Rule(
+        ("light.reflection.diffuse",),
+        lambda scene: flat_wall(scene) and not has_floor(scene),
+        "the LEDs on a flat wall do not shine on it",
+        "light.reflection.floor, or another light.surface",
     ),
     Rule(
         ("light.layout.spacing", "light.layout.spread", "light.layout.lit", "light.layout.pwm_levels"),
