@@ -19,6 +19,7 @@ from skysim.core.quantities.utc import check_year
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import DomeConfig, Glow, Light
 from skysim.scene.sections.motion import MotionConfig, PointingConfig
+from skysim.scene.sections.thermal import ThermalConfig
 from skysim.scene.sections.tracker import FilterConfig, SurveyErrorsConfig, TrackerConfig
 from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
 
@@ -72,6 +73,7 @@ class Scene(ConfigModel):
     background: tuple[Glow, ...] = ()
     camera: CameraConfig
     exposure: ExposureConfig
+    thermal: ThermalConfig | None = None
     tracker: TrackerConfig = TrackerConfig()
     filter: FilterConfig | None = None
     name: Annotated[str, Field(exclude=True, alias=NAME_ALIAS)] = ""

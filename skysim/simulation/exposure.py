@@ -8,6 +8,7 @@ The order is that of the light: background and display glow, the sources integra
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Clock
+from skysim.camera import thermal
 from skysim.camera.detector.detector import add_snr_and_saturation, expose, saturation_dn, smear
 from skysim.camera.discs.bodies import behind, concatenated, render_bodies
 from skysim.camera.discs.disc_image import Exposed
@@ -41,6 +43,7 @@ def render_frame(
     scene, camera = testbed.scene, testbed.scene.camera
     window = exposure_window(scene, index, exposure_s)
     middle_s = window.middle_s(camera.height_px)
+    testbed = at_time(testbed, middle_s)
     lab_from_body = testbed.trajectory.attitude_at(middle_s)
     cam_from_lab = testbed.mount.cam_from_body * lab_from_body.inv()
     light_e = testbed.canvas
@@ -76,6 +79,14 @@ def render_frame(
     truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, occluded_ids(testbed, lab_from_body), seen)
     tagged_s = middle_s + time_tag_error_s(scene, index)
     return Frame(index, image, tagged_s, window.exposure_s, saturation_dn(camera.detector)), truth
+
+
+def at_time(testbed: Testbed, t_s: float) -> Testbed:
+    """The test bed with LEDs, mount and lens where the temperature of that time has moved them."""
+    if testbed.scene.thermal is None:
+        return testbed
+    hardware = thermal.Hardware(testbed.sources, testbed.mount, testbed.optics)
+    return replace(testbed, **thermal.at_time(testbed.scene.thermal, hardware, t_s)._asdict())
 
 
 def lit_sources(testbed: Testbed, t_s: float, cam_from_lab: Rotation, camera_m: Floats) -> Sources:

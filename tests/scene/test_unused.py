@@ -39,6 +39,11 @@ DOME, SKY, BENCH = "afit_simsat", "shefex2", "collimated_display"
 DIRECT = {"light.led.drive": "{kind: direct}"}
 FLAT = {"light.surface": "{kind: flat, apex: 48 in}"}
 FLOOR = "{share: 0.5, depth: 1 m, radius: 1 m}"
+WARMING = {
+    "thermal.mount_arcsec_k": "[1, 2, 3]",
+    "thermal.temperature": "{kind: linear, start_c: 21, rate_c_h: 30}",
+}
+STEADY = {"thermal.temperature": "{kind: steady, temperature_c: 25}"}
 MOON = {"light.bodies": "{}", "start_time": "2012-06-24T21:00:00", "motion.start": "{ra_deg: 154.5, dec_deg: 5}"}
 CASES = [
     Case(DOME, {}, "tracker.catalog", "gaia_v8.0", {}),
@@ -83,7 +88,7 @@ CASES = [
     ),
     Case(
         DOME,
-        FLAT | {"light.reflection": "{specular: 0.1}"},
+        FLAT,
         "light.reflection.diffuse",
         "0.5",
         {"light.reflection": f"{{diffuse: 0.5, floor: {FLOOR}}}"},
@@ -118,6 +123,9 @@ CASES = [
     Case(SKY, MOON, "site.latitude_deg", "-50", {**MOON, "site.longitude_deg": "20"}),
     Case(SKY, {}, "site.longitude_deg", "20", MOON),
     Case(SKY, MOON, "site.height", "9 km", {**MOON, "site.longitude_deg": "20"}),
+    Case(SKY, WARMING, "thermal.dome_ppm_k", "70", {}),
+    Case(DOME, WARMING, "thermal.anchor_height", "1 m", {"thermal.dome_ppm_k": "70"}),
+    Case(DOME, WARMING | STEADY, "thermal.speed", "60", WARMING),
     Case(SKY, {}, "vehicle.tilt_stop_deg", "20", {"vehicle.mount": "air_bearing"}),
     Case(DOME, {}, "vehicle.cmgs", CMGS, {"motion.control": "{actuators: cmgs}"}),
     Case(DOME, {"vehicle.imu": IMU}, "vehicle.imu.gyro.bias_time", "9 s", {"vehicle.imu.gyro.bias_deg_h": "1"}),

@@ -11,44 +11,30 @@ motion, pulses, shutter, vignetting.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import replace
 from functools import lru_cache
 
-import numpy as np
-
-from skysim.camera.optics import Optics
-from skysim.core.types import Floats, SourceTruth
+from skysim.camera.optics import Optics, ScaledOptics
+from skysim.core.types import SourceTruth
 from skysim.scene.sections.camera import DiskPsfConfig, GhostConfig
 from skysim.sources.false_lights import GHOST
 
 BLUR_PX = 0.7  # of a ghost's edge
 
 
-@dataclass(frozen=True, slots=True)
-class GhostOptics(Optics):
-    """The lens by one pair of its surfaces."""
-
-    magnification: float
-
-    def project(self, vectors_cam: Floats) -> Floats:
-        """As `Optics.project`, then mirrored and magnified about the principal point."""
-        center = np.array(self.camera.center_px)
-        return center - self.magnification * (Optics.project(self, vectors_cam) - center)
-
-
 @lru_cache(maxsize=64)
-def ghost_optics(optics: Optics, ghost: GhostConfig) -> GhostOptics:
+def ghost_optics(optics: Optics, ghost: GhostConfig) -> ScaledOptics:
     """The lens by the pair of surfaces of a ghost: its light is a share of the image's, spread over a disk.
 
     Its field is that of all lights whose ghosts reach the chip.
     """
     blur = DiskPsfConfig(kind="disk", radius_px=ghost.radius_px, sigma_px=BLUR_PX)
     camera = optics.camera.model_copy(update={"psf": blur})
-    corner_r = (camera.corner_px + ghost.radius_px) / camera.focal_px
-    field_rad = np.arctan(
-        np.tan(optics.field_rad) * corner_r * camera.focal_px / camera.corner_px / abs(ghost.magnification)
-    )
-    return GhostOptics(camera, optics.collecting_m2 * ghost.share, optics.fold_r, float(field_rad), ghost.magnification)
+    reach = (1 + ghost.radius_px / camera.corner_px) / abs(ghost.magnification)
+    field_rad = math.atan(math.tan(optics.field_rad) * reach)
+    scale = -ghost.magnification * getattr(optics, "scale", 1.0)
+    return ScaledOptics(camera, optics.collecting_m2 * ghost.share, optics.fold_r, field_rad, scale)
 
 
 def as_ghosts(lights: SourceTruth, number: int) -> SourceTruth:

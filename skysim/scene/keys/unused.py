@@ -300,6 +300,24 @@ RULES = (
         "vehicle.disturbances.earth_rotation, or a vehicle.imu whose earth_rate is not none",
     ),
     Rule(
+        ("thermal.dome_ppm_k", "thermal.anchor_height", "thermal.creep"),
+        lambda scene: not under_dome(scene),
+        "there is no dome to move",
+        "light of kind dome",
+    ),
+    Rule(
+        ("thermal.anchor_height",),
+        lambda scene: scene.thermal is not None and not scene.thermal.dome_ppm_k,
+        "the dome does not expand",
+        "thermal.dome_ppm_k",
+    ),
+    Rule(
+        ("thermal.speed",),
+        lambda scene: scene.thermal is not None and scene.thermal.temperature.kind == "steady",
+        "the temperature is steady",
+        "another thermal.temperature",
+    ),
+    Rule(
         ("vehicle.tilt_stop_deg",),
         lambda scene: scene.vehicle.mount == "free",
         "a free vehicle has no tilt stop",
