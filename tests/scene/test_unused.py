@@ -22,6 +22,10 @@ BOARDS = (
     "{kind: patch_boards, cap_deg: 27, pitch: 8 mm, boards: [{azimuth_deg: 0, tilt_deg: 1, leds: [0, 2, 4, 7, 8]}]}"
 )
 SPREAD = "{kind: patch_boards, cap_deg: 27, pitch: 8 mm, spacing: 60 mm}"
+PANEL = (
+    "{kind: lcd, pixels: [400, 300], pitch: 2 mm, points: {kind: celestial, cap_deg: 10, count: 20,"
+    " camera: [0 m, 0 m, 0 m], zenith_ra_deg: 0, zenith_dec_deg: 90}}"
+)
 SPIRAL = "{kind: fibonacci, count: 900, cap_deg: 27}"
 
 
@@ -70,6 +74,13 @@ CASES = [
     ),
     Case(DOME, {}, "tracker.survey.surface_seed", "5", {"light.surface.error": "1 mm"}),
     Case(DOME, DIRECT, "light.led.pwm_period", "7 ms", {"light.led.drive": "{kind: pwm}"}),
+    Case(
+        DOME,
+        FLAT | DIRECT | {"light.layout": PANEL, "light.led.spectrum": "630 nm"},
+        "light.led.color_scatter",
+        "5 nm",
+        {},
+    ),
     Case(DOME, DIRECT, "light.led.clock.offset_ppm", "7", {"light.led.drive": "{kind: pwm}"}),
     Case(DOME, {"light.layout": BOARDS}, "light.layout.lit", "[1, 2]", {"light.layout": SPREAD}),
     Case(

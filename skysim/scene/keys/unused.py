@@ -88,7 +88,12 @@ def listed_boards(scene: Scene) -> bool:
 
 def dome_draws_nothing(scene: Scene) -> bool:
     """Whether LEDs, their brightness and their pulses are all without anything random."""
-    if not isinstance(scene.light, DomeConfig) or not steady(scene) or scene.light.led.scatter:
+    if (
+        not isinstance(scene.light, DomeConfig)
+        or not steady(scene)
+        or scene.light.led.scatter
+        or scene.light.led.color_scatter_m
+    ):
         return False
     layout = scene.light.layout
     if isinstance(layout, FibersConfig) and layout.radius_variation:
@@ -195,6 +200,12 @@ RULES = (
         lambda scene: isinstance(scene.light, DomeConfig) and not isinstance(scene.light.led.drive, PwmConfig),
         "it is the period of the drive pwm",
         "light.led.drive: {kind: pwm}",
+    ),
+    Rule(
+        ("light.led.color_scatter",),
+        lambda scene: isinstance(getattr(scene.light, "layout", None), LcdConfig),
+        "the pixels of a panel share their light",
+        "another light.layout",
     ),
     Rule(
         ("light.led.clock",),
