@@ -22,6 +22,7 @@ AREAS = (
     "photographs",
     "lost_in_space",
     "frames",
+    "sky",
 )
 
 

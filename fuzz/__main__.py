@@ -41,6 +41,7 @@ TARGETS = {
     "stores": (),
     "answers": (),
     "profiles": (),
+    "orbits": (),
     "torques": (),
     "packets": (),
     "quantities": (),

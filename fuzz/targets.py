@@ -11,6 +11,8 @@ from functools import cache
 from io import BytesIO, TextIOWrapper
 from pathlib import Path
 
+import numpy as np
+
 from estimator.catalog import catalog, ptase
 from estimator.core.errors import ImageError
 from skysim.apps.cli import terminal
@@ -33,6 +35,8 @@ from skysim.sources import catalog as star_catalog
 from skysim.sources import photometry
 from skysim.sources.dome.layouts import listed
 from skysim.sources.dome.shell import point_cloud
+from skysim.sources.orbit.elements import gcrs_states, read_elements
+from skysim.sources.orbit.oem import read_oem
 from skysim.tracking import dome_map_file
 from skysim.tracking.external import interface
 
@@ -166,6 +170,13 @@ def answers(data: bytes) -> None:
         raise AssertionError(f"not printed as it is: {statuses[0]!r}")
 
 
+def orbits(data: bytes) -> None:
+    """An orbit or satellites: OEM, TLE, OMM."""
+    path = str(write_file(data, "orbit"))
+    rejects(lambda: read_oem(path, START).at(np.zeros(1)), InputError)
+    rejects(lambda: gcrs_states(read_elements(path), START, np.zeros(1)), InputError)
+
+
 def profiles(data: bytes) -> None:
     """An attitude file of any format, read as a scene's maneuver is."""
     path = write_file(data, "profile.csv")
@@ -195,6 +206,6 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
     target.__name__: target
     for target in (
         *(scenes, studies, overrides, fits, pictures, catalogs, maps, truths, calibrations),
-        *(tables, vehicles, stores, answers, profiles, torques, packets, quantities),
+        *(tables, vehicles, stores, answers, profiles, torques, packets, quantities, orbits),
     )
 }

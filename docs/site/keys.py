@@ -76,6 +76,8 @@ TEXTS = {
     "light.layout.catalog": CATALOG,
     "light.layout.file": "a CSV file",
     "light.surface.file": "a file of points",
+    "light.satellites.file": "a TLE file, or an OMM file as CSV, XML or JSON",
+    "orbit.file": "a TLE or OMM file, or with `kind: oem` a CCSDS OEM file",
     "camera.psf.file": "a table of numbers",
     "camera.detector.quantum_efficiency": f"a number to 1, or {stems(CURVE_FOLDER, 'csv')}, or a CSV file",
     "camera.detector.quantum_efficiency.curve": f"{stems(CURVE_FOLDER, 'csv')}, or a CSV file",

@@ -38,6 +38,9 @@ MIN_STREAK_PX, MIN_TRACK_PX = 2.0, 6.0
 # Of a line from the shared one, relative to it: the streaks of one frame differ in length and direction by rotation and
 # distortion, and the ends of bright ones are seen farther out.
 SAME_LINE = 0.5
+# A faint track breaks into pieces: blobs of at least MIN_PIECE_PX on one straight line, within PIECE_OFF_PX of it and
+# within an angle whose double has the cosine PARALLEL (20 degrees). Three of them, or two with a whole track, are one.
+MIN_PIECE_PX, PIECE_OFF_PX, PARALLEL, MIN_PIECES, MAX_PIECES = 3.0, 1.5, 0.77, 3, 200
 
 
 class Flag(IntFlag):
@@ -96,6 +99,8 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
         priors.saturation,
         FILTERED_NOISE * (image.dtype.kind in "iu"),
     )
+    if streak_px is None:
+        _join_tracks(flag, shape, blobs.xy_px)
     return replace(blobs, flag=flag | TEXT * text, streak_px=streak_px, turn_rad=turn_rad)
 
 
@@ -156,6 +161,53 @@ def _flags(
         flag[n] |= HUGE if side > max_side and not track else 0
         flag[n] |= TEXTURE if local_noise > MAX_NOISE_RATIO * typical_noise else 0
     return flag
+
+
+@jit
+def _join_tracks(flag: Ints, shape: Floats, xy: Floats) -> None:
+    """Flag the pieces into which a faint track breaks, in place: one track, however many blobs it is.
+
+    A piece is longer than wide and parallel to the line through it and another one; on a line through two pieces there
+    are MIN_PIECES, where one that is a track by itself counts twice. Round stars have no direction, so among the few
+    blobs with one the chance that three agree is below 1e-3.
+    """
+    piece = np.empty(MAX_PIECES, np.int64)
+    count = 0
+    for n in range(len(shape)):
+        length2 = hypot(shape[n, 3], shape[n, 4])
+        if length2 > max(MIN_PIECE_PX**2, 12 * shape[n, 2]) and not flag[n] & (HOT | HUGE) and count < MAX_PIECES:
+            piece[count] = n
+            count += 1
+    for i in range(count):
+        for j in range(i):
+            a, b = piece[i], piece[j]
+            x, y = xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1]
+            if not (_along(shape[a], x, y) and _along(shape[b], x, y)):
+                continue
+            weight = 0
+            for k in range(count):
+                if _on_line(shape[piece[k]], xy[piece[k]], xy[a], x, y):
+                    weight += 2 if flag[piece[k]] & TRACK else 1
+            if weight < MIN_PIECES:
+                continue
+            for k in range(count):
+                if _on_line(shape[piece[k]], xy[piece[k]], xy[a], x, y):
+                    flag[piece[k]] |= TRACK
+
+
+@jit
+def _along(shape: Floats, x: float, y: float) -> bool:
+    """Whether a blob's line is parallel to a vector."""
+    line_x, line_y = _double_angle(x, y)
+    along = shape[3] * line_x + shape[4] * line_y
+    return along > PARALLEL * hypot(shape[3], shape[4]) * (x * x + y * y)
+
+
+@jit
+def _on_line(shape: Floats, xy: Floats, start: Floats, x: float, y: float) -> bool:
+    """Whether a blob lies on a line from a start along a vector, and is parallel to it."""
+    off = (xy[0] - start[0]) * y - (xy[1] - start[1]) * x
+    return abs(off) < PIECE_OFF_PX * hypot(x, y) and _along(shape, x, y)
 
 
 @jit

@@ -28,7 +28,7 @@ from skysim.camera.psf.led_disk import DiskImages, disk_images
 from skysim.camera.psf.splat import Singles, add_gaussian, add_grid, add_round
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
+from skysim.core.types import Floats, Mount, Sources, SourceTruth, StarSources, Trajectory
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2, lit_moments_s
 
 STEP = 1.3  # largest motion in one piece of the exposure, in units of the image's sharpest feature (sigma)
@@ -36,6 +36,8 @@ MAX_PIECES = 100_000
 MIN_POSES, MAX_POSES = 9, 32_769  # number of poses in an exposure
 SINGLE_PIECE_STEPS = 0.4  # path length, in steps, up to which one piece is enough: error 1e-4 of the peak
 STILL_PX = 1e-3  # an image that moves less is drawn as one point
+MIN_TREE_STARS = 20_000  # below, a pass over all takes less than 50 us
+MAX_TREE_SHARE = 0.1  # of the sky, up to which a search tree finds a field's stars sooner than a pass over all
 MAX_PATCH_PIXELS = 1 << 20  # pixels of patches held in memory at once, or as many as the frame has
 
 OcclusionTest = Callable[[Sources], NDArray[np.bool_]]  # (N,) which of N sources are occluded
@@ -107,7 +109,7 @@ def render(
     all_poses = poses(trajectory, mount, t_s)
     # Coarse selection with a few poses, before the sources are projected at all of them.
     few_poses = Poses(*(samples[:: len(t_s) // 8] for samples in all_poses))
-    candidates = sources.take(in_view(sources, optics, few_poses))
+    candidates = sources.take(in_view(sources, optics, few_poses)) if sources.motion is None else sources
     if occluded:
         candidates = candidates.take(~occluded(candidates))
     emitter, middle = emitter or Emitter(), len(t_s) // 2
@@ -161,7 +163,7 @@ def image_tracks(
     sources: Sources, optics: Optics, poses: Poses, t_s: Floats, emitter: Emitter
 ) -> tuple[Tracks, Floats, Floats]:
     """The tracks of N sources, their mean distances (N,) in m (1 for stars) and mean field-angle cosines (N,)."""
-    xy, distance_m, cos_out, cos_in = project(sources, optics, poses)
+    xy, distance_m, cos_out, cos_in = project(sources, optics, poses, t_s - t_s[len(t_s) // 2])
     throughput = optics.throughput(cos_in)
     rate = np.where(
         sources.place[:, 3] > 0,
@@ -173,12 +175,17 @@ def image_tracks(
     return tracks, distance_m.mean(axis=0), cos_in.mean(axis=0)
 
 
-def project(sources: Sources, optics: Optics, poses: Poses) -> tuple[Floats, Floats, Floats, Floats]:
-    """Project N sources at each of K poses.
+NOW = np.zeros(1)
+
+
+def project(
+    sources: Sources, optics: Optics, poses: Poses, after_s: Floats = NOW
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Project N sources at each of K poses, (K,) seconds after mid-exposure.
 
     Returns (K, N, 2) pixels, (K, N) distances in m (1 for stars), (K, N) cosines at the emitter and at the aperture.
     """
-    offset = sources.place[None, :, :3] - sources.place[None, :, 3:] * poses.camera_m[:, None, :]
+    offset = sources.places_at(after_s) - sources.place[None, :, 3:] * poses.camera_m[:, None, :]
     distance = np.sqrt(np.einsum("knj,knj->kn", offset, offset))
     offset /= distance[:, :, None]
     cos_out = -np.einsum("knj,nj->kn", offset, sources.normal)
@@ -206,14 +213,21 @@ def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]
     """Rows of the sources within a cone about the boresight at any of these poses.
 
     The cone's half-angle is the field's circle, a quarter more for images that reach in from outside, and half of
-    the largest rotation between two poses for sources that cross the field between them.
+    the largest rotation between two poses for sources that cross the field between them. Stars in a small part of the
+    sky are looked up by direction, so the time is that of the stars in the field and not of those in the catalog.
     """
     boresight = np.ascontiguousarray(poses.cam_from_lab[:, 2])
     rotation_rad = np.arccos(np.clip(np.sum(boresight[1:] * boresight[:-1], axis=1), -1, 1)).max(initial=0.0)
     half_rad = 1.25 * optics.field_rad + 0.02 + rotation_rad / 2
-    span_rad = np.arccos(np.clip(boresight @ boresight[0], -1, 1)).max()
+    span_rad = float(np.arccos(np.clip(boresight @ boresight[0], -1, 1)).max())
     cos_limit, cos_any = (math.cos(min(angle_rad, math.pi)) for angle_rad in (half_rad, half_rad + span_rad))
-    return np.flatnonzero(_in_cone(sources.place, boresight, np.ascontiguousarray(poses.camera_m), cos_limit, cos_any))
+    place, camera_m = sources.place, np.ascontiguousarray(poses.camera_m)
+    deep = isinstance(sources, StarSources) and len(sources) >= MIN_TREE_STARS
+    if not deep or (1 - cos_any) / 2 > MAX_TREE_SHARE:
+        return np.flatnonzero(_in_cone(place, boresight, camera_m, cos_limit, cos_any))
+    assert isinstance(sources, StarSources)
+    near = sources.within(boresight[0], half_rad + span_rad)
+    return near[_in_cone(place[near], boresight, camera_m, cos_limit, cos_any)]
 
 
 @jit

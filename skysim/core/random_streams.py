@@ -12,6 +12,8 @@ import numpy as np
 
 # First number of the key under a scene's seed; the second is the frame, if it is drawn anew for each.
 DETECTOR, JITTER, IMU, AIR_CURRENT, LED_CLOCKS, CAMERA_TIMING = 1, 2, 3, 4, 5, 6
+VARIABLE_STARS = 11  # under `light.variability_seed`
+SATELLITES = 7  # under the seed of `light.satellites.random`
 
 
 def random_stream(seed: int, *key: int) -> np.random.Generator:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from skysim.core.quaternion import interpolate
@@ -134,6 +136,7 @@ class Sources:
     period_s, start_s, on_s : (N,) pulse train: lit from start_s for on_s in every period_s, by its controller's clock
     clock      : (N,) number of that clock, from 0; LEDs of one controller share it; 0 for a star
     magnitude  : (N,) V magnitude of a star; NaN for an LED
+    motion     : (N, 2, 3) velocity s^-1 and acceleration s^-2 of `place` at mid-exposure; None where nothing moves
     """
 
     id: NDArray[np.int64]
@@ -146,13 +149,37 @@ class Sources:
     on_s: Floats
     clock: NDArray[np.int64]
     magnitude: Floats
+    motion: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.id)
 
     def take(self, which: NDArray[Any]) -> Sources:
         """The chosen sources, by mask or index."""
-        return Sources(*(getattr(self, name)[which] for name in self.__slots__))
+        columns = (getattr(self, name) for name in Sources.__slots__)
+        return Sources(*(None if column is None else column[which] for column in columns))  # type: ignore[arg-type]
+
+    def places_at(self, after_s: Floats) -> Floats:
+        """(K, N, 3) places at K times after mid-exposure, (1, N, 3) where nothing moves; directions of any length."""
+        place = self.place[None, :, :3]
+        if self.motion is None:
+            return place
+        t = after_s[:, None, None]
+        return np.asarray(place + t * (self.motion[:, 0] + t / 2 * self.motion[:, 1]))
+
+
+class StarSources(Sources):
+    """Stars alone, which are found by direction: the time of a frame does not grow with the catalog."""
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Search tree of the directions."""
+        return cKDTree(self.place[:, :3])
+
+    def within(self, direction: Floats, angle_rad: float) -> NDArray[np.int64]:
+        """Rows, in order, of the stars within an angle of a unit vector."""
+        chord = 2.0 * np.sin(min(angle_rad, np.pi) / 2.0)
+        return np.array(self.tree.query_ball_point(direction, chord, return_sorted=True), dtype=np.int64)
 
 
 def with_sources(parts: Sequence[Sources]) -> Sources:
@@ -206,6 +233,28 @@ class BodyTruth:
 
 
 @dataclass(frozen=True, slots=True)
+class SatelliteTruth:
+    """An artificial satellite in a frame, at mid-exposure; `id` is its number in the sources' truth.
+
+    v_mag           : as it is lit;  sunlit : part of the Sun's disc that the satellite sees
+    ra_deg, dec_deg : apparent place in ICRS axes
+    rate_deg_s      : against the stars
+    range_km        : from the camera;  phase_deg : angle at the satellite between the Sun and the camera; NaN for a
+                      random one
+    """
+
+    id: int
+    name: str
+    v_mag: float
+    ra_deg: float
+    dec_deg: float
+    rate_deg_s: float
+    range_km: float
+    phase_deg: float
+    sunlit: float
+
+
+@dataclass(frozen=True, slots=True)
 class Truth:
     """The true state behind a frame.
 
@@ -216,6 +265,7 @@ class Truth:
     sources       : the sources on the frame
     hidden        : (M,) ids of sources that are occluded and would otherwise be on the frame at mid-exposure
     bodies        : Sun, Moon and planets on the frame
+    satellites    : artificial satellites on the frame
     """
 
     t_s: float
@@ -225,6 +275,7 @@ class Truth:
     sources: SourceTruth
     hidden: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     bodies: tuple[BodyTruth, ...] = ()
+    satellites: tuple[SatelliteTruth, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

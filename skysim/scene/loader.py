@@ -300,10 +300,12 @@ FILE_KEYS = (
     ("camera", "psf", "file"),
     ("camera", "calibration"),
     ("light", "catalog"),
+    ("light", "satellites", "file"),
     ("light", "surface", "file"),
     ("light", "layout", "catalog"),
     ("light", "layout", "file"),
     ("light", "layout", "points", "file"),
+    ("orbit", "file"),
     ("tracker", "catalog"),
     ("tracker", "map"),
 )

@@ -17,14 +17,16 @@ from skysim.core.quantities.tolerance import TimeError
 from skysim.core.quantities.units import ConfigModel, Number, Time
 from skysim.core.quantities.utc import check_year
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import DomeConfig, Glow, Light
+from skysim.scene.sections.light import DomeConfig, Glow, Light, StarsConfig
 from skysim.scene.sections.motion import MotionConfig, PointingConfig
+from skysim.scene.sections.orbit import Orbit
 from skysim.scene.sections.thermal import ThermalConfig
 from skysim.scene.sections.tracker import FilterConfig, SurveyErrorsConfig, TrackerConfig
 from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
 
 NAME_ALIAS = "(the file's name)"  # alias of Scene.name, not a valid key in a file
 
+EPHEMERIS_KEYS = "bodies", "satellites"  # of a light, whose places need the ephemeris
 BODIES_YEARS = 1972, 2100  # UTC has leap seconds from 1972; the ephemeris ends with 2100
 MAX_FRAMES, MAX_DURATION_S = 1_000_000, 86_400.0  # of a run, limited by memory
 
@@ -67,6 +69,7 @@ class Scene(ConfigModel):
     seed: Annotated[int, Field(ge=0)]
     start_time: Annotated[datetime.datetime, AfterValidator(check_year)]
     site: SiteConfig = SiteConfig()
+    orbit: Orbit | None = None
     vehicle: VehicleConfig
     motion: MotionConfig
     light: Annotated[Light, Field(discriminator="kind")]
@@ -92,6 +95,8 @@ class Scene(ConfigModel):
         if self.motion.start != "profile" and sky != isinstance(self.motion.start, PointingConfig):
             keys = "ra_deg, dec_deg, roll_deg" if sky else "roll_deg, pitch_deg, yaw_deg"
             raise ValueError(f"motion.start: light of kind {self.light.kind} requires {keys}")
+        if not sky and any(glow.kind == "faint_stars" for glow in self.background):
+            raise ValueError(f"background: faint_stars requires light of kind stars, not {self.light.kind}")
         read_s = getattr(self.camera.shutter, "row_time_s", 0.0) * (self.camera.height_px - 1)
         if read_s > 1 / self.exposure.rate_hz:
             raise ValueError(
@@ -104,8 +109,20 @@ class Scene(ConfigModel):
     def check_bodies(self) -> Scene:
         """Check that the ephemeris of the bodies holds at the scene's time."""
         first, last = BODIES_YEARS
-        if getattr(self.light, "bodies", None) and not first <= self.start_time.year <= last:
-            raise ValueError(f"light.bodies: start_time {self.start_time} is outside {first} to {last}")
+        sections = {"orbit": self.orbit, **{f"light.{key}": getattr(self.light, key, None) for key in EPHEMERIS_KEYS}}
+        for key, section in sections.items():
+            if section and not first <= self.start_time.year <= last:
+                raise ValueError(f"{key}: start_time {self.start_time} is outside {first} to {last}")
+        return self
+
+    @model_validator(mode="after")
+    def check_orbit(self) -> Scene:
+        """Check that an orbit is under the stars, and that satellites have a place from which they are seen."""
+        if self.orbit and not isinstance(self.light, StarsConfig):
+            raise ValueError(f"orbit: light of kind {self.light.kind} is in a laboratory; allowed: stars")
+        satellites = getattr(self.light, "satellites", None)
+        if satellites and satellites.file and not self.orbit and self.site.longitude_deg is None:
+            raise ValueError("light.satellites.file: requires the section orbit, or a site.longitude_deg")
         return self
 
     @model_validator(mode="after")

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,13 +22,21 @@ from skysim.camera.detector.detector import add_snr_and_saturation, expose, satu
 from skysim.camera.discs.bodies import behind, concatenated, render_bodies
 from skysim.camera.discs.disc_image import Exposed
 from skysim.camera.glow import background, display_glow
-from skysim.camera.render import OcclusionTest, Poses, in_view, project, render
+from skysim.camera.render import OcclusionTest, Poses, Window, in_view, project, render
 from skysim.camera.stray import ghosts, glare, wall
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Floats, Frame, Sources, SourceTruth, Truth, with_sources
 from skysim.dynamics import multibody
-from skysim.simulation.testbed import Testbed, bodies_during, exposure_window, time_tag_error_s
+from skysim.simulation.testbed import (
+    Testbed,
+    bodies_during,
+    exposure_window,
+    lights_during,
+    satellites_during,
+    time_tag_error_s,
+)
 from skysim.sources.dome.led import Emitter
+from skysim.sources.orbit.satellites import View, as_sources
 from skysim.sources.solar_system.bodies import BodyLight
 
 
@@ -56,14 +64,17 @@ def render_frame(
     black_level = display_glow.black_glow(scene.light, testbed.optics, cam_from_lab, camera_m, testbed.band)
     if black_level is not None:
         light_e += black_level * window.exposure_s
-    light = lit_sources(testbed, middle_s, cam_from_lab, camera_m)
+    view = view_of(testbed, window, cam_from_lab, middle_s)
+    light = with_images(testbed, lights_during(testbed, view, middle_s), cam_from_lab, camera_m)
     bodies = bodies_during(testbed, middle_s)
+    satellites = satellites_during(testbed, view, middle_s, index)
+    lights = Lights(light, bodies, as_sources(satellites, testbed.band) if satellites else None)
     occludes = partial(multibody.occluded, testbed.obstacles, lab_from_body) if testbed.obstacles else None
     exposed = Exposed(testbed.optics, testbed.trajectory, testbed.mount, window)
-    sources = draw_lights(light_e, light, bodies, exposed, testbed.emitter, occludes)
+    sources = draw_lights(light_e, lights, exposed, testbed.emitter, occludes)
     for number, ghost in enumerate(camera.ghosts, 1):
         by_ghost = exposed._replace(optics=ghosts.ghost_optics(testbed.optics, ghost))
-        drawn = draw_lights(light_e, light, bodies, by_ghost, testbed.emitter, occludes)
+        drawn = draw_lights(light_e, lights, by_ghost, testbed.emitter, occludes)
         sources = concatenated([sources, ghosts.as_ghosts(drawn, number)])
     if camera.glare:
         glare.add_glare(light_e, camera.glare)
@@ -76,9 +87,18 @@ def render_frame(
     clock.lap("detector")
     rate_cam = testbed.mount.cam_from_body.apply(testbed.trajectory.rate_at(middle_s))
     seen = tuple(body.truth() for body in bodies if body.id in sources.id)
-    truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, occluded_ids(testbed, lab_from_body), seen)
+    streaked = tuple(light.truth for light in satellites if light.truth.id in sources.id)
+    hidden_ids = occluded_ids(testbed, lab_from_body)
+    truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, hidden_ids, seen, streaked)
     tagged_s = middle_s + time_tag_error_s(scene, index)
     return Frame(index, image, tagged_s, window.exposure_s, saturation_dn(camera.detector)), truth
+
+
+def view_of(testbed: Testbed, window: Window, cam_from_lab: Rotation, middle_s: float) -> View:
+    """What the camera can see in the exposure."""
+    duration_s = window.close_s(testbed.scene.camera.height_px) - window.open_s
+    turn_rad = float(np.linalg.norm(testbed.trajectory.rate_at(middle_s))) * duration_s
+    return View(cam_from_lab.inv().apply([0.0, 0.0, 1.0]), testbed.optics.field_rad, turn_rad, duration_s)
 
 
 def at_time(testbed: Testbed, t_s: float) -> Testbed:
@@ -89,27 +109,33 @@ def at_time(testbed: Testbed, t_s: float) -> Testbed:
     return replace(testbed, **thermal.at_time(testbed.scene.thermal, hardware, t_s)._asdict())
 
 
-def lit_sources(testbed: Testbed, t_s: float, cam_from_lab: Rotation, camera_m: Floats) -> Sources:
-    """The stars, or the LEDs with their pulses about a time, and the images of LEDs that a camera there sees."""
-    sources = testbed.clocks.pulses_at(testbed.sources, t_s) if testbed.clocks else testbed.sources
+def with_images(testbed: Testbed, sources: Sources, cam_from_lab: Rotation, camera_m: Floats) -> Sources:
+    """The sources, and the images of LEDs that a camera there sees in the wall."""
     if not (testbed.reflecting and testbed.reflecting.config.mirrors):
         return sources
-    return with_sources(
-        [sources, wall.images_in_wall(testbed.reflecting, sources, testbed.optics, cam_from_lab, camera_m)]
-    )
+    images = wall.images_in_wall(testbed.reflecting, sources, testbed.optics, cam_from_lab, camera_m)
+    return with_sources([sources, images])
+
+
+class Lights(NamedTuple):
+    """All that shines in an exposure; no satellites are None."""
+
+    sources: Sources
+    bodies: Sequence[BodyLight]
+    satellites: Sources | None
 
 
 def draw_lights(
-    image: NDArray[Any],
-    lights: Sources,
-    bodies: Sequence[BodyLight],
-    exposed: Exposed,
-    emitter: Emitter,
-    occludes: OcclusionTest | None,
+    image: NDArray[Any], lights: Lights, exposed: Exposed, emitter: Emitter, occludes: OcclusionTest | None
 ) -> SourceTruth:
-    """Add stars or LEDs and bodies to the (H, W) image, in place; return the truth of those that gave light."""
-    sources = render(image, lights, *exposed, emitter, behind(bodies, occludes))
-    return concatenated([sources, *render_bodies(image, bodies, exposed, occludes)]) if bodies else sources
+    """Add all lights to the (H, W) image, in place; return the truth of those that gave light."""
+    hidden = behind(lights.bodies, occludes)
+    truths = [render(image, lights.sources, *exposed, emitter, hidden)]
+    if lights.bodies:
+        truths += render_bodies(image, lights.bodies, exposed, occludes)
+    if lights.satellites is not None:
+        truths.append(render(image, lights.satellites, *exposed, None, hidden))
+    return concatenated(truths) if len(truths) > 1 else truths[0]
 
 
 def occluded_ids(testbed: Testbed, lab_from_body: Rotation) -> NDArray[np.int64]:

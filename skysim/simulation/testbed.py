@@ -21,7 +21,7 @@ from skysim.camera.render import Window
 from skysim.core.errors import InputError
 from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import CAMERA_TIMING, random_stream
-from skysim.core.types import Floats, Mount, Sources, Telemetry, Trajectory
+from skysim.core.types import Floats, Mount, Sources, StarSources, Telemetry, Trajectory
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.controllers.adapter import ControllerSource
 from skysim.dynamics.controllers.interface import Factory
@@ -40,9 +40,13 @@ from skysim.sources.dome.layouts.led_list import led_list
 from skysim.sources.dome.led import Emitter
 from skysim.sources.dome.reflection.dome import ReflectingDome, reflecting_dome
 from skysim.sources.dome.shell import surface
+from skysim.sources.orbit.camera_orbit import CameraOrbit, build_orbit, state_at
+from skysim.sources.orbit.earth import hidden_by_earth
+from skysim.sources.orbit.elements import Elements, read_elements
+from skysim.sources.orbit.satellites import MovingLight, View, known_satellites, random_satellites
 from skysim.sources.photometry import Band
-from skysim.sources.solar_system.bodies import BodyLight, bodies_at
-from skysim.sources.solar_system.observer import observe_from
+from skysim.sources.solar_system.bodies import BodyLight, bodies_from
+from skysim.sources.solar_system.observer import GcrsState, Observer, observe_at, site_in_gcrs, tt_jd
 from skysim.tracking import factory, settings
 from skysim.tracking.external.interface import TRACKERS
 
@@ -90,6 +94,8 @@ class Testbed:
     profiles  : attitude profiles of the maneuvers of that kind, in their order
     controller, tracker : given to `skysim.simulate` in place of those that the scene names
     endless   : frames continue without end, whatever the scene's number; only for `live`
+    orbit     : the camera's; None without the section
+    satellites: elements of `light.satellites.file`
     """
 
     scene: Scene
@@ -115,6 +121,8 @@ class Testbed:
     controller: Factory | None = None
     tracker: factory.Estimator | None = None
     endless: bool = False
+    orbit: CameraOrbit | None = None
+    satellites: Elements | None = None
 
     @property
     def frames(self) -> float:
@@ -179,7 +187,8 @@ def build_testbed(
     dtype = np.float32 if scene.camera.detector.noise else np.float64
     mount = multibody.camera_mount(vehicle)
     profiles = load_profiles(scene, mount, profile)
-    sources = light_sources(scene, band)
+    orbit, satellites = build_orbit(scene.orbit, scene.start_time), getattr(scene.light, "satellites", None)
+    sources = light_sources(scene, band, orbit)
     return Testbed(
         scene,
         vehicle,
@@ -198,6 +207,8 @@ def build_testbed(
         profiles=profiles,
         controller=controller,
         tracker=tracker,
+        orbit=orbit,
+        satellites=read_elements(satellites.file) if satellites and satellites.file else None,
     )
 
 
@@ -231,26 +242,84 @@ def lab_from_body_start(scene: Scene, mount: Mount, profiles: Sequence[AttitudeS
     return guidance.start_attitude(scene.motion, profiles)
 
 
-def light_sources(scene: Scene, band: Band) -> Sources:
-    """All light sources of the scene, with strengths in the camera's band."""
+def light_sources(scene: Scene, band: Band, orbit: CameraOrbit | None = None) -> Sources:
+    """All light sources of the scene at its start, with strengths in the camera's band."""
     if isinstance(scene.light, DomeConfig):
         return dome.sources(scene.light, band)
     stars = catalog.read_for("light.catalog", scene.light.catalog)
     if isinstance(scene.light, CollimatedDisplayConfig):
         return display.display_sources(scene.light, stars, scene.start_time, band)
+    if scene.light.variability_seed is not None:
+        if not stars.scatter_mag.any():
+            raise InputError(f"light.variability_seed: {scene.light.catalog} has no variable stars; allowed: gaia_v8.0")
+        stars = star_sources.varied(stars, scene.light.variability_seed)
     velocity_m_s: Floats | tuple[float, ...] = star_sources.AT_REST
-    if scene.light.bodies:
-        velocity_m_s = observe_from(scene.start_time, scene.site).from_earth_m_s
+    if scene.light.bodies or scene.light.satellites or orbit:
+        velocity_m_s = state_from_earth(scene, orbit, 0.0).velocity_m_s
     return star_sources.sources(stars, scene.start_time, scene.light.limit_mag, Rotation.identity(), band, velocity_m_s)
 
 
 def bodies_during(testbed: Testbed, t_s: float) -> list[BodyLight]:
-    """Sun, Moon and planets at a time since the scene's start; none where the scene has no `light.bodies`."""
+    """Sun, Moon and planets at a time since the scene's start; none where the scene has no `light.bodies`.
+
+    In an orbit those whose center is behind the Earth are left out.
+    """
     scene = testbed.scene
     if not isinstance(scene.light, StarsConfig) or scene.light.bodies is None:
         return []
+    observer = observer_during(testbed, t_s)
+    bodies = bodies_from(scene.light.bodies, observer, testbed.band)
+    if testbed.orbit is None:
+        return bodies
+    return [body for body in bodies if not hidden_by_earth(observer.from_earth.position_m, body.place.direction)]
+
+
+def state_from_earth(scene: Scene, orbit: CameraOrbit | None, t_s: float) -> GcrsState:
+    """The camera's state in the GCRS at a time since the scene's start: in its orbit, else at the site."""
+    if orbit:
+        return state_at(orbit, t_s)
     time = scene.start_time + datetime.timedelta(seconds=t_s)
-    return bodies_at(scene.light.bodies, scene.site, time, testbed.band)
+    return site_in_gcrs(time, tt_jd(time), scene.site)
+
+
+def observer_during(testbed: Testbed, t_s: float) -> Observer:
+    """The camera among the bodies of the solar system, at a time since the scene's start."""
+    time = testbed.scene.start_time + datetime.timedelta(seconds=t_s)
+    return observe_at(time, state_from_earth(testbed.scene, testbed.orbit, t_s))
+
+
+def satellites_during(testbed: Testbed, view: View, t_s: float, index: int) -> list[MovingLight]:
+    """The satellites in a frame, those of the file first; none where the scene has no `light.satellites`."""
+    scene, found = testbed.scene, list[MovingLight]()
+    config = scene.light.satellites if isinstance(scene.light, StarsConfig) else None
+    if config and testbed.satellites:
+        time = scene.start_time + datetime.timedelta(seconds=t_s)
+
+        def observer_at(after_s: float) -> GcrsState:
+            return state_from_earth(scene, testbed.orbit, t_s + after_s)
+
+        found += known_satellites(testbed.satellites, config.standard_mag, view, time, observer_at)
+    if config and config.random:
+        found += random_satellites(config.random, view, index)
+    return found
+
+
+def lights_during(testbed: Testbed, view: View, t_s: float) -> Sources:
+    """The light sources as they are in a frame: LEDs with their clocks' pulses, stars by the velocity in the orbit.
+
+    In a low orbit the velocity turns by a degree in 15 s, so the aberration is each frame's own. It is that of
+    mid-exposure: in a second a star moves by 0.006".
+    """
+    if testbed.clocks:
+        return testbed.clocks.pulses_at(testbed.sources, t_s)
+    if testbed.orbit is None or not isinstance(testbed.sources, StarSources):
+        return testbed.sources
+    reach_rad = 1.25 * view.field_rad + 0.02 + view.turn_rad
+    near = testbed.sources.take(testbed.sources.within(view.boresight, reach_rad))
+    before, now = (1e3 * observer_during(testbed, t).velocity_km_s for t in (0.0, t_s))
+    direction = star_sources.seen_at_velocity(near.place[:, :3], before, now)
+    visible = ~hidden_by_earth(state_at(testbed.orbit, t_s).position_m, direction)
+    return replace(near, place=np.column_stack([direction, np.zeros(len(near))])).take(visible)
 
 
 def build_tracker(testbed: Testbed) -> factory.Estimator:

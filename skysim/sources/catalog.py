@@ -53,6 +53,7 @@ def star_columns(motion_format: str) -> tuple[Column, ...]:
 
 
 NUMBERS = tuple(column.name for column in star_columns(""))
+SCATTER = Column("scatter_mag", "mag", ".3g")  # optional
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +65,7 @@ class Catalog:
     pm_ra_rad_yr   : mu_alpha cos(delta), per Julian year; pm_dec_rad_yr likewise
     parallax_rad   : annual parallax; 0 if unknown
     v_mag, b_v, v_i : Johnson V and colors
+    scatter_mag    : standard deviation of a variable star's magnitude in time; 0 for others
     epoch_jyear    : the epoch
     """
 
@@ -76,6 +78,7 @@ class Catalog:
     v_mag: Floats
     b_v: Floats
     v_i: Floats
+    scatter_mag: Floats
     epoch_jyear: float
 
     def __len__(self) -> int:
@@ -140,13 +143,14 @@ def read(name_or_path: str | Path) -> Catalog:
     path = catalog_path(name_or_path)
     meta, lines = read_meta_and_lines(path)
     header = lines[0].split(",")
+    names = [*NUMBERS, SCATTER.name] if SCATTER.name in header else NUMBERS
     try:
-        table = np.loadtxt(lines[1:], delimiter=",", usecols=[header.index(name) for name in NUMBERS], ndmin=2)
+        table = np.loadtxt(lines[1:], delimiter=",", usecols=[header.index(name) for name in names], ndmin=2)
     except ValueError as error:
         raise catalog_error(path, f"damaged ({str(error).splitlines()[0]})") from error
     if len(table) != meta["rows"]:
         raise catalog_error(path, f"damaged ({len(table)} stars of {meta['rows']})")
-    hip, ra, dec, pm_ra, pm_dec, parallax, v_mag, b_v, v_i = np.ascontiguousarray(table.T)
+    hip, ra, dec, pm_ra, pm_dec, parallax, v_mag, b_v, v_i, *scatter = np.ascontiguousarray(table.T)
     return Catalog(
         hip=hip.astype(np.int64),
         ra_rad=np.radians(ra),
@@ -157,6 +161,7 @@ def read(name_or_path: str | Path) -> Catalog:
         v_mag=v_mag,
         b_v=b_v,
         v_i=v_i,
+        scatter_mag=scatter[0] if scatter else np.zeros(len(table)),
         epoch_jyear=float(meta["epoch_jyear"]),
     )
 

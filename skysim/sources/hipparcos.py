@@ -32,6 +32,7 @@ HIP2 = {
     "b_v": slice(152, 158),
     "v_i": slice(165, 171),
 }
+HIP2_SCATTER, HIP2_VARIABLE = slice(143, 149), slice(149, 151)  # of Hp; 0 if not in the Variability Annex
 
 # For these entries hip2 gives the magnitude of a brighter neighbor (Hipparcos' detector was 30" wide), so that its
 # light would be counted twice. Gaia's and Hipparcos-1's magnitudes show it.
@@ -102,7 +103,8 @@ def hip2_row(line: str) -> dict[str, Any]:
     row["hip"] = int(row["hip"])
     row["ra_deg"], row["dec_deg"] = np.degrees(row["ra_deg"]), np.degrees(row["dec_deg"])
     row["v_mag"] = JOHNSON_V.get(row["hip"], float(v_from_hp(row["hp_mag"], row["v_i"])))
-    return row | {"source": "hip2"}
+    variable = int(line[HIP2_VARIABLE]) > 0
+    return row | {"source": "hip2", "scatter_mag": float(line[HIP2_SCATTER]) if variable else 0.0}
 
 
 def supplement_rows() -> list[dict[str, Any]]:
@@ -111,5 +113,5 @@ def supplement_rows() -> list[dict[str, Any]]:
     rows = []
     for cells in csv.DictReader(lines):
         row: dict[str, Any] = {column.name: float(cells[column.name]) for column in COLUMNS}
-        rows.append(row | {"hip": int(cells["hip"]), "source": "supplement"})
+        rows.append(row | {"hip": int(cells["hip"]), "source": "supplement", "scatter_mag": 0.0})
     return rows

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+from dataclasses import replace
 
 import erfa
 import numpy as np
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.quantities.utc import in_utc
-from skysim.core.types import Floats, Sources
+from skysim.core.random_streams import VARIABLE_STARS, random_stream
+from skysim.core.types import Floats, Sources, StarSources
 from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import Band, star_flux_e_s_m2
 
@@ -20,6 +22,7 @@ J2000_TT = datetime.datetime(2000, 1, 1, 12)
 TT_MINUS_UTC = datetime.timedelta(seconds=69.184)
 DAY = datetime.timedelta(days=1)
 ARCSEC_RAD = erfa.DAS2R
+LAST_HIPPARCOS = 120_416  # number of the catalog's last star
 C_AU_DAY = erfa.DAYSEC / erfa.AULT
 C_M_S = erfa.CMPS
 AT_REST = (0.0, 0.0, 0.0)
@@ -61,6 +64,29 @@ def apparent(
     return np.asarray(apparent_direction / np.linalg.norm(apparent_direction, axis=-1, keepdims=True))
 
 
+def varied(stars: Catalog, seed: int) -> Catalog:
+    """The stars with the magnitudes of variable ones drawn about their means, at one time.
+
+    The draw is normal, with the standard deviation that Hipparcos saw over three years, and belongs to the star's
+    Hipparcos number: the same star has the same magnitude whatever the catalog's limit. The colors stay.
+    """
+    draws = random_stream(seed, VARIABLE_STARS).standard_normal(LAST_HIPPARCOS + 1)
+    numbered = np.where(stars.hip <= LAST_HIPPARCOS, stars.hip, 0)
+    return replace(stars, v_mag=stars.v_mag + stars.scatter_mag * draws[numbered])
+
+
+def seen_at_velocity(apparent_direction: Floats, from_m_s: Floats, to_m_s: Floats) -> Floats:
+    """Apparent directions (N, 3) of stars for another velocity of the observer.
+
+    from_m_s, to_m_s : (3,) barycentric velocities, before and after
+    The aberration of the first velocity is undone by that of its opposite, and that of the second applied (`erfa.ab`).
+    """
+    direction = apparent_direction
+    for beta in (-np.asarray(from_m_s) / C_M_S, np.asarray(to_m_s) / C_M_S):
+        direction = erfa.ab(direction, beta, 1.0, np.sqrt(1.0 - beta @ beta))
+    return np.asarray(direction)
+
+
 def days_since_j2000_tt(time: datetime.datetime) -> float:
     """Terrestrial Time as days from J2000.0 (JD 2451545.0)."""
     return (in_utc(time) + TT_MINUS_UTC - J2000_TT) / DAY
@@ -90,11 +116,11 @@ def sources(
     return steady_points(selected.hip, direction, flux, selected.v_mag)
 
 
-def steady_points(ids: NDArray[np.int64], direction: Floats, flux_e_s_m2: Floats, magnitude: Floats) -> Sources:
+def steady_points(ids: NDArray[np.int64], direction: Floats, flux_e_s_m2: Floats, magnitude: Floats) -> StarSources:
     """Steady points of light at infinity: (N, 3) unit vectors, (N,) photo-electrons s^-1 m^-2 and V magnitudes."""
     count = len(ids)
     zeros, ones = np.zeros(count), np.ones(count)
-    return Sources(
+    return StarSources(
         id=ids,
         place=np.column_stack([direction, zeros]),
         normal=np.zeros((count, 3)),

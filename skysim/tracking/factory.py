@@ -8,6 +8,7 @@ differ from the simulated hardware.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from estimator.catalog import catalog
 from estimator.core.errors import ImageError
@@ -20,11 +21,13 @@ from skysim.core.types import Frame, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.sources.dome import display
+from skysim.sources.orbit.camera_orbit import build_orbit, state_at
 from skysim.tracking.external import adapter
 from skysim.tracking.external.adapter import ExternalTracker
 from skysim.tracking.external.function import FunctionTracker
 from skysim.tracking.external.interface import OWN
 from skysim.tracking.onboard_model import assumed_camera, assumed_dome, assumed_lever, onboard_catalog, surveyed_dome
+from skysim.tracking.orbit_velocity import OrbitStarTracker, in_orbit
 from skysim.tracking.settings import assumed_settings
 
 UserTracker = ExternalTracker | FunctionTracker  # each frame must reach it once, in order
@@ -52,12 +55,18 @@ def build_tracker(scene: Scene, mount: Mount, sources: Sources, programs: Mappin
         except ImageError as error:
             raise InputError(f"light: the star tracker cannot use this dome: {error}") from None
     stars = catalog.brighter_than(onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag)
-    directions = catalog.apparent(stars, catalog.on_earth(scene.start_time))
+    orbit = build_orbit(scene.orbit, scene.start_time) if scene.tracker.orbit_velocity else None
+    observer = catalog.on_earth(scene.start_time)
+    if orbit:
+        observer = in_orbit(observer, state_at(orbit, 0.0).velocity_m_s)
+    directions = catalog.apparent(stars, observer)
     if isinstance(scene.light, CollimatedDisplayConfig):
         # The display's mounting defines where the stars are in the lab frame.
         directions = display.lab_from_icrs(scene.light).apply(directions)
     if scene.tracker.name != OWN:
         return ExternalTracker.start(scene, camera, settings, adapter.star_map(stars, directions), programs)
+    if orbit:
+        return OrbitStarTracker(camera, stars, directions, settings, orbit)
     return StarTracker(camera, stars, directions, settings)
 
 
@@ -75,6 +84,9 @@ def solve_frame(
     if isinstance(estimator, UserTracker):
         return estimator.solve_frame(frame, streak_px)
     try:
-        return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s)
+        report = estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s)
+        if isinstance(estimator, OrbitStarTracker):
+            return replace(report, attitude=estimator.corrected(report.attitude, frame.t_mid_s))
+        return report
     except ImageError as error:
         return Report(Attitude(str(error)), Centroids.empty())

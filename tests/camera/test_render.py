@@ -25,6 +25,7 @@ from skysim.scene.sections.leds import CosineLobeConfig
 from skysim.scene.sections.motion import JitterLineConfig, MotionConfig
 from skysim.sources.dome.led import Emitter
 from skysim.sources.photometry import SUN, Band, led_strength_e_s_sr, star_flux_e_s_m2
+from skysim.sources.stars import steady_points
 
 FLAT = Band.from_efficiency(1.0)
 
@@ -169,7 +170,7 @@ def test_a_star_on_the_border_leaves_half_of_itself_outside() -> None:
 
 def test_lights_add() -> None:
     near, far = star_at(20.2, 20.9, 1e3), star_at(22.0, 21.0, 2e3)
-    both = Sources(*(np.concatenate([getattr(near, f), getattr(far, f)]) for f in Sources.__slots__))
+    both = Sources(*(np.concatenate([getattr(near, f), getattr(far, f)]) for f in Sources.__slots__ if f != "motion"))
     np.testing.assert_allclose(shot(both)[0], shot(near)[0] + shot(far)[0], rtol=0, atol=1e-9)
 
 
@@ -377,7 +378,7 @@ def test_stars_that_cross_the_field_between_two_looks_are_not_missed() -> None:
     """A whole turn in a second, looked at nine times: every star of the equator gives the same."""
     around = np.radians(np.arange(0, 360, 7.5))
     stars = [light(place=[[np.sin(a), 0, np.cos(a), 0]]) for a in around]
-    ring = Sources(*(np.concatenate([getattr(s, f) for s in stars]) for f in Sources.__slots__))
+    ring = Sources(*(np.concatenate([getattr(s, f) for s in stars]) for f in Sources.__slots__ if f != "motion"))
     t = np.linspace(0, 3, 3001)
     spin = Trajectory(t, Rotation.from_rotvec(np.outer(t, [0, 2 * np.pi, 0])), np.tile([0, 2 * np.pi, 0], (len(t), 1)))
     lens = lens_of(pixel="250 um", psf={"kind": "gaussian", "sigma_px": 0.7})
@@ -563,6 +564,28 @@ def test_a_star_that_crosses_the_field_between_two_poses_is_kept() -> None:
     assert len(kept) < 600
 
 
+@pytest.mark.parametrize("angles", [[0.0], [0.0, 0.02], list(np.linspace(-0.6, 0.6, 9))])
+def test_a_field_of_a_deep_catalog_costs_only_the_stars_near_it(
+    monkeypatch: pytest.MonkeyPatch, angles: list[float]
+) -> None:
+    """The rows are those of a pass over all stars; those tested are as many as the cone's part of the sky holds."""
+    rng = np.random.default_rng(5)
+    rays = rng.standard_normal((25_000, 3))
+    stars = steady_points(
+        np.arange(25_000), rays / np.linalg.norm(rays, axis=1, keepdims=True), np.ones(25_000), np.zeros(25_000)
+    )
+    turns = Rotation.from_rotvec(np.outer(angles, [0, 1, 0])).as_matrix()
+    poses = rendering.Poses(turns, np.zeros((len(angles), 3)))
+    tested = []
+    in_cone = rendering._in_cone
+    monkeypatch.setattr(rendering, "_in_cone", lambda place, *more: tested.append(len(place)) or in_cone(place, *more))
+    rows = rendering.in_view(stars, LENS, poses)
+    monkeypatch.setattr(rendering, "MIN_TREE_STARS", 10**9)
+    assert rows.tolist() == rendering.in_view(stars, LENS, poses).tolist()
+    assert tested[1] == 25_000
+    assert len(rows) <= tested[0] < (0.05 * 25_000 if len(angles) < 3 else 25_001)
+
+
 def test_a_patch_holds_the_bend_of_a_path_between_two_samples() -> None:
     """A circle of 100 px sampled every 45 deg, none of them where it is widest: 7.6 px beyond the samples."""
     angle = np.radians(22.5 + 45 * np.arange(9))
@@ -731,7 +754,7 @@ def test_work_is_shared_in_goes_without_a_seam(monkeypatch: pytest.MonkeyPatch) 
     """Patches of many sources do not fit in a frame at once; the outcome does not tell."""
     rng = np.random.default_rng(2)
     many = [star_at(*xy, 1e3) for xy in rng.uniform((5, 5), (58, 42), (40, 2))]
-    stars = Sources(*(np.concatenate([getattr(s, f) for s in many]) for f in Sources.__slots__))
+    stars = Sources(*(np.concatenate([getattr(s, f) for s in many]) for f in Sources.__slots__ if f != "motion"))
     whole, seen = shot(stars)
     monkeypatch.setattr(rendering, "MAX_PATCH_PIXELS", 500)
     parts, again = shot(stars)

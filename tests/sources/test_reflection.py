@@ -269,4 +269,4 @@ def test_fresnel() -> None:
 def test_names() -> None:
     assert light_name(17) == "17"
     assert light_name(2 * MIRRORED + 17) == "reflection of 17"
-    assert light_name(3_000_000_000 + MIRRORED + 5) == "ghost of reflection of 5"
+    assert light_name(3_000_000_000_000 + MIRRORED + 5) == "ghost of reflection of 5"

@@ -16,7 +16,7 @@ from skysim.scene.sections.light import BodiesConfig
 from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 from skysim.sources.solar_system import colors, discs, ephemeris, magnitudes, observer, places
-from skysim.sources.solar_system.bodies import BODIES, bodies_at
+from skysim.sources.solar_system.bodies import BODIES, bodies_from
 
 GEOCENTER = SiteConfig()
 ARCSEC_RAD = erfa.DAS2R
@@ -289,7 +289,7 @@ def test_reflected_light_follows_the_albedo() -> None:
 
 
 def test_the_light_of_all_bodies_is_their_magnitudes() -> None:
-    lights = bodies_at(BodiesConfig(), GEOCENTER, datetime.datetime(2012, 6, 24, 21), BAND)
+    lights = bodies_from(BodiesConfig(), observer.observe_from(datetime.datetime(2012, 6, 24, 21), GEOCENTER), BAND)
     assert {light.name for light in lights} == set(BODIES)
     distances = [light.place.distance_km for light in lights]
     assert distances == sorted(distances, reverse=True)

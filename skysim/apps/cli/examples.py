@@ -12,6 +12,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "skysim run simsat_slew --frames 2 --scene-3d",
     ),
     "check": ("skysim check afit_simsat", 'skysim check afit_simsat --set light.led.intensity="60 mcd"'),
+    "availability": (
+        "skysim availability orbit.yaml --law zenith --off-deg 30",
+        "skysim availability orbit.yaml --span year --picture out/year.png",
+    ),
     "render": ("skysim render shefex2 --frames 1 --preview",),
     "stream": (
         "skysim stream shefex2 --folder out/stream --frames 5",

@@ -11,6 +11,7 @@ import typer
 
 from estimator.core.errors import ImageError
 from skysim import __version__
+from skysim.apps.cli.commands.availability import availability
 from skysim.apps.cli.commands.camera import app as cameras
 from skysim.apps.cli.commands.files import catalog_app, export, scenes_app
 from skysim.apps.cli.commands.gui import gui
@@ -27,7 +28,21 @@ from skysim.core import errors
 from skysim.core.errors import InputError
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
-COMMANDS = (run, check, render, stream, compare, trackers, solve, survey, reproduce, gui, validate, export)
+COMMANDS = (
+    run,
+    check,
+    render,
+    stream,
+    compare,
+    trackers,
+    solve,
+    survey,
+    reproduce,
+    gui,
+    validate,
+    export,
+    availability,
+)
 for command in COMMANDS:
     app.command()(command)
 app.add_typer(scenes_app, name="scenes")

@@ -17,11 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from skysim.camera.glow.faint_stars import S10_MAG_ARCSEC2, faint_starlight_s10, galactic_latitude_deg
 from skysim.camera.optics import Optics, radial, tangential
 from skysim.core.jit import jit
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import Glow, MoonGlowConfig, SkyGlowConfig, StrayLightConfig, UniformGlowConfig
+from skysim.scene.sections.light import (
+    FaintStarsGlowConfig,
+    Glow,
+    MoonGlowConfig,
+    SkyGlowConfig,
+    StrayLightConfig,
+    UniformGlowConfig,
+)
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 
 MAX_NODE_SPACING_PX = 32.0
@@ -142,12 +150,19 @@ def transmittance(angle_deg: float, table_deg: Sequence[float], pst: Sequence[fl
     return float(np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, MIN_PST)))))
 
 
+def faint_star_glow(config: FaintStarsGlowConfig, view: ViewingGeometry) -> Floats:
+    """Light of the stars fainter than those that are drawn, by galactic latitude; the lab's axes are the ICRS."""
+    s10 = faint_starlight_s10(galactic_latitude_deg(view.toward_lab), config.fainter_than_mag)
+    return float(sky_radiance_e_s_m2_sr(S10_MAG_ARCSEC2, view.band)) * s10 * view.etendue_m2_sr()
+
+
 # Radiance models by kind. To add one, add a class to scene/light.py and a function here.
 BACKGROUNDS: dict[str, Callable[[Any, ViewingGeometry], Floats]] = {
     "uniform": uniform_glow,
     "sky": sky_glow,
     "moon": moon_glow,
     "stray": stray_light,
+    "faint_stars": faint_star_glow,
 }
 
 

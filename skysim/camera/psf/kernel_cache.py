@@ -92,7 +92,8 @@ def source_kernels(
     outside_px = np.maximum(np.maximum(-position, position - size), 0).max(axis=1)
     # Sources far outside the frame have no image.
     emitter, blur = (np.where(outside_px < MAX_RADIUS_PX, radius, 0.0) for radius in (emitter, blur))
-    widest = emitter if disks is None else np.where(emitter > 0, np.fmax(emitter, disks.semi_axes_px()[:, 0]), 0)
+    axes_px = np.column_stack([emitter, emitter]) if disks is None else disks.semi_axes_px()
+    widest = np.where(emitter > 0, np.fmax(emitter, axes_px[:, 0]), 0)
     largest = (widest + blur).max(initial=0.0)
     if largest > MAX_RADIUS_PX:
         raise InputError(
@@ -103,8 +104,9 @@ def source_kernels(
     disk = np.zeros((len(steps), len(ellipse.EllipseDisk._fields)))
     if disks is not None:
         variance_px2 = 1 / (2 * np.pi * build_kernel(camera.psf, camera).peak) + extra**2 + blur**2 / 4
-        chosen = np.flatnonzero((emitter > 0) & (round_error(disks, emitter, variance_px2) > MAX_ROUND_ERROR))
-        sizes = (part[chosen] for part in (blur, extra, variance_px2))
+        error = round_error(disks, axes_px, emitter, variance_px2)
+        chosen = np.flatnonzero((emitter > 0) & (error > MAX_ROUND_ERROR))
+        sizes = (part[chosen] for part in (axes_px, blur, extra, variance_px2))
         disk[chosen], steps[chosen] = ellipse_disks(camera.psf, camera, disks.take(chosen), *sizes)
     gaussian = camera.psf.kind == "gaussian"
     if gaussian:
@@ -128,26 +130,34 @@ def source_kernels(
     return Kernels(kind.astype(np.int64), sigma, reach, sharp, spans, cache.tables[0], disk, bessel)
 
 
-def round_error(disks: DiskImages, drawn_px: Floats, variance_px2: Floats) -> Floats:
-    """(N,) about the largest error, over the peak, of disks drawn as circles of these radii about their centers.
+def round_error(disks: DiskImages, axes_px: Floats, drawn_px: Floats, variance_px2: Floats) -> Floats:
+    """(N,) about the largest error, over the peak, of disks of these (N, 2) semi-axes drawn as circles of these radii
+    about their centers.
 
     Behind a blur of variance s^2 the edge of a wide disk has the slope 0.4 / s; a radius a of a small one makes the
     image wider by a^2 / 4, and so its peak less by a^2 / 8 s^2. A shifted image differs by up to 0.6 / s a pixel, and
     so does the gradient of a small disk, which shifts the image; that of a wide one is seen as it is. NaN where a disk
     has no image.
     """
-    s_px, axes = np.sqrt(variance_px2), disks.semi_axes_px()
-    edge_px = np.abs(axes - drawn_px[:, None]).max(axis=1)
+    s_px = np.sqrt(variance_px2)
+    edge_px = np.abs(axes_px - drawn_px[:, None]).max(axis=1)
     shift_px, gradient_px = (np.hypot(*part.T) for part in (disks.center, disks.gradient))
-    gradient = np.minimum(gradient_px / np.maximum(axes[:, 1], 1e-9), 0.15 * gradient_px / s_px)
+    gradient = np.minimum(gradient_px / np.maximum(axes_px[:, 1], 1e-9), 0.15 * gradient_px / s_px)
     return np.asarray((np.minimum(0.4, drawn_px / 2 / s_px) * edge_px + 0.6 * shift_px) / s_px + gradient)
 
 
 def ellipse_disks(
-    psf: Psf, camera: CameraConfig, disks: DiskImages, blur_px: Floats, sigma_px: Floats, variance_px2: Floats
+    psf: Psf,
+    camera: CameraConfig,
+    disks: DiskImages,
+    axes_px: Floats,
+    blur_px: Floats,
+    sigma_px: Floats,
+    variance_px2: Floats,
 ) -> tuple[Floats, NDArray[np.int64]]:
     """(M, 15) `ellipse.EllipseDisk` of M disks, and (M, 3) the keys of their boxes.
 
+    axes_px      : (M, 2) their semi-axes, the larger one first
     variance_px2 : s^2 of the blur behind which they are seen
 
     Blurred by a Gaussian, a light of I (1 + g x) is (1 + g x) I + s^2 g dI/dx: the blurred I, shifted by -s^2 g, times
@@ -159,7 +169,7 @@ def ellipse_disks(
     xx, xy, yy = square[:, 0, 0], square[:, 0, 1], square[:, 1, 1]
     mean, zero = center + gradient / 4, np.zeros_like(gradient)
     winged, odd = psf.kind in WINGED, psf.kind in WINGED + NOT_ROUND
-    wide = (disks.semi_axes_px()[:, 1] > 1.5 * np.sqrt(variance_px2))[:, None]
+    wide = (axes_px[:, 1] > 1.5 * np.sqrt(variance_px2))[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         inverse = np.column_stack(
             [yy * gradient[:, 0] - xy * gradient[:, 1], xx * gradient[:, 1] - xy * gradient[:, 0]]
@@ -168,7 +178,7 @@ def ellipse_disks(
     drawn = center if odd else np.where(wide, center - variance_px2[:, None] * slope, mean)
     parts = (zero, gradient) if odd else (slope, zero)
     # With wings the reach is that of a circle, where they are faded; else that along x and y.
-    radius_px = disks.semi_axes_px()[:, 0] if winged else np.sqrt(np.maximum(xx, yy))
+    radius_px = axes_px[:, 0] if winged else np.sqrt(np.maximum(xx, yy))
     reach = ellipse.reach_px(psf, camera, radius_px + blur_px, sigma_px)
     one = np.ones_like(xx)
     half_px = ellipse.box_half_px(reach + np.abs(drawn).max(axis=1))

@@ -18,10 +18,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
+from skysim.core.io.text import SCALES, Line, excerpt, seconds_since, to_numbers
 from skysim.core.types import Floats
 from skysim.dynamics.profiles.frames import REFERENCES, frame_of, icrs_from
 from skysim.dynamics.profiles.samples import Samples, from_quaternions
-from skysim.dynamics.profiles.text import SCALES, Line, excerpt, seconds_since, to_numbers
 
 VERSION = "CCSDS_AEM_VERS"
 VERSIONS = ("1.0", "2.0")

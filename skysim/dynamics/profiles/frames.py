@@ -5,7 +5,7 @@ from __future__ import annotations
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.dynamics.profiles.text import excerpt
+from skysim.core.io.text import excerpt
 
 ICRF, LAB, CAMERA, BODY = "ICRF", "LAB", "STARTRACKER_1", "SC_BODY_1"  # as skysim writes them
 EME2000 = ("EME2000", "J2000")

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from skysim.core.errors import InputError
+from skysim.core.io.text import read_lines
 from skysim.core.quantities.utc import in_utc
 from skysim.core.types import Mount
 from skysim.dynamics.profiles import ccsds_aem, stk, table
 from skysim.dynamics.profiles.samples import Samples, check_samples
 from skysim.dynamics.profiles.spline import AttitudeSpline, fit_spline
-from skysim.dynamics.profiles.text import read_lines
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.motion import ProfileConfig

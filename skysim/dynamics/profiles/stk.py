@@ -12,9 +12,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from skysim.core.errors import InputError, unknown_name
+from skysim.core.io.text import Line, excerpt, to_numbers
 from skysim.dynamics.profiles.frames import REFERENCES, icrs_from
 from skysim.dynamics.profiles.samples import Samples, from_quaternions
-from skysim.dynamics.profiles.text import Line, excerpt, to_numbers
 
 # Numbers of a data line with its time, and the columns of x, y, z, w.
 SECTIONS = {

@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError, printable
 from skysim.core.io import files
+from skysim.core.io.text import Line, excerpt, seconds_since, to_numbers
 from skysim.core.types import Floats
 from skysim.dynamics.profiles.samples import Samples, from_quaternions
-from skysim.dynamics.profiles.text import Line, excerpt, seconds_since, to_numbers
 from skysim.sources.stars import cam_from_icrs
 
 QUATERNIONS = ("lab_from_body", "body_from_lab", "icrs_from_body", "body_from_icrs", "icrs_from_cam", "cam_from_icrs")

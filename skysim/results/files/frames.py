@@ -106,4 +106,6 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
     }
     if truth.bodies:
         table.meta["bodies"] = [dataclasses.asdict(body) for body in truth.bodies]
+    if truth.satellites:
+        table.meta["satellites"] = [dataclasses.asdict(satellite) for satellite in truth.satellites]
     write_table(path, table)

@@ -130,8 +130,10 @@ def has_floor(scene: Scene) -> bool:
     return reflection is not None and reflection.floor is not None
 
 
-def has_bodies(scene: Scene) -> bool:
-    return getattr(scene.light, "bodies", None) is not None
+def seen_from_earth(scene: Scene) -> bool:
+    """Whether bodies or satellites are seen from the Earth: from its center or from a site."""
+    bodies, satellites = (getattr(scene.light, key, None) for key in ("bodies", "satellites"))
+    return scene.orbit is None and bool(bodies or (satellites and satellites.file))
 
 
 RULES = (
@@ -287,9 +289,9 @@ RULES = (
     ),
     Rule(
         ("site.longitude_deg", "site.height"),
-        lambda scene: not has_bodies(scene),
+        lambda scene: not seen_from_earth(scene),
         "nothing depends on the place on the Earth",
-        "light.bodies",
+        "light.bodies or light.satellites.file, without an orbit",
     ),
     Rule(
         ("site.height",),
@@ -299,7 +301,7 @@ RULES = (
     ),
     Rule(
         ("site.latitude_deg",),
-        lambda scene: earth_unused(scene) and not (has_bodies(scene) and scene.site.longitude_deg is not None),
+        lambda scene: earth_unused(scene) and not (seen_from_earth(scene) and scene.site.longitude_deg is not None),
         "nothing depends on the Earth's rotation",
         "vehicle.disturbances.earth_rotation, a vehicle.imu whose earth_rate is not none, or light.bodies with a"
         " site.longitude_deg",
@@ -327,6 +329,18 @@ RULES = (
         lambda scene: scene.thermal is not None and scene.thermal.temperature.kind == "steady",
         "the temperature is steady",
         "another thermal.temperature",
+    ),
+    Rule(
+        ("tracker.orbit_velocity",),
+        lambda scene: scene.orbit is None,
+        "the camera is on the ground",
+        "the section orbit",
+    ),
+    Rule(
+        ("light.satellites.standard_mag",),
+        lambda scene: bool(scene.light.satellites and not scene.light.satellites.file),
+        "random satellites have their own magnitudes",
+        "light.satellites.file",
     ),
     Rule(
         ("vehicle.tilt_stop_deg",),

@@ -12,6 +12,7 @@ from skysim.core.quantities.tolerance import LengthError
 from skysim.core.quantities.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
 from skysim.scene.sections.layouts import Layout, PixelsConfig
 from skysim.scene.sections.leds import LedConfig
+from skysim.scene.sections.orbit import SatellitesConfig
 
 SKY = "gaia_v8.0"  # as faint as any camera of a shipped scene detects
 Tilt = Annotated[Number, Field(ge=-45, le=45)]
@@ -302,14 +303,19 @@ class StarsConfig(ConfigModel):
 
     catalog   : a name in data/catalogs, or a file of `skysim catalog build`; the tracker has its own
     limit_mag : faintest V; all stars of the catalog if left out
+    variability_seed : of the magnitudes of variable stars at the scene's time, which scatter as Hipparcos saw them;
+        means if left out
     bodies    : Sun, Moon and planets; none if left out
+    satellites : artificial satellites; none if left out
     occlusion : whether the vehicle's parts hide stars
     """
 
     kind: Literal["stars"]
     catalog: str = SKY
     limit_mag: Annotated[Number, Field(ge=0, le=15)] | None = None
+    variability_seed: Annotated[int, Field(ge=0)] | None = None
     bodies: BodiesConfig | None = None
+    satellites: SatellitesConfig | None = None
     occlusion: bool = True
 
 
@@ -392,7 +398,20 @@ class StrayLightConfig(ConfigModel):
         return self
 
 
-Glow = Annotated[UniformGlowConfig | SkyGlowConfig | MoonGlowConfig | StrayLightConfig, Field(discriminator="kind")]
+class FaintStarsGlowConfig(ConfigModel):
+    """Light of all stars fainter than a V magnitude, by galactic latitude, for skies of kind stars.
+
+    fainter_than_mag : where the catalog, or its limit_mag, ends
+    """
+
+    kind: Literal["faint_stars"]
+    fainter_than_mag: Annotated[Number, Field(ge=6, le=15)]
+
+
+Glow = Annotated[
+    UniformGlowConfig | SkyGlowConfig | MoonGlowConfig | StrayLightConfig | FaintStarsGlowConfig,
+    Field(discriminator="kind"),
+]
 
 
 Light = DomeConfig | StarsConfig | CollimatedDisplayConfig

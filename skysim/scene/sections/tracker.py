@@ -100,6 +100,7 @@ class TrackerConfig(ConfigModel):
     assumed_row_time : of a rolling shutter; 0 for a tracker that takes all rows as exposed at once
     gyro : whether the tracker gets the mean rate that `vehicle.imu` measures during each exposure, unless saturated,
         for smear and a rolling shutter. Without it, as in the published labs, both follow from the frame alone
+    orbit_velocity : whether the tracker gets the velocity of the scene's `orbit`, and corrects for its aberration (5")
     brightest : only this many of the brightest detections of a frame are used
     exposure_control : every frame is exposed for `exposure.time` if left out
     """
@@ -120,6 +121,7 @@ class TrackerConfig(ConfigModel):
     assumed_distortion: tuple[Number, Number, Number, Number, Number] | None = None
     assumed_row_time_s: Annotated[Time, Field(ge=0)] | None = None
     gyro: bool = False
+    orbit_velocity: bool = True
     brightest: Annotated[int, Field(ge=3, le=1000)] | None = None
     assumed_camera_body_m: tuple[Length, Length, Length] | None = None
     survey: SurveyErrorsConfig = SurveyErrorsConfig()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,12 +10,11 @@ from numpy.typing import NDArray
 
 from skysim.core.types import BodyTruth, Floats
 from skysim.scene.sections.light import BodiesConfig
-from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.photometry import Band
 from skysim.sources.solar_system.colors import ALBEDO, reflected_flux_e_s_m2
 from skysim.sources.solar_system.discs import LAMBERT, LIMB_DARKENED, LOMMEL_SEELIGER, Surface
 from skysim.sources.solar_system.magnitudes import earthshine_fraction, magnitude
-from skysim.sources.solar_system.observer import observe_from
+from skysim.sources.solar_system.observer import Observer
 from skysim.sources.solar_system.places import Place, place
 
 ID_BASE = 9_000_000  # a body's number is this + NAIF's
@@ -98,9 +96,8 @@ class BodyLight:
         return directions @ self.place.direction > np.cos(self.radius_rad)
 
 
-def bodies_at(config: BodiesConfig, site: SiteConfig, time: datetime.datetime, band: Band) -> list[BodyLight]:
-    """The chosen bodies at a time, the farthest first."""
-    observer = observe_from(time, site)
+def bodies_from(config: BodiesConfig, observer: Observer, band: Band) -> list[BodyLight]:
+    """The chosen bodies as an observer sees them, the farthest first."""
     lights = [body_light(name, place(name, observer), observer.tt_jd, band) for name in chosen(config)]
     return sorted(lights, key=lambda light: -light.place.distance_km)
 

@@ -21,13 +21,20 @@ J2000 = datetime.datetime(2000, 1, 1, 12)
 JD_2000 = 2451545.0
 
 
+class GcrsState(NamedTuple):
+    """(3,) position in m and velocity in m/s from the Earth's center, GCRS axes."""
+
+    position_m: Floats
+    velocity_m_s: Floats
+
+
 class Observer(NamedTuple):
-    """Barycentric position in km and velocity in km/s, ICRS axes (3,); from_earth_m_s: (3,) velocity in the GCRS."""
+    """Barycentric position in km and velocity in km/s, ICRS axes (3,); from_earth: the same from the Earth's center."""
 
     tt_jd: float
     position_km: Floats
     velocity_km_s: Floats
-    from_earth_m_s: Floats
+    from_earth: GcrsState
 
 
 def tt_jd(time: datetime.datetime) -> float:
@@ -75,23 +82,30 @@ def ut1_table() -> tuple[Floats, Floats]:
 def observe_from(time: datetime.datetime, site: SiteConfig) -> Observer:
     """The observer at a time: at the site if it has a longitude, else at the Earth's center.
 
-    The Earth's position is the ephemeris's, its velocity `erfa.epv00`'s (5 mm/s), as for the stars. A site's place is
-    that of WGS 84, turned by UT1 and by precession and nutation of IAU 2006/2000A (`erfa.pvtob`, `erfa.c2i06a`).
-    Polar motion (0.3", which moves the Moon by 0.005") is neglected. Source: IERS Conventions 2010, chapter 5.
+    A site's place is that of WGS 84, turned by UT1 and by precession and nutation of IAU 2006/2000A (`erfa.pvtob`,
+    `erfa.c2i06a`). Polar motion (0.3", which moves the Moon by 0.005") is neglected. Source: IERS Conventions 2010,
+    chapter 5.
+    """
+    return observe_at(time, site_in_gcrs(time, tt_jd(time), site))
+
+
+def observe_at(time: datetime.datetime, from_earth: GcrsState) -> Observer:
+    """The observer at a time in this state from the Earth's center.
+
+    The Earth's position is the ephemeris's, its velocity `erfa.epv00`'s (5 mm/s), as for the stars.
     """
     tt = tt_jd(time)
     velocity_km_s = erfa.epv00(tt, 0.0)[1]["v"] * (erfa.DAU / 1e3 / DAY_S)
-    position_m, from_earth_m_s = site_in_gcrs(time, tt, site)
-    position_km = load_ephemeris().position_km("earth", tt) + position_m / 1e3
-    return Observer(tt, position_km, velocity_km_s + from_earth_m_s / 1e3, from_earth_m_s)
+    position_km = load_ephemeris().position_km("earth", tt) + from_earth.position_m / 1e3
+    return Observer(tt, position_km, velocity_km_s + from_earth.velocity_m_s / 1e3, from_earth)
 
 
-def site_in_gcrs(time: datetime.datetime, tt: float, site: SiteConfig) -> tuple[Floats, Floats]:
-    """(3,) position in m and velocity in m/s from the Earth's center, GCRS axes; zeros for a site without longitude."""
+def site_in_gcrs(time: datetime.datetime, tt: float, site: SiteConfig) -> GcrsState:
+    """The state of a site; zeros for one without longitude."""
     if site.longitude_deg is None:
-        return np.zeros(3), np.zeros(3)
+        return GcrsState(np.zeros(3), np.zeros(3))
     longitude_rad, latitude_rad = np.radians([site.longitude_deg, site.latitude_deg])
     theta_rad = erfa.era00(ut1_jd(time), 0.0)
     state = erfa.pvtob(longitude_rad, latitude_rad, site.height_m, 0.0, 0.0, 0.0, theta_rad)
     gcrs_from_cirs = erfa.c2i06a(tt, 0.0).T
-    return gcrs_from_cirs @ state["p"], gcrs_from_cirs @ state["v"]
+    return GcrsState(gcrs_from_cirs @ state["p"], gcrs_from_cirs @ state["v"])

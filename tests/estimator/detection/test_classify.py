@@ -245,6 +245,25 @@ def add_line(light: np.ndarray, at: tuple[int, int], angle: float) -> None:
         light[at[1] : at[1] + 41, at[0] : at[0] + 41] += star(x, y, 900.0, 0.7, (41, 41))
 
 
+@pytest.mark.parametrize("angle_deg", [12.0, 75.0])
+def test_a_faint_track_in_pieces_is_flagged(angle_deg: float) -> None:
+    """Near the threshold a line is many blobs: of up to 24 at most two are left, and no star is taken for a piece."""
+    rng, angle = np.random.default_rng(53), np.radians(angle_deg)
+    light, xy = sky_frame(rng, 25, 0.7)
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] - np.array([240.0, 320.0])[:, None, None]
+    along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    track = np.where(np.abs(along) < 230, np.exp(-(across**2) / (2 * 0.7**2)), 0.0)
+    pieces, left = [], []
+    for peak in (24.0, 27.0, 30.0):
+        blobs = detect.default(exposed(rng, light + peak * track))
+        away = np.linalg.norm(blobs.xy_px[:, None] - xy, axis=2).min(axis=1) > 3
+        assert np.count_nonzero(~away & (blobs.flag == 0)) >= len(xy) - 1  # a star may be on the line
+        pieces.append(np.count_nonzero(away))
+        left.append(np.count_nonzero(away & (blobs.flag & NO_STAR == 0)))
+    assert max(pieces) >= 20
+    assert max(left) <= 2, (pieces, left)
+
+
 def test_tracks_among_round_stars_make_no_roll() -> None:
     """Of three tracks and the sky, any two lines give a turn, but the stars are round."""
     rng = np.random.default_rng(50)

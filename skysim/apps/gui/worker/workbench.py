@@ -138,6 +138,7 @@ def id_prefix(testbed: Testbed) -> str:
 def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> tuple[Light, ...]:
     """The true lights of a frame, the brightest first."""
     sources, of_bodies = truth.sources, {body.id: body.v_mag for body in truth.bodies}
+    of_bodies |= {satellite.id: satellite.v_mag for satellite in truth.satellites}
     rows = np.argsort(-sources.electrons)
     columns = zip(
         sources.id[rows].tolist(), sources.flux_xy_px[rows].tolist(), sources.electrons[rows].tolist(), strict=True

@@ -1,4 +1,4 @@
-"""Text files of attitude samples: read within limits, numbers and epochs with the line of what is wrong."""
+"""Text files of samples over time: read within limits, numbers and epochs with the line of what is wrong."""
 
 from __future__ import annotations
 

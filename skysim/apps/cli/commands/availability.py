@@ -1,0 +1,138 @@
+"""Command `skysim availability`."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from skysim.apps.cli.options import Json, Overrides, SceneArg, load
+from skysim.apps.cli.terminal import print_json, print_table, progress_callback
+from skysim.core.errors import InputError
+
+if TYPE_CHECKING:
+    from skysim.scene.scene import Scene
+    from skysim.sources.orbit.availability import Pointing, Samples
+
+SPANS_S = {"orbit": None, "day": 86_400.0, "year": 365.25 * 86_400.0}
+LAWS = ("inertial", "zenith")
+
+
+def availability(
+    scene: SceneArg,
+    law: Annotated[str, typer.Option(help="inertial: toward motion.start; zenith: at --off-deg from it.")] = "inertial",
+    off_deg: Annotated[float, typer.Option(help="Angle of the boresight from the zenith, 180 is nadir.")] = 0.0,
+    around_deg: Annotated[float, typer.Option(help="Its azimuth from the flight direction, left positive.")] = 0.0,
+    span: Annotated[str, typer.Option(help="orbit, day or year, from the scene's start_time.")] = "orbit",
+    samples: Annotated[int, typer.Option(min=10, max=10_000_000, help="Times that are computed.")] = 20_000,
+    overrides: Overrides = None,
+    picture: Annotated[Path | None, typer.Option(help="Also write a picture (.png) of the angles over time.")] = None,
+    json: Json = False,
+) -> None:
+    """Fraction of an orbit or a year in which the tracker is outside its exclusion angles and sees enough stars."""
+    config = load(scene, None, None, overrides)
+    if config.orbit is None or config.orbit.exclusion is None:
+        raise InputError("orbit.exclusion: the scene has none; allowed: a scene with a section orbit with exclusion")
+    for value, allowed, name in ((law, LAWS, "law"), (span, tuple(SPANS_S), "span")):
+        if value not in allowed:
+            raise InputError(f"--{name} {value}: allowed: {', '.join(allowed)}")
+    if law == "inertial" and (off_deg or around_deg):
+        raise InputError("--off-deg, --around-deg: have no effect with --law inertial; allowed: --law zenith")
+    with progress_callback("availability", quiet=json) as watch:
+        found = computed(config, pointing_of(config, law, off_deg, around_deg), SPANS_S[span], samples, watch)
+    fractions = fractions_of(found, config)
+    if picture is not None:
+        write_picture(picture, found, config)
+    if json:
+        print_json({"span": span, "law": law, "samples": len(found.t_s), "fractions": fractions})
+        return
+    exclusion = config.orbit.exclusion
+    limits = {"Sun": exclusion.sun_deg, "Earth": exclusion.earth_deg, "Moon": exclusion.moon_deg}
+    rows = [[name, f"more than {limit:g}° away", f"{100 * fractions[name]:.2f} %"] for name, limit in limits.items()]
+    rows.append(["stars", f"at least {exclusion.stars}", f"{100 * fractions['stars']:.2f} %"])
+    rows.append(["all", "available", f"{100 * fractions['all']:.2f} %"])
+    print_table(f"{config.name}: {span} of {found.t_s[-1] / 3600:.4g} h", ["", "condition", "fraction of time"], rows)
+
+
+def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Pointing:
+    """The boresight's attitude law. Raises InputError for an inertial one without a direction."""
+    import numpy as np
+
+    from skysim.camera.glow.background import direction
+    from skysim.scene.sections.motion import PointingConfig
+    from skysim.sources.orbit.availability import Pointing
+
+    start = scene.motion.start
+    if law == "zenith":
+        return Pointing("zenith", np.zeros(3), math.radians(off_deg), math.radians(around_deg))
+    if not isinstance(start, PointingConfig):
+        raise InputError("--law inertial: requires motion.start with ra_deg and dec_deg")
+    return Pointing("inertial", direction(start.ra_deg, start.dec_deg))
+
+
+def computed(scene: Scene, pointing: Pointing, span_s: float | None, samples: int, watch: Any) -> Samples:
+    """The angles over the span, or over one revolution."""
+    import numpy as np
+
+    from skysim.sources import catalog, stars
+    from skysim.sources.orbit.availability import sample
+    from skysim.sources.orbit.camera_orbit import build_orbit
+    from skysim.sources.orbit.earth import MU_M3_S2
+
+    orbit = build_orbit(scene.orbit, scene.start_time)
+    assert orbit is not None
+    if span_s is None:
+        first = orbit.states(np.zeros(1))
+        energy = np.sum(first.velocity_m_s**2) / 2 - MU_M3_S2 / np.linalg.norm(first.position_m)
+        if energy >= 0:
+            raise InputError("--span orbit: this orbit is not closed; allowed: day, year")
+        span_s = float(2 * np.pi * MU_M3_S2 / (-2 * energy) ** 1.5)
+    t_s = np.asarray((np.arange(samples) + 0.5) * (span_s / samples), float)
+    known = catalog.read_for("tracker.catalog", scene.tracker.catalog).to_limit(scene.tracker.limit_mag)
+    camera = scene.camera
+    area_px = camera.width_px * camera.height_px
+    field_rad = math.atan(math.sqrt(area_px / math.pi) / camera.focal_px)
+    return sample(orbit, scene.start_time, t_s, pointing, stars.apparent(known, scene.start_time), field_rad, watch)
+
+
+def fractions_of(found: Samples, scene: Scene) -> dict[str, float]:
+    """The fraction of the times at which each condition holds, and at which all do."""
+    import numpy as np
+
+    assert scene.orbit is not None
+    assert scene.orbit.exclusion is not None
+    outside = found.outside(scene.orbit.exclusion)
+    each = {name: float(np.mean(holds)) for name, holds in outside.items()}
+    return {**each, "all": float(np.mean(np.all(list(outside.values()), axis=0)))}
+
+
+def write_picture(path: Path, found: Samples, scene: Scene) -> None:
+    """The angles over time with their limits, and the times at which the tracker is available."""
+    import numpy as np
+
+    from skysim.core.io.files import atomic_file
+    from skysim.results.plots import INK, png
+
+    assert scene.orbit is not None
+    assert scene.orbit.exclusion is not None
+    exclusion, hours = scene.orbit.exclusion, found.t_s / 3600
+    curves = (
+        ("Sun", found.sun_deg, exclusion.sun_deg),
+        ("Earth's limb", found.earth_deg, exclusion.earth_deg),
+        ("Moon", found.moon_deg, exclusion.moon_deg),
+    )
+
+    def draw(fig: Any) -> None:
+        axes = fig.subplots()
+        for color, (name, angle_deg, limit_deg) in zip(INK, curves, strict=False):
+            axes.plot(hours, angle_deg, color=color, label=name)
+            axes.axhline(limit_deg, color=color, linestyle=":", linewidth=0.8)
+        free = np.all(list(found.outside(exclusion).values()), axis=0)
+        axes.fill_between(hours, 0, 1, where=free, transform=axes.get_xaxis_transform(), color="#009e73", alpha=0.15)
+        axes.set(xlabel="time [h]", ylabel="angle from the boresight [deg]")
+        axes.legend()
+
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(png(draw, (7, 3.2)))

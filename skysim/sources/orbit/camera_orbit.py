@@ -1,0 +1,122 @@
+"""The camera's own orbit: its position and velocity in GCRS axes at any time of a run."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.scene.sections.orbit import CircularOrbitConfig, OemOrbitConfig, TleOrbitConfig
+from skysim.sources.orbit.earth import J2, MU_M3_S2, RADIUS_M
+from skysim.sources.orbit.elements import Elements, gcrs_states, read_elements
+from skysim.sources.orbit.oem import Ephemeris, read_oem
+from skysim.sources.solar_system.observer import DAY_S, GcrsState
+
+
+class CameraOrbit(Protocol):
+    """Position and velocity of the camera."""
+
+    def states(self, after_s: Floats) -> GcrsState:
+        """(K, 3) positions and velocities at K times since the scene's start. Raises InputError beyond its data."""
+        ...
+
+
+def state_at(orbit: CameraOrbit, after_s: float) -> GcrsState:
+    """(3,) position and velocity at a time since the scene's start."""
+    return GcrsState(*(column[0] for column in orbit.states(np.array([after_s]))))
+
+
+@dataclass(frozen=True, slots=True)
+class CircularOrbit:
+    """A circular orbit under gravity and J2, averaged over a revolution.
+
+    With the mean motion n = sqrt(mu / a^3) and k = 1.5 J2 (R / a)^2, the node moves by -k n cos i and the argument of
+    latitude by n (1 + k (3 - 4 sin^2 i)). The short-period terms (some km in a low orbit) are left out, and the
+    equator is that of the GCRS. Source: Vallado 2013, Fundamentals of Astrodynamics, section 9.6.
+    """
+
+    config: CircularOrbitConfig
+
+    @property
+    def rates_rad_s(self) -> tuple[float, float]:
+        """Of the argument of latitude and of the node."""
+        radius_m, inclination = RADIUS_M + self.config.altitude_m, np.radians(self.config.inclination_deg)
+        n, k = np.sqrt(MU_M3_S2 / radius_m**3), 1.5 * J2 * (RADIUS_M / radius_m) ** 2
+        return float(n * (1 + k * (3 - 4 * np.sin(inclination) ** 2))), float(-k * n * np.cos(inclination))
+
+    def states(self, after_s: Floats) -> GcrsState:
+        config, (rate, node_rate) = self.config, self.rates_rad_s
+        inclination = np.radians(config.inclination_deg)
+        along = np.radians(config.argument_deg) + rate * after_s
+        node = np.radians(config.raan_deg) + node_rate * after_s
+        toward_node = np.stack([np.cos(node), np.sin(node), np.zeros_like(node)], axis=-1)
+        ahead = np.stack([-np.sin(node) * np.cos(inclination), np.cos(node) * np.cos(inclination)], axis=-1)
+        ahead = np.column_stack([ahead, np.full(len(node), np.sin(inclination))])
+        radius_m, cosine, sine = RADIUS_M + config.altitude_m, np.cos(along)[:, None], np.sin(along)[:, None]
+        position_m = radius_m * (cosine * toward_node + sine * ahead)
+        velocity_m_s = radius_m * rate * (cosine * ahead - sine * toward_node)
+        return GcrsState(position_m, velocity_m_s + np.cross([0.0, 0.0, node_rate], position_m))
+
+
+@dataclass(frozen=True, slots=True)
+class TleOrbit:
+    """An orbit by SGP4."""
+
+    elements: Elements
+    start: datetime.datetime
+
+    def states(self, after_s: Floats) -> GcrsState:
+        position_m, velocity_m_s = np.empty((2, len(after_s), 3))
+        day = np.round(after_s / DAY_S)
+        for one in np.unique(day):  # the equinox moves by 0.1" a day
+            rows = np.flatnonzero(day == one)
+            middle_s = float(after_s[rows].mean())
+            time = self.start + datetime.timedelta(seconds=middle_s)
+            place, velocity, errors = gcrs_states(self.elements, time, after_s[rows] - middle_s)
+            if errors.any():
+                raise InputError(f"orbit.file: SGP4 has no place of this satellite at {time}; allowed: newer elements")
+            position_m[rows], velocity_m_s[rows] = place[0], velocity[0]
+        return GcrsState(position_m, velocity_m_s)
+
+
+@dataclass(frozen=True, slots=True)
+class OemOrbit:
+    """An orbit of samples."""
+
+    ephemeris: Ephemeris
+
+    def states(self, after_s: Floats) -> GcrsState:
+        return GcrsState(*self.ephemeris.at(after_s))
+
+
+def circular(config: CircularOrbitConfig, start: datetime.datetime) -> CircularOrbit:
+    return CircularOrbit(config)
+
+
+def tle(config: TleOrbitConfig, start: datetime.datetime) -> TleOrbit:
+    """The orbit of one satellite of a file. Raises InputError for a file without it, or of several without a number."""
+    elements = read_elements(config.file)
+    rows = [n for n, number in enumerate(elements.numbers) if config.number in (None, number)]
+    if len(rows) != 1:
+        listed = ", ".join(map(str, elements.numbers[:5])) + ", ..." * (len(elements.numbers) > 5)
+        raise InputError(
+            f"orbit.number: {config.number}: {len(rows)} satellites of {config.file}; allowed: one of {listed}"
+        )
+    return TleOrbit(elements.take(rows), start)
+
+
+def oem(config: OemOrbitConfig, start: datetime.datetime) -> OemOrbit:
+    return OemOrbit(read_oem(config.file, start))
+
+
+ORBITS: dict[str, Callable[[Any, datetime.datetime], CameraOrbit]] = {"circular": circular, "tle": tle, "oem": oem}
+
+
+def build_orbit(config: Any, start: datetime.datetime) -> CameraOrbit | None:
+    """The camera's orbit of a scene; None without the section `orbit`. Raises InputError for an unreadable file."""
+    return ORBITS[config.kind](config, start) if config else None

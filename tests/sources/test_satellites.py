@@ -1,0 +1,233 @@
+"""Satellites: elements, places by SGP4, sunlight and the Earth's shadow, and random ones."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skysim.core.errors import InputError
+from skysim.scene.sections.orbit import RandomSatellitesConfig
+from skysim.scene.sections.vehicle import SiteConfig
+from skysim.sources.orbit import earth, elements, satellites
+from skysim.sources.orbit.satellites import View
+from skysim.sources.solar_system.observer import GcrsState, site_in_gcrs, tt_jd
+
+# Satellite 00005 of Vallado et al. 2006 (AIAA 2006-6753), and its TEME states of tcppver.out, km and km/s.
+VANGUARD = (
+    "1 00005U 58002B   00179.78495062  .00000023  00000-0  28098-4 0  4753\n"
+    "2 00005  34.2682 348.7242 1859667 331.7664  19.3264 10.82419157413667\n"
+)
+PUBLISHED = {
+    0.0: (7022.46529266, -1400.08296755, 0.03995155, 1.893841015, 6.405893759, 4.534807250),
+    360.0: (-7154.03120202, -3783.17682504, -3536.19412294, 4.741887409, -4.151817765, -2.093935425),
+    720.0: (-7134.59340119, 6531.68641334, 3260.27186483, -4.113793027, -2.911922039, -2.557327851),
+}
+OMM = {
+    **{
+        "OBJECT_NAME": "VANGUARD 1",
+        "OBJECT_ID": "1958-002B",
+        "NORAD_CAT_ID": "5",
+        "EPOCH": "2000-06-27T18:50:19.733568",
+    },
+    **{
+        "MEAN_MOTION": "10.82419157",
+        "ECCENTRICITY": ".1859667",
+        "INCLINATION": "34.2682",
+        "RA_OF_ASC_NODE": "348.7242",
+    },
+    **{"ARG_OF_PERICENTER": "331.7664", "MEAN_ANOMALY": "19.3264", "BSTAR": ".28098E-4", "MEAN_MOTION_DOT": ".23E-6"},
+}
+DATE = datetime.datetime(2024, 4, 10, 3, 0, 7)
+SITE = SiteConfig(latitude_deg=40.0, longitude_deg=10.0, height="500 m")
+
+
+def written(folder: Path, text: str, name: str = "elements.txt") -> str:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def tle(number: int, inclination_deg: float, node_deg: float, along_deg: float, revolutions_day: float) -> str:
+    """A circular orbit of 10 April 2024, 0 h."""
+    lines = (
+        f"1 {number:05d}U 20001A   24101.00000000  .00000000  00000-0  00000-0 0  999",
+        f"2 {number:05d} {inclination_deg:8.4f} {node_deg:8.4f} 0001000   0.0000 {along_deg:8.4f}"
+        f" {revolutions_day:11.8f}    1",
+    )
+    return "".join(f"{line}{elements.checksum(line)}\n" for line in lines)
+
+
+@pytest.fixture
+def low_orbits(tmp_path: Path) -> elements.Elements:
+    rng = np.random.default_rng(4)
+    orbits = (tle(n, *rng.uniform((0, 0, 0, 13), (100, 360, 360, 15.5))) for n in range(1, 41))
+    return elements.read_elements(written(tmp_path, "".join(orbits)))
+
+
+def test_sgp4_gives_the_published_states(tmp_path: Path) -> None:
+    record = elements.read_elements(written(tmp_path, f"VANGUARD 1\n{VANGUARD}")).records[0]
+    for minutes, state in PUBLISHED.items():
+        error, place, velocity = record.sgp4_tsince(minutes)
+        assert error == 0
+        assert np.array([*place]) == pytest.approx(state[:3], abs=1e-5)
+        assert np.array([*velocity]) == pytest.approx(state[3:], abs=1e-8)
+
+
+def test_gcrs_of_teme_is_the_published_one() -> None:
+    """Vallado et al. 2006, appendix C: 6 April 2004, 07:51:28.386 UTC; their EOP and polar motion differ by a meter."""
+    date = datetime.datetime(2004, 4, 6, 7, 51, 28, 386009)
+    place_km = elements.gcrs_from_teme(date) @ [5094.18016210, 6127.64465950, 6380.34453270]
+    assert place_km == pytest.approx([5102.508958, 6123.011401, 6378.136928], abs=3e-3)
+
+
+@pytest.mark.parametrize("kind", ["csv", "json", "xml"])
+def test_omm_and_tle_are_the_same_satellite(kind: str, tmp_path: Path) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(OMM))
+    writer.writeheader()
+    writer.writerow(OMM)
+    leaves = "".join(f"<{key}>{value}</{key}>" for key, value in OMM.items())
+    xml = f"<ndm><omm><body><segment><metadata/><data>{leaves}</data></segment></body></omm></ndm>"
+    omm = elements.read_elements(
+        written(tmp_path, {"csv": text.getvalue(), "json": json.dumps([OMM]), "xml": xml}[kind], "omm")
+    )
+    line = elements.read_elements(written(tmp_path, VANGUARD))
+    time = datetime.datetime(2000, 6, 28)
+    places_m = [elements.gcrs_states(one, time, np.zeros(1))[0] for one in (omm, line)]
+    assert omm.names == ("VANGUARD 1",)
+    assert omm.numbers == line.numbers == (5,)
+    assert np.abs(places_m[0] - places_m[1]).max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "empty"),
+        (VANGUARD.replace("4753", "4754"), "line 1: the checksum of line 1 is 4; it should be 3"),
+        (VANGUARD.splitlines()[0], "is not line 2 of a TLE"),
+        ("[{}]", "message 1: NORAD_CAT_ID is missing"),
+        ("<ndm>", "not an OMM"),
+        (json.dumps({**OMM, "EPOCH": "yesterday"}), "message 1: EPOCH 'yesterday'"),
+        (json.dumps({**OMM, "MEAN_MOTION": "fast"}), 'message 1: "could not convert'),
+        (json.dumps({**OMM, "ECCENTRICITY": "1.5"}), "satellite 1: SGP4 refuses these elements"),
+    ],
+)
+def test_bad_elements_are_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError) as refused:
+        elements.read_elements(written(tmp_path, text))
+    assert message in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_the_phase_law_is_that_of_a_lambert_sphere() -> None:
+    """The integral of mu mu0 over the part of a sphere that is lit and seen, over that at 90 degrees."""
+    z, around = np.meshgrid((np.arange(600) + 0.5) / 300 - 1, (np.arange(600) + 0.5) * np.pi / 300)
+    normal = np.stack([np.sqrt(1 - z**2) * np.cos(around), np.sqrt(1 - z**2) * np.sin(around), z])
+
+    def light(phase_rad: float) -> float:
+        sun = np.array([np.sin(phase_rad), 0.0, np.cos(phase_rad)])
+        return float((np.maximum(normal[2], 0) * np.maximum(np.tensordot(sun, normal, 1), 0)).sum())
+
+    for phase_rad in (0.0, 0.7, 1.5, 2.4, 2.9):
+        fainter = -2.5 * np.log10(light(phase_rad) / light(np.pi / 2))
+        assert satellites.phase_mag(phase_rad) == pytest.approx(fainter, abs=2e-3)
+
+
+def test_magnitudes_follow_range_and_light() -> None:
+    assert satellites.magnitude(6.0, 1e6, np.pi / 2, 1.0) == pytest.approx(6.0)
+    assert satellites.magnitude(6.0, 1e7, np.pi / 2, 1.0) == pytest.approx(11.0)
+    assert satellites.magnitude(6.0, 1e6, np.pi / 2, 0.01) == pytest.approx(11.0)
+
+
+def test_the_shadow_is_a_cone_behind_the_earth() -> None:
+    """On a circle about the Earth's axis the umbra ends where the limb hides all of the Sun."""
+    sun_m, radius_m = np.array([1.496e11, 0.0, 0.0]), 7e6
+    sun_rad = np.arcsin(earth.SUN_RADIUS_M / 1.496e11)
+    limb_rad = np.arccos(earth.RADIUS_M / radius_m)  # beyond 90 degrees from the Sun
+
+    def lit(angle_rad: float) -> float:
+        place = radius_m * np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0])
+        return float(earth.sunlit_fraction(place, sun_m))
+
+    parallax_rad = radius_m / 1.496e11
+    edge = np.pi / 2 + limb_rad - parallax_rad
+    assert lit(0.0) == 1
+    assert lit(np.pi) == 0
+    assert lit(edge) == pytest.approx(0.5, abs=0.01)
+    assert lit(edge - 1.02 * sun_rad) == 1
+    assert lit(edge + 1.02 * sun_rad) == 0
+    half = 0.5 + (0.5 * np.sqrt(0.75) + np.arcsin(0.5)) / np.pi  # area of a disc above a chord at half its radius
+    assert lit(edge - 0.5 * sun_rad) == pytest.approx(half, abs=0.01)
+
+
+def test_the_earth_hides_what_is_behind_its_ellipsoid() -> None:
+    high = np.array([0.0, 0.0, 7e6])
+    pole_m = earth.RADIUS_M * (1 - earth.FLATTENING)
+    limb_rad = np.arcsin(pole_m / 7e6)
+    for off, hidden in ((-0.02, True), (0.02, False)):  # from the nadir to the limb
+        direction = np.array([np.sin(limb_rad + off), 0.0, -np.cos(limb_rad + off)])
+        assert earth.hidden_by_earth(high, direction) == hidden
+    down = np.array([0.0, 0.0, -1.0])
+    assert not earth.hidden_by_earth(high, down, 7e6 - pole_m - 1)
+    assert earth.hidden_by_earth(high, down, 7e6 - pole_m + 1)
+    ground = np.array([earth.RADIUS_M, 0.0, 0.0])
+    horizon = np.array([[0.001, 1.0, 0.0], [-0.001, 1.0, 0.0]])
+    assert earth.hidden_by_earth(ground, horizon).tolist() == [False, True]
+
+
+def test_a_path_is_that_of_places_at_its_times(low_orbits: elements.Elements) -> None:
+    """Place and motion at mid-exposure give the apparent place at another time of a long exposure."""
+
+    def observer_at(after_s: float) -> GcrsState:
+        time = DATE + datetime.timedelta(seconds=after_s)
+        return site_in_gcrs(time, tt_jd(time), SITE)
+
+    for n in range(len(low_orbits.numbers)):
+        one = low_orbits.take([n])
+        place, motion = satellites.path(one, DATE, 10.0, observer_at)
+        for after_s in (-3.1, 4.2):
+            then = place + after_s * (motion[0] + after_s / 2 * motion[1])
+            time = DATE + datetime.timedelta(seconds=after_s)
+            exact, _ = satellites.path(one, time, 0.1, lambda t, at=after_s: observer_at(at + t))
+            off = np.linalg.norm(np.cross(then / np.linalg.norm(then), exact))
+            assert np.degrees(off) * 3600 < 0.1
+
+
+def test_satellites_of_the_field_are_those_that_cross_it(low_orbits: elements.Elements) -> None:
+    """From a place beside each sunlit satellite, looking at it: found, with its range, and nothing where it is dark."""
+    place_m, velocity_m_s, _ = elements.gcrs_states(low_orbits, DATE, np.zeros(1))
+    lit = earth.sunlit_fraction(place_m[:, 0], earth.sun_m(tt_jd(DATE)))
+    assert 5 < np.count_nonzero(lit == 1) < 40
+    for n in range(len(lit)):
+        up = place_m[n, 0] / np.linalg.norm(place_m[n, 0])
+        here = GcrsState(place_m[n, 0] - 50e3 * up, velocity_m_s[n, 0])
+        view = View(up, 0.05, 0.0, 0.1)
+        found = list(satellites.known_satellites(low_orbits, 6.0, view, DATE, lambda t, at=here: at))
+        assert [light.truth.id - satellites.ID_BASE for light in found] == [n + 1] * int(lit[n] > 0)
+        for light in found:
+            assert light.truth.range_km == pytest.approx(50)
+
+
+def test_random_satellites_have_their_density_rates_and_magnitudes() -> None:
+    config = RandomSatellitesConfig(per_field=30.0, rate_deg_s=(0.1, 2.0), v_mag=(3.0, 5.0), seed=8)
+    view = View(np.array([0.6, 0.0, 0.8]), 0.1, 0.0, 1.0)
+    drawn = [list(satellites.random_satellites(config, view, index)) for index in range(60)]
+    lights = [light for frame in drawn for light in frame]
+    inside = sum(light.place @ view.boresight > np.cos(view.field_rad) for light in lights)
+    assert inside / 60 == pytest.approx(30, abs=4 * np.sqrt(30 / 60))
+    rates = np.log([light.truth.rate_deg_s for light in lights])
+    assert rates.mean() == pytest.approx(np.log([0.1, 2.0]).mean(), abs=0.05)
+    assert rates.min() >= np.log(0.1) - 1e-9
+    assert rates.max() <= np.log(2.0) + 1e-9
+    magnitudes = np.array([light.truth.v_mag for light in lights])
+    assert magnitudes.mean() == pytest.approx(4, abs=0.05)
+    headings = np.array([light.motion[0] / np.linalg.norm(light.motion[0]) for light in lights])
+    assert np.abs(headings.mean(axis=0)).max() < 0.05
+    again = list(satellites.random_satellites(config, view, 3))
+    assert [str(light.truth) for light in again] == [str(light.truth) for light in drawn[3]]
