@@ -82,6 +82,23 @@ class Optics:
         return cosine * VIGNETTING[config.kind](config, np.arccos(np.minimum(cosine, 1)))
 
 
+@dataclass(frozen=True, slots=True)
+class ScaledOptics(Optics):
+    """A lens whose image is scaled about the principal point; a negative scale mirrors it through the axis."""
+
+    scale: float = 1.0
+
+    @classmethod
+    def of(cls, optics: Optics, scale: float) -> ScaledOptics:
+        """A lens with its image scaled, and all else unchanged."""
+        return cls(optics.camera, optics.collecting_m2, optics.fold_r, optics.field_rad, scale=scale)
+
+    def project(self, vectors_cam: Floats) -> Floats:
+        """As `Optics.project`, then scaled."""
+        center = np.array(self.camera.center_px)
+        return center + self.scale * (Optics.project(self, vectors_cam) - center)
+
+
 def radial(distortion: tuple[float, ...], r2: Floats) -> Floats:
     """Radial distortion factor 1 + k1 r^2 + k2 r^4 + k3 r^6 from k1, k2, p1, p2, k3 (OpenCV's order)."""
     k1, k2, _, _, k3 = distortion

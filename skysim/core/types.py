@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -179,6 +180,11 @@ class StarSources(Sources):
         """Rows, in order, of the stars within an angle of a unit vector."""
         chord = 2.0 * np.sin(min(angle_rad, np.pi) / 2.0)
         return np.array(self.tree.query_ball_point(direction, chord, return_sorted=True), dtype=np.int64)
+
+
+def with_sources(parts: Sequence[Sources]) -> Sources:
+    """All sources of several sets, in their order."""
+    return Sources(*(np.concatenate([getattr(part, name) for part in parts]) for name in Sources.__slots__))
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from skysim.core.io.files import write_text
 from skysim.core.types import Floats, FrameRow, SourceTruth
 from skysim.results.plots import figure_png, stacked_axes
 from skysim.results.stretch import to_8bit
-from skysim.sources.solar_system.bodies import light_name
+from skysim.sources.false_lights import light_name
 
 LEGEND_PX = 20  # height of the legend
 MIN_SNR = 3.0  # of the true sources that are marked: no one sees fainter ones

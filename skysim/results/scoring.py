@@ -40,15 +40,17 @@ def row(result: FrameResult, scene: Scene, mount: Mount, verdict: str = "") -> F
     Errors and standard deviations are in arcseconds, NaN without a solution.
     """
     truth, attitude = result.truth, result.report.attitude
+    # With the mount of the calibration: one that has moved since makes an error of the vehicle's attitude.
+    cam_from_lab = mount.cam_from_body * truth.lab_from_body.inv()
     cross = roll = cross_sigma = roll_sigma = chance = float("nan")
     estimate, wrong = None, False
     if attitude.cam_from_ref is not None:
-        cross, roll = metrics.cross_and_roll_rad(attitude.cam_from_ref, truth.cam_from_lab)
+        cross, roll = metrics.cross_and_roll_rad(attitude.cam_from_ref, cam_from_lab)
         estimate = angles_deg(attitude.cam_from_ref, scene, mount)
         covariance, nees = np.full((3, 3), np.nan), np.inf
         if attitude.covariance_rad2 is not None:
             covariance = attitude.covariance_rad2
-            nees = metrics.normalized_error_squared(attitude.cam_from_ref, truth.cam_from_lab, covariance)
+            nees = metrics.normalized_error_squared(attitude.cam_from_ref, cam_from_lab, covariance)
         wrong = metrics.is_wrong(np.hypot(cross, roll), nees)
         variance = np.diag(covariance)
         cross_sigma, roll_sigma = float(np.sqrt(variance[:2].sum())), float(np.sqrt(variance[2]))
@@ -59,7 +61,7 @@ def row(result: FrameResult, scene: Scene, mount: Mount, verdict: str = "") -> F
         t_s=truth.t_s,
         rate_deg_s=float(np.degrees(np.linalg.norm(truth.rate_cam_rad_s))),
         status=attitude.status,
-        truth_deg=angles_deg(truth.cam_from_lab, scene, mount),
+        truth_deg=angles_deg(cam_from_lab, scene, mount),
         estimate_deg=estimate,
         cross_arcsec=cross / ARCSEC_RAD,
         roll_arcsec=roll / ARCSEC_RAD,

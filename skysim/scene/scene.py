@@ -20,6 +20,7 @@ from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import DomeConfig, Glow, Light, StarsConfig
 from skysim.scene.sections.motion import MotionConfig, PointingConfig
 from skysim.scene.sections.orbit import Orbit
+from skysim.scene.sections.thermal import ThermalConfig
 from skysim.scene.sections.tracker import FilterConfig, SurveyErrorsConfig, TrackerConfig
 from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
 
@@ -75,6 +76,7 @@ class Scene(ConfigModel):
     background: tuple[Glow, ...] = ()
     camera: CameraConfig
     exposure: ExposureConfig
+    thermal: ThermalConfig | None = None
     tracker: TrackerConfig = TrackerConfig()
     filter: FilterConfig | None = None
     name: Annotated[str, Field(exclude=True, alias=NAME_ALIAS)] = ""

@@ -1,20 +1,23 @@
 """Render one frame with its truth.
 
 The order is that of the light: background and display glow, the sources integrated along their paths
-(camera/render.py), charge smear of the shutter, then the detector (camera/detector).
+(camera/render.py), ghosts and glare of the lens (camera/stray), charge smear of the shutter, then the detector
+(camera/detector).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Clock
+from skysim.camera import thermal
 from skysim.camera.detector.detector import add_snr_and_saturation, expose, saturation_dn, smear
 from skysim.camera.discs.bodies import FEW, behind, concatenated, render_bodies
 from skysim.camera.discs.disc_image import Exposed
@@ -23,8 +26,9 @@ from skysim.camera.glow.air_glow import sky_light
 from skysim.camera.glow.earth_glow import earth_light
 from skysim.camera.optics import Optics
 from skysim.camera.render import OcclusionTest, Poses, Window, in_view, poses, project, render
+from skysim.camera.stray import ghosts, glare, wall
 from skysim.core.random_streams import DETECTOR, SCINTILLATION, random_stream
-from skysim.core.types import Frame, Sources, Truth
+from skysim.core.types import Floats, Frame, Sources, SourceTruth, Truth, with_sources
 from skysim.dynamics import multibody
 from skysim.simulation.testbed import (
     Testbed,
@@ -37,9 +41,11 @@ from skysim.simulation.testbed import (
     time_tag_error_s,
 )
 from skysim.sources.air.air import Sky
+from skysim.sources.dome.led import Emitter
 from skysim.sources.orbit.earth import sun_m
-from skysim.sources.orbit.satellites import View, as_sources
+from skysim.sources.orbit.satellites import MovingLight, View, as_sources
 from skysim.sources.photometry import SUN
+from skysim.sources.solar_system.bodies import BodyLight
 
 
 def render_frame(
@@ -53,45 +59,25 @@ def render_frame(
     scene, camera = testbed.scene, testbed.scene.camera
     window = exposure_window(scene, index, exposure_s)
     middle_s = window.middle_s(camera.height_px)
+    testbed = at_time(testbed, middle_s)
     lab_from_body = testbed.trajectory.attitude_at(middle_s)
     cam_from_lab = testbed.mount.cam_from_body * lab_from_body.inv()
-    light_e = testbed.canvas
-    # The canvas is reused for every frame: the background overwrites it, all else is added to it.
-    sky = sky_during(testbed, middle_s)
-    glow = background.glow_map(scene.background, testbed.optics, cam_from_lab, testbed.band, sky_light(sky))
-    background.fill(light_e, glow, window.exposure_s)
-    add_earth(light_e, testbed, cam_from_lab, middle_s, window.exposure_s)
     camera_m = lab_from_body.apply(testbed.mount.camera_body_m)
-    black_level = display_glow.black_glow(scene.light, testbed.optics, cam_from_lab, camera_m, testbed.band)
-    if black_level is not None:
-        light_e += black_level * window.exposure_s
+    sky, light_e = sky_during(testbed, middle_s), testbed.canvas
+    # The canvas is reused for every frame: the background overwrites it, all else is added to it.
+    fill_background(light_e, testbed, sky, cam_from_lab, camera_m, middle_s, window.exposure_s)
     view = view_of(testbed, window, cam_from_lab, middle_s)
-    light = lights_during(testbed, view, middle_s)
-    bodies, optics = bodies_during(testbed, middle_s), testbed.optics
-    if sky:
-        light, optics = seen_stars(testbed, sky, window, index), seeing_optics(testbed, sky, cam_from_lab)
-    occludes = occlusion_test(testbed, lab_from_body, sky)
-    sources = render(
-        light_e,
-        light,
-        optics,
-        testbed.trajectory,
-        testbed.mount,
-        window,
-        testbed.emitter,
-        behind(bodies, occludes),
-    )
-    if bodies:
-        exposed = Exposed(optics, testbed.trajectory, testbed.mount, window)
-        sources = concatenated([sources, *render_bodies(light_e, bodies, exposed, occludes)])
     satellites = satellites_during(testbed, view, middle_s, index)
-    if satellites:
-        hidden = behind(bodies, occludes)
-        streaks = as_sources(satellites, testbed.band)
-        if sky:
-            streaks = sky.lights_seen(streaks, SUN[0])
-        drawn = render(light_e, streaks, optics, testbed.trajectory, testbed.mount, window, None, hidden)
-        sources = concatenated([sources, drawn])
+    stars = lights_during(testbed, view, middle_s)
+    if sky:
+        stars = seen_stars(testbed, stars, sky, window, index)
+    streaks = satellite_sources(testbed, sky, satellites)
+    lights = Lights(with_images(testbed, stars, cam_from_lab, camera_m), bodies_during(testbed, middle_s), streaks)
+    occludes = occlusion_test(testbed, lab_from_body, sky)
+    optics = seeing_optics(testbed, sky, cam_from_lab) if sky else testbed.optics
+    exposed = Exposed(optics, testbed.trajectory, testbed.mount, window)
+    sources = draw_lights(light_e, lights, exposed, testbed.emitter, occludes)
+    sources = add_stray(light_e, sources, lights, exposed, testbed, occludes)
     smear(light_e, window.exposure_s, testbed.detector.shutter)
     # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
     sources = add_snr_and_saturation(sources, light_e, window.exposure_s, testbed.detector)
@@ -99,12 +85,61 @@ def render_frame(
     image = expose(light_e, window.exposure_s, testbed.detector, random_stream(scene.seed, DETECTOR, index))
     clock.lap("detector")
     rate_cam = testbed.mount.cam_from_body.apply(testbed.trajectory.rate_at(middle_s))
-    seen = tuple(body.truth() for body in bodies if body.id in sources.id)
+    seen = tuple(body.truth() for body in lights.bodies if body.id in sources.id)
     streaked = tuple(light.truth for light in satellites if light.truth.id in sources.id)
-    hidden_ids = occluded_ids(testbed, lab_from_body, light, occludes)
+    hidden_ids = occluded_ids(testbed, lab_from_body, stars, occludes)
     truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, hidden_ids, seen, streaked)
     tagged_s = middle_s + time_tag_error_s(scene, index)
     return Frame(index, image, tagged_s, window.exposure_s, saturation_dn(camera.detector)), truth
+
+
+def fill_background(
+    light_e: NDArray[Any],
+    testbed: Testbed,
+    sky: Sky | None,
+    cam_from_lab: Rotation,
+    camera_m: Floats,
+    t_s: float,
+    exposure_s: float,
+) -> None:
+    """Set the image to all extended light: background and air, the dome's wall, the Earth, a display's black level."""
+    optics, band = testbed.optics, testbed.band
+    glow = background.glow_map(testbed.scene.background, optics, cam_from_lab, band, sky_light(sky))
+    if testbed.reflecting:
+        glow = glow + wall.wall_glow(testbed.reflecting, optics, cam_from_lab, camera_m, band)
+    background.fill(light_e, glow, exposure_s)
+    add_earth(light_e, testbed, cam_from_lab, t_s, exposure_s)
+    black_level = display_glow.black_glow(testbed.scene.light, optics, cam_from_lab, camera_m, band)
+    if black_level is not None:
+        light_e += black_level * exposure_s
+
+
+def satellite_sources(testbed: Testbed, sky: Sky | None, satellites: Sequence[MovingLight]) -> Sources | None:
+    """The satellites as light sources, through the air where there is one; None without satellites."""
+    if not satellites:
+        return None
+    streaks = as_sources(satellites, testbed.band)
+    return sky.lights_seen(streaks, SUN[0]) if sky else streaks
+
+
+def add_stray(
+    light_e: NDArray[Any],
+    sources: SourceTruth,
+    lights: Lights,
+    exposed: Exposed,
+    testbed: Testbed,
+    occludes: OcclusionTest | None,
+) -> SourceTruth:
+    """Add the lens's ghosts and glare to the image, in place; return the truth of all images."""
+    camera = testbed.scene.camera
+    for number, ghost in enumerate(camera.ghosts, 1):
+        by_ghost = exposed._replace(optics=ghosts.ghost_optics(testbed.optics, ghost))
+        drawn = draw_lights(light_e, lights, by_ghost, testbed.emitter, occludes)
+        sources = concatenated([sources, ghosts.as_ghosts(drawn, number)])
+    if camera.glare:
+        glare.add_glare(light_e, camera.glare)
+        sources = glare.without_glare(sources, camera.glare)
+    return sources
 
 
 def add_earth(light_e: NDArray[Any], testbed: Testbed, cam_from_lab: Rotation, t_s: float, exposure_s: float) -> None:
@@ -128,7 +163,44 @@ def view_of(testbed: Testbed, window: Window, cam_from_lab: Rotation, middle_s: 
     return View(cam_from_lab.inv().apply([0.0, 0.0, 1.0]), testbed.optics.field_rad, turn_rad, duration_s)
 
 
-def seen_stars(testbed: Testbed, sky: Sky, window: Window, index: int) -> Sources:
+def at_time(testbed: Testbed, t_s: float) -> Testbed:
+    """The test bed with LEDs, mount and lens where the temperature of that time has moved them."""
+    if testbed.scene.thermal is None:
+        return testbed
+    hardware = thermal.Hardware(testbed.sources, testbed.mount, testbed.optics)
+    return replace(testbed, **thermal.at_time(testbed.scene.thermal, hardware, t_s)._asdict())
+
+
+def with_images(testbed: Testbed, sources: Sources, cam_from_lab: Rotation, camera_m: Floats) -> Sources:
+    """The sources, and the images of LEDs that a camera there sees in the wall."""
+    if not (testbed.reflecting and testbed.reflecting.config.mirrors):
+        return sources
+    images = wall.images_in_wall(testbed.reflecting, sources, testbed.optics, cam_from_lab, camera_m)
+    return with_sources([sources, images])
+
+
+class Lights(NamedTuple):
+    """All that shines in an exposure; no satellites are None."""
+
+    sources: Sources
+    bodies: Sequence[BodyLight]
+    satellites: Sources | None
+
+
+def draw_lights(
+    image: NDArray[Any], lights: Lights, exposed: Exposed, emitter: Emitter, occludes: OcclusionTest | None
+) -> SourceTruth:
+    """Add all lights to the (H, W) image, in place; return the truth of those that gave light."""
+    hidden = behind(lights.bodies, occludes)
+    truths = [render(image, lights.sources, *exposed, emitter, hidden)]
+    if lights.bodies:
+        truths += render_bodies(image, lights.bodies, exposed, occludes)
+    if lights.satellites is not None:
+        truths.append(render(image, lights.satellites, *exposed, None, hidden))
+    return concatenated(truths) if len(truths) > 1 else truths[0]
+
+
+def seen_stars(testbed: Testbed, stars: Sources, sky: Sky, window: Window, index: int) -> Sources:
     """The stars near the field of a frame as they are seen through the air.
 
     The site turns by 15" in a second, which changes a refraction by less than 0.02" at 15 degrees of altitude, so the
@@ -136,7 +208,7 @@ def seen_stars(testbed: Testbed, sky: Sky, window: Window, index: int) -> Source
     """
     scene, rows = testbed.scene, testbed.scene.camera.height_px
     few_poses = poses(testbed.trajectory, testbed.mount, np.linspace(window.open_s, window.close_s(rows), FEW))
-    seen = sky.stars_seen(testbed.sources.take(in_view(testbed.sources, testbed.optics, few_poses)))
+    seen = sky.stars_seen(stars.take(in_view(stars, testbed.optics, few_poses)))
     if not sky.air.config.scintillation:
         return seen
     rng = random_stream(scene.seed, SCINTILLATION, index)

@@ -39,6 +39,7 @@ from skysim.sources.dome import display
 from skysim.sources.dome.clocks import Clocks, build_clocks
 from skysim.sources.dome.layouts.led_list import led_list
 from skysim.sources.dome.led import Emitter
+from skysim.sources.dome.reflection.dome import ReflectingDome, reflecting_dome
 from skysim.sources.dome.shell import surface
 from skysim.sources.orbit.camera_orbit import CameraOrbit, build_orbit, state_at
 from skysim.sources.orbit.earth import hidden_by_earth
@@ -86,6 +87,7 @@ class Testbed:
     clocks    : the LED controllers' oscillators in this run; None where all light is steady
     air       : over the site of a sky scene with `light.air`
     obstacles : occluders of the sources; None where the scene has light.occlusion off
+    reflecting : the dome's reflections; None without light.reflection
     imu_samples: every sample of the IMU; None without one
     reports   : the star tracker's reports on frames solved during the motion (for the filter), by frame index
     update_statuses: the filter's status of each of those updates
@@ -111,6 +113,7 @@ class Testbed:
     clocks: Clocks | None = None
     air: Air | None = None
     obstacles: multibody.Obstacles | None = None
+    reflecting: ReflectingDome | None = None
     telemetry: Telemetry | None = None
     imu_samples: imu.Increments | None = None
     reports: dict[int, Report] = field(default_factory=dict)
@@ -203,6 +206,7 @@ def build_testbed(
         build_clocks(scene.light, sources, scene.seed),
         build_air(scene, band),
         build_obstacles(scene, vehicle),
+        reflecting_dome(scene.light, sources),
         programs=programs,
         profiles=profiles,
         controller=controller,

@@ -222,32 +222,47 @@ def sky_radiance_e_s_m2_sr(mag_arcsec2: float | Floats, band: Band) -> Floats:
     return np.asarray(star_flux_e_s_m2(mag_arcsec2, *SUN, band) / ARCSEC2_SR)
 
 
-def led_strength_e_s_sr(intensity_cd: float | Floats, spectrum: Spectrum, band: Band) -> Floats:
+def led_strength_e_s_sr(
+    intensity_cd: float | Floats, spectrum: Spectrum, band: Band, fwhm_m: float | None = None
+) -> Floats:
     """Candela to photo-electrons: luminous intensity / luminous efficacy * electrons per joule.
 
     intensity_cd : any shape, along the LED's normal
-    spectrum     : "white" (data/led/white.csv, 304 lm/W), or the wavelength in m of a narrow line
+    spectrum     : "white" (data/led/white.csv, 304 lm/W), or the peak wavelength in m of a colored LED
+    fwhm_m       : width of its spectrum at half maximum; None for a narrow line
     Returns photo-electrons s^-1 sr^-1. Raises InputError for a line outside the visible range, which has no candelas.
     """
-    watts_sr = np.asarray(intensity_cd, dtype=float) / lumens_per_watt(spectrum)
-    return radiant_strength_e_s_sr(watts_sr, spectrum, band)
+    watts_sr = np.asarray(intensity_cd, dtype=float) / lumens_per_watt(spectrum, fwhm_m)
+    return radiant_strength_e_s_sr(watts_sr, spectrum, band, fwhm_m)
 
 
-def radiant_strength_e_s_sr(intensity_w_sr: float | Floats, spectrum: Spectrum, band: Band) -> Floats:
+def radiant_strength_e_s_sr(
+    intensity_w_sr: float | Floats, spectrum: Spectrum, band: Band, fwhm_m: float | None = None
+) -> Floats:
     """Radiant intensity to photo-electrons s^-1 sr^-1: I_e ∫ S λ/(h c) QE dλ / ∫ S dλ, S the spectrum's shape."""
     if isinstance(spectrum, str):
         white = _read_curve(DATA / "led" / "white.csv")
         electrons = band.integral(lambda wavelength_m: white.response_at(wavelength_m) * wavelength_m / HC_J_M)
         electrons_per_joule = electrons / white.integral(np.ones_like)
-    else:
+    elif fwhm_m is None:
         electrons_per_joule = band.response_at(spectrum) * spectrum / HC_J_M
+    else:
+        power = colored(spectrum, fwhm_m)
+        electrons_per_joule = band.integral(lambda wavelength_m: power(wavelength_m) * wavelength_m / HC_J_M)
     return np.asarray(np.asarray(intensity_w_sr, dtype=float) * electrons_per_joule)
 
 
-def lumens_per_watt(spectrum: Spectrum) -> float:
+def colored(peak_m: float, fwhm_m: float) -> Callable[[Floats], Floats]:
+    """Gaussian spectrum of a colored LED, per meter of wavelength and with unit integral: s = FWHM / (8 ln 2)^(1/2)."""
+    sigma_m = fwhm_m / math.sqrt(8 * math.log(2))
+    scale = 1 / (math.sqrt(2 * math.pi) * sigma_m)
+    return lambda wavelength_m: scale * np.exp(-0.5 * ((wavelength_m - peak_m) / sigma_m) ** 2)
+
+
+def lumens_per_watt(spectrum: Spectrum, fwhm_m: float | None = None) -> float:
     """Luminous efficacy of radiation, lm/W: 683 ∫ S V dλ / ∫ S dλ, V the eye's response.
 
-    Raises InputError for a line at which V is zero.
+    Raises InputError for a colored LED whose peak is where V is zero.
     """
     photopic = _read_curve(DATA / "bands" / "photopic.csv")
     if isinstance(spectrum, str):
@@ -259,7 +274,9 @@ def lumens_per_watt(spectrum: Spectrum) -> float:
             f"light.led.spectrum: {spectrum * 1e9:g} nm is invisible and has no candelas; allowed: {allowed}, or"
             " radiant_intensity"
         )
-    return float(LUMENS_PER_WATT * photopic.response_at(spectrum))
+    if fwhm_m is None:
+        return float(LUMENS_PER_WATT * photopic.response_at(spectrum))
+    return float(LUMENS_PER_WATT * photopic.integral(colored(spectrum, fwhm_m)))
 
 
 def snr(

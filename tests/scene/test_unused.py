@@ -22,6 +22,10 @@ BOARDS = (
     "{kind: patch_boards, cap_deg: 27, pitch: 8 mm, boards: [{azimuth_deg: 0, tilt_deg: 1, leds: [0, 2, 4, 7, 8]}]}"
 )
 SPREAD = "{kind: patch_boards, cap_deg: 27, pitch: 8 mm, spacing: 60 mm}"
+PANEL = (
+    "{kind: lcd, pixels: [400, 300], pitch: 2 mm, points: {kind: celestial, cap_deg: 10, count: 20,"
+    " camera: [0 m, 0 m, 0 m], zenith_ra_deg: 0, zenith_dec_deg: 90}}"
+)
 SPIRAL = "{kind: fibonacci, count: 900, cap_deg: 27}"
 
 
@@ -37,6 +41,13 @@ class Case(NamedTuple):
 
 DOME, SKY, BENCH = "afit_simsat", "shefex2", "collimated_display"
 DIRECT = {"light.led.drive": "{kind: direct}"}
+FLAT = {"light.surface": "{kind: flat, apex: 48 in}"}
+FLOOR = "{share: 0.5, depth: 1 m, radius: 1 m}"
+WARMING = {
+    "thermal.mount_arcsec_k": "[1, 2, 3]",
+    "thermal.temperature": "{kind: linear, start_c: 21, rate_c_h: 30}",
+}
+STEADY = {"thermal.temperature": "{kind: steady, temperature_c: 25}"}
 MOON = {"light.bodies": "{}", "start_time": "2012-06-24T21:00:00", "motion.start": "{ra_deg: 154.5, dec_deg: 5}"}
 ORBIT = "{kind: circular, altitude: 500 km, inclination_deg: 97}"
 AIR = {"light.air": "{}", "site": "{latitude_deg: 53, longitude_deg: 9}", "start_time": "2012-06-24T21:00:00"}
@@ -65,6 +76,13 @@ CASES = [
     ),
     Case(DOME, {}, "tracker.survey.surface_seed", "5", {"light.surface.error": "1 mm"}),
     Case(DOME, DIRECT, "light.led.pwm_period", "7 ms", {"light.led.drive": "{kind: pwm}"}),
+    Case(
+        DOME,
+        FLAT | DIRECT | {"light.layout": PANEL, "light.led.spectrum": "630 nm"},
+        "light.led.color_scatter",
+        "5 nm",
+        {},
+    ),
     Case(DOME, DIRECT, "light.led.clock.offset_ppm", "7", {"light.led.drive": "{kind: pwm}"}),
     Case(DOME, {"light.layout": BOARDS}, "light.layout.lit", "[1, 2]", {"light.layout": SPREAD}),
     Case(
@@ -73,6 +91,20 @@ CASES = [
         "light.layout.hardware_seed",
         "7",
         {"light.led.scatter": "0.1"},
+    ),
+    Case(
+        DOME,
+        FLAT | {"light.reflection": f"{{floor: {FLOOR}}}"},
+        "light.reflection.specular",
+        "0.1",
+        {"light.surface": "{kind: sphere, apex: 48 in, radius: 48 in}"},
+    ),
+    Case(
+        DOME,
+        FLAT,
+        "light.reflection.diffuse",
+        "0.5",
+        {"light.reflection": f"{{diffuse: 0.5, floor: {FLOOR}}}"},
     ),
     Case(SKY, {"camera.detector.dark_e_s": "0"}, "camera.detector.dsnu", "0.5", {"camera.detector.dark_e_s": "20"}),
     Case(SKY, {"camera.detector.hot_e_s": "0"}, "camera.detector.hot_pixels", "0.01", {"camera.detector.hot_e_s": "9"}),
@@ -104,6 +136,9 @@ CASES = [
     Case(SKY, MOON, "site.latitude_deg", "-50", {**MOON, "site.longitude_deg": "20"}),
     Case(SKY, {}, "site.longitude_deg", "20", MOON),
     Case(SKY, MOON, "site.height", "9 km", {**MOON, "site.longitude_deg": "20"}),
+    Case(SKY, WARMING, "thermal.dome_ppm_k", "70", {}),
+    Case(DOME, WARMING, "thermal.anchor_height", "1 m", {"thermal.dome_ppm_k": "70"}),
+    Case(DOME, WARMING | STEADY, "thermal.speed", "60", WARMING),
     Case(
         SKY,
         {"light.satellites.random": "{per_field: 1, seed: 1}"},

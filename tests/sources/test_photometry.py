@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.scene.sections.camera import curve_file
+from skysim.scene.sections.leds import LedConfig
 from skysim.sources import catalog
+from skysim.sources.dome.led import color_factors, full_strength_e_s_sr
 from skysim.sources.photometry import (
+    HC_J_M,
     SUN,
     Band,
     black_body_v0,
@@ -372,3 +379,48 @@ def test_a_file_that_is_no_curve_is_refused_in_one_line(tmp_path: Path, text: st
     path.write_text(text)
     with pytest.raises(InputError, match=r"^.*bad\.csv: not a response curve.*$"):
         Band.from_efficiency(str(path))
+
+
+@pytest.mark.parametrize(("peak_nm", "fwhm_nm"), [(470, 25), (525, 35), (630, 18), (590, 3)])
+def test_colored_led(peak_nm: float, fwhm_nm: float) -> None:
+    """Its Gaussian spectrum with QE and the eye's response, against adaptive quadrature."""
+    band, sigma = Band.from_efficiency("cmos"), fwhm_nm / 2.3548200450309493
+    eye = Band(
+        *np.loadtxt(DATA / "bands" / "photopic.csv", delimiter=",", comments="#", skiprows=skipped("photopic")).T
+    )
+    eye = Band(eye.wavelength_m * 1e-9, eye.response)
+
+    def integral(weight: Callable[[float], float]) -> float:
+        def shape(nm: float) -> float:
+            return math.exp(-0.5 * ((nm - peak_nm) / sigma) ** 2) * weight(nm * 1e-9)
+
+        ends = np.arange(peak_nm - 7 * sigma, peak_nm + 7 * sigma + 1, sigma / 2)
+        return sum(quad(shape, a, b)[0] for a, b in itertools.pairwise(ends)) / (math.sqrt(2 * math.pi) * sigma)
+
+    electrons = integral(lambda m: float(band.response_at(m)) * m / HC_J_M)
+    lumens = 683 * integral(lambda m: float(eye.response_at(m)))
+    found = led_strength_e_s_sr(0.2, peak_nm * 1e-9, band, fwhm_nm * 1e-9)
+    assert found == pytest.approx(0.2 * electrons / lumens, rel=2e-4)
+
+
+def skipped(name: str) -> int:
+    """Lines of a curve's file before its numbers."""
+    lines = (DATA / "bands" / f"{name}.csv").read_text().splitlines()
+    return next(n for n, line in enumerate(lines) if line[0].isdigit())
+
+
+def test_color_scatter() -> None:
+    """LEDs of 630 nm within 2 nm, at equal candela: by the slope of QE times wavelength over V."""
+    band = Band.from_efficiency("cmos")
+    led = LedConfig.model_validate(
+        {"intensity": "10 mcd", "disk_diameter": "2 mm", "spectrum": "630 nm", "fwhm": "18 nm", "color_scatter": "2 nm"}
+    )
+    normal = np.random.default_rng(4).standard_normal(2000)
+    factors = color_factors(led, band, normal)
+    nominal = full_strength_e_s_sr(led, band)
+    for n in range(0, 2000, 400):
+        one = led_strength_e_s_sr(10e-3, 630e-9 + 2e-9 * normal[n], band, 18e-9)
+        assert factors[n] == pytest.approx(float(one) / nominal, rel=1e-5)
+    steps = [float(led_strength_e_s_sr(10e-3, 630e-9 + d, band, 18e-9)) for d in (-1e-9, 1e-9)]
+    slope = math.log(steps[1] / steps[0]) / 2  # a nanometer
+    assert np.log(factors).std() == pytest.approx(abs(2 * slope), rel=0.08)

@@ -136,9 +136,9 @@ class ConfigModel(BaseModel):
     )
 
 
-def check_table(angle_deg: Sequence[float], values: Sequence[float], name: str) -> None:
-    """Raise ValueError unless two columns have equal length and the angle ascends."""
-    if len(angle_deg) != len(values):
-        raise ValueError(f"angle_deg has {len(angle_deg)} numbers, {name} has {len(values)}")
-    if any(b <= a for a, b in itertools.pairwise(angle_deg)):
-        raise ValueError("angle_deg is not strictly ascending")
+def check_table(first: Sequence[float], values: Sequence[float], name: str, first_name: str = "angle_deg") -> None:
+    """Raise ValueError unless two columns have equal length and the first, the angle, ascends."""
+    if len(first) != len(values):
+        raise ValueError(f"{first_name} has {len(first)} numbers, {name} has {len(values)}")
+    if any(b <= a for a, b in itertools.pairwise(first)):
+        raise ValueError(f"{first_name} is not strictly ascending")

@@ -130,7 +130,7 @@ RULES = (
             *("exposure.time", "exposure.first", "exposure.trigger_jitter", "background", "camera.transmission"),
             *("camera.f_number", "camera.psf", "camera.shutter", *DETECTOR, "tracker.detector", "tracker.centroider"),
             *("tracker.threshold_sigma", "tracker.min_area_px", "light.led.intensity", "light.led.radiant_intensity"),
-            *("light.led.pwm_period", "light.led.clock"),
+            *("light.led.pwm_period", "light.led.clock", "light.reflection", "camera.ghosts", "camera.glare"),
         ),
         lambda scene, trial: isinstance(trial, CentroidTrial),
         "a trial of kind centroids has no image: trial.noise_px is the centroids' error",

@@ -89,7 +89,12 @@ def listed_boards(scene: Scene) -> bool:
 
 def dome_draws_nothing(scene: Scene) -> bool:
     """Whether LEDs, their brightness and their pulses are all without anything random."""
-    if not isinstance(scene.light, DomeConfig) or not steady(scene) or scene.light.led.scatter:
+    if (
+        not isinstance(scene.light, DomeConfig)
+        or not steady(scene)
+        or scene.light.led.scatter
+        or scene.light.led.color_scatter_m
+    ):
         return False
     layout = scene.light.layout
     if isinstance(layout, FibersConfig) and layout.radius_variation:
@@ -115,6 +120,15 @@ def uniform_chip(detector: DetectorConfig) -> bool:
 def earth_unused(scene: Scene) -> bool:
     imu = scene.vehicle.imu
     return not scene.vehicle.disturbances.earth_rotation and (imu is None or imu.earth_rate == "none")
+
+
+def flat_wall(scene: Scene) -> bool:
+    return isinstance(scene.light, DomeConfig) and scene.light.surface.kind == "flat"
+
+
+def has_floor(scene: Scene) -> bool:
+    reflection = getattr(scene.light, "reflection", None)
+    return reflection is not None and reflection.floor is not None
 
 
 def seen_from_earth(scene: Scene) -> bool:
@@ -205,10 +219,28 @@ RULES = (
         "light.led.drive: {kind: pwm}",
     ),
     Rule(
+        ("light.led.color_scatter",),
+        lambda scene: isinstance(getattr(scene.light, "layout", None), LcdConfig),
+        "the pixels of a panel share their light",
+        "another light.layout",
+    ),
+    Rule(
         ("light.led.clock",),
         steady,
         "the drive direct has no pulses to time",
         "another light.led.drive",
+    ),
+    Rule(
+        ("light.reflection.specular", "light.reflection.refractive_index"),
+        flat_wall,
+        "a flat wall has no image of the LEDs on it",
+        "another light.surface",
+    ),
+    Rule(
+        ("light.reflection.diffuse",),
+        lambda scene: flat_wall(scene) and not has_floor(scene),
+        "the LEDs on a flat wall do not shine on it",
+        "light.reflection.floor, or another light.surface",
     ),
     Rule(
         ("light.layout.spacing", "light.layout.spread", "light.layout.lit", "light.layout.pwm_levels"),
@@ -306,6 +338,24 @@ RULES = (
         earth_unused,
         "nothing depends on the Earth's rotation",
         "vehicle.disturbances.earth_rotation, or a vehicle.imu whose earth_rate is not none",
+    ),
+    Rule(
+        ("thermal.dome_ppm_k", "thermal.anchor_height", "thermal.creep"),
+        lambda scene: not under_dome(scene),
+        "there is no dome to move",
+        "light of kind dome",
+    ),
+    Rule(
+        ("thermal.anchor_height",),
+        lambda scene: scene.thermal is not None and not scene.thermal.dome_ppm_k,
+        "the dome does not expand",
+        "thermal.dome_ppm_k",
+    ),
+    Rule(
+        ("thermal.speed",),
+        lambda scene: scene.thermal is not None and scene.thermal.temperature.kind == "steady",
+        "the temperature is steady",
+        "another thermal.temperature",
     ),
     Rule(
         ("tracker.orbit_velocity",),

@@ -114,6 +114,37 @@ class VignettingTableConfig(ConfigModel):
         return self
 
 
+class GhostConfig(ConfigModel):
+    """A ghost of every light: light that a pair of the lens's surfaces reflects back to the chip.
+
+    magnification : its distance from the principal point over the image's, on the other side of it; below 0 on the same
+    share         : its light over the image's: the product of the two reflectances
+    radius_px     : of the disk over which it is spread, out of focus
+    """
+
+    magnification: Annotated[Number, Field(ge=-20, le=20)]
+    share: Annotated[Fraction, Field(gt=0)]
+    radius_px: Annotated[Number, Field(gt=0, le=200)]
+
+    @field_validator("magnification")
+    @classmethod
+    def check_magnification(cls, value: float) -> float:
+        if abs(value) < 0.05:
+            raise ValueError(f"{value:g} images half of space on the chip; allowed: from 0.05 or to -0.05")
+        return value
+
+
+class GlareConfig(ConfigModel):
+    """Veiling glare: light scattered over the chip, (1 + (r / core_px)^2)^(-exponent / 2) at the distance r.
+
+    share    : of all light;  core_px : where the law of the power begins
+    """
+
+    share: Annotated[Fraction, Field(gt=0, lt=1)]
+    exponent: Annotated[Number, Field(gt=2, le=10)]
+    core_px: Annotated[Number, Field(ge=2, le=1000)]
+
+
 class GlobalShutterConfig(ConfigModel):
     """All rows are exposed at the same time."""
 
@@ -269,7 +300,10 @@ class DetectorConfig(ConfigModel):
 
 
 class CameraConfig(ConfigModel):
-    """Lens and chip as the hardware is. What the tracker assumes about them is in `tracker`."""
+    """Lens and chip as the hardware is. What the tracker assumes about them is in `tracker`.
+
+    ghosts, glare : stray light of what is in the field; light from outside is `background` of kind stray
+    """
 
     width_px: Annotated[int, Field(ge=16, le=20000)]
     height_px: Annotated[int, Field(ge=16, le=20000)]
@@ -282,6 +316,8 @@ class CameraConfig(ConfigModel):
     distortion: tuple[Radial, Radial, Tangential, Tangential, Radial] = (0.0, 0.0, 0.0, 0.0, 0.0)
     principal_point_px: tuple[Number, Number] | None = None
     psf: Psf = GaussianPsfConfig()
+    ghosts: tuple[GhostConfig, ...] = ()
+    glare: GlareConfig | None = None
     shutter: Shutter = GlobalShutterConfig()
     detector: DetectorConfig
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from skysim.core.quantities.tolerance import NumberError, Tolerance
+from skysim.core.quantities.tolerance import LengthError, NumberError, Tolerance
 from skysim.core.quantities.units import (
     Ascending,
     ConfigModel,
@@ -93,6 +93,10 @@ class ClockConfig(ConfigModel):
 class LedConfig(ConfigModel):
     """The one LED type of the dome: intensity along its normal, in candela or in watts per steradian.
 
+    spectrum : white (data/led/white.csv), or the peak wavelength of a colored LED
+    fwhm     : width of a colored LED's spectrum at half maximum, a Gaussian in power; a narrow line if left out
+    color_scatter : of the peak wavelength from LED to LED, at the same intensity: standard deviation or tolerance (a
+        bin); from the layout's hardware_seed
     scatter : of the intensity from LED to LED: standard deviation of its logarithm, or its tolerance as a fraction
         (a bin of ±10 %: {tolerance: 0.1})
     drive : how its level is made; pwm_period belongs to the kind pwm
@@ -105,6 +109,8 @@ class LedConfig(ConfigModel):
     falloff: Literal["inverse_square"] = "inverse_square"
     lobe: Lobe = CosineLobeConfig()
     spectrum: Literal["white"] | Annotated[Length, Field(ge=300e-9, le=1100e-9)] = "white"
+    fwhm_m: Annotated[Length, Field(ge=3e-9, le=200e-9)] | None = None
+    color_scatter_m: Annotated[LengthError, Field(le=30e-9)] = 0.0
     scatter: Annotated[NumberError, Field(lt=0.5)] = 0.0
     drive: Drive = PwmConfig()
     clock: ClockConfig = ClockConfig()
@@ -114,6 +120,13 @@ class LedConfig(ConfigModel):
     def check_intensity(self) -> LedConfig:
         if (self.intensity_cd is None) == (self.radiant_intensity_w_sr is None):
             raise ValueError("an LED takes either intensity or radiant_intensity")
+        return self
+
+    @model_validator(mode="after")
+    def check_color(self) -> LedConfig:
+        if self.spectrum == "white" and (self.fwhm_m is not None or self.color_scatter_m):
+            key = "color_scatter" if self.fwhm_m is None else "fwhm"
+            raise ValueError(f"{key}: a white LED has a spectrum of its own; allowed: a wavelength as spectrum")
         return self
 
     @field_validator("scatter")

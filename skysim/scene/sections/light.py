@@ -199,11 +199,58 @@ class RoomConfig(ConfigModel):
         return self
 
 
+class FloorConfig(ConfigModel):
+    """A level disc below the bearing's center that scatters light by Lambert's law: floor, table and vehicle.
+
+    share  : of the light that it scatters
+    depth  : below the bearing's center
+    radius : the wall should not be between it and the LEDs: up to that of the rim
+    """
+
+    share: Annotated[Fraction, Field(gt=0, lt=1)]
+    depth_m: Annotated[Length, Field(gt=0)]
+    radius_m: Annotated[Length, Field(gt=0)]
+
+
+class ReflectionConfig(ConfigModel):
+    """Light that the dome's inside and the floor reflect.
+
+    diffuse          : share of the light on the wall that it scatters by Lambert's law: a glow
+    specular         : share that it mirrors, at any angle: images of the LEDs
+    refractive_index : of a polished wall, which mirrors by Fresnel's equations for unpolarized light; in place of
+        specular. Acrylic has 1.49
+    floor            : black if left out
+    """
+
+    diffuse: Annotated[Fraction, Field(lt=1)] = 0.0
+    specular: Annotated[Fraction, Field(lt=1)] = 0.0
+    refractive_index: Annotated[Number, Field(gt=1, le=4)] | None = None
+    floor: FloorConfig | None = None
+
+    @model_validator(mode="after")
+    def check_shares(self) -> Self:
+        if self.specular and self.refractive_index is not None:
+            raise ValueError("specular and refractive_index conflict; allowed: one of the two")
+        if self.diffuse + self.specular >= 1:
+            raise ValueError(f"diffuse {self.diffuse:g} and specular {self.specular:g} leave no loss; allowed: below 1")
+        if not (self.diffuse or self.mirrors or self.floor):
+            raise ValueError(
+                "nothing reflects; allowed: diffuse, specular, refractive_index or floor, or no reflection"
+            )
+        return self
+
+    @property
+    def mirrors(self) -> bool:
+        """Whether the wall makes images of the LEDs."""
+        return self.specular > 0 or self.refractive_index is not None
+
+
 class DomeConfig(ConfigModel):
     """An LED dome as the light source.
 
-    occlusion : whether the vehicle's parts and the dome's own wall hide LEDs
-    room      : limits of the room in which it is to be built; unlimited if left out
+    occlusion  : whether the vehicle's parts and the dome's own wall hide LEDs
+    reflection : of wall and floor; black if left out
+    room       : limits of the room in which it is to be built; unlimited if left out
     """
 
     kind: Literal["dome"]
@@ -211,6 +258,7 @@ class DomeConfig(ConfigModel):
     layout: Layout
     led: LedConfig
     occlusion: bool = True
+    reflection: ReflectionConfig | None = None
     room: RoomConfig | None = None
 
     @model_validator(mode="after")

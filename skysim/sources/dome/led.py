@@ -27,6 +27,7 @@ from skysim.scene.sections.leds import (
 )
 from skysim.sources.photometry import Band, led_strength_e_s_sr, radiant_strength_e_s_sr
 
+COLORS = 129  # wavelengths at which a colored LED's strength is computed
 Falloff = Callable[[Floats], Floats]
 
 
@@ -92,8 +93,20 @@ def irradiance_e_s_m2(
 def full_strength_e_s_sr(led: LedConfig, band: Band) -> float:
     """Strength of an LED at full brightness in the chip's band: photo-electrons s^-1 sr^-1 along its normal."""
     if led.intensity_cd is not None:
-        return float(led_strength_e_s_sr(led.intensity_cd, led.spectrum, band))
-    return float(radiant_strength_e_s_sr(led.radiant_intensity_w_sr or 0.0, led.spectrum, band))
+        return float(led_strength_e_s_sr(led.intensity_cd, led.spectrum, band, led.fwhm_m))
+    return float(radiant_strength_e_s_sr(led.radiant_intensity_w_sr or 0.0, led.spectrum, band, led.fwhm_m))
+
+
+def color_factors(led: LedConfig, band: Band, normal: Floats) -> Floats:
+    """Strengths of LEDs of other peak wavelengths over the nominal one's, at the same intensity, from normal numbers.
+
+    They are interpolated between COLORS wavelengths.
+    """
+    assert not isinstance(led.spectrum, str)
+    peak_m = led.spectrum + scaled_errors(led.color_scatter_m, normal)
+    grid_m = np.linspace(peak_m.min(), peak_m.max(), COLORS)
+    strengths = [full_strength_e_s_sr(led.model_copy(update={"spectrum": one}), band) for one in grid_m.tolist()]
+    return np.interp(peak_m, grid_m, strengths) / full_strength_e_s_sr(led, band)
 
 
 def strength_factors(scatter: float, normal: Floats) -> Floats:

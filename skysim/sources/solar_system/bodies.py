@@ -49,11 +49,6 @@ BODIES = {
 NAMES = {body.id: name.capitalize() for name, body in BODIES.items()}
 
 
-def light_name(id: int) -> str:
-    """The name of a body, the number of any other light."""
-    return NAMES.get(id, str(id))
-
-
 @dataclass(frozen=True, slots=True)
 class BodyLight:
     """One body in the sky, in the lab's axes (the ICRS).

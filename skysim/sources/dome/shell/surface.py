@@ -96,6 +96,11 @@ class Surface(ABC):
         within = self.within(start + distance[:, None] * along)
         return np.asarray(origin_m + np.where(within, distance, np.nan)[:, None] * rays)
 
+    def exit_m(self, origin_m: Floats, rays: Floats) -> Floats:
+        """(N,) `distance` of rays in the lab's axes, to the surface or to where it would be beyond its rim."""
+        R_lab_from_own = self.lab_from_own.as_matrix()
+        return self.distance((origin_m - self.center_m) @ R_lab_from_own, rays @ R_lab_from_own)
+
     def inward(self, points_m: Floats) -> Floats:
         """(N, 3) unit normals toward the inside, at points of the surface: minus the level's gradient."""
         R_lab_from_own = self.lab_from_own.as_matrix()

@@ -1,0 +1,1 @@
+"""Stray light: the dome's reflections as the camera sees them, ghosts of the lens, and its veiling glare."""
