@@ -206,6 +206,6 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
     target.__name__: target
     for target in (
         *(scenes, studies, overrides, fits, pictures, catalogs, maps, truths, calibrations),
-        *(tables, vehicles, stores, answers, profiles, torques, packets, quantities, orbits),
+        *(tables, vehicles, stores, answers, profiles, orbits, torques, packets, quantities),
     )
 }

@@ -21,7 +21,7 @@ from skysim.sources.air import starlight
 from skysim.sources.air.air import Air, horizon_rad, mean_wavelength_m
 from skysim.sources.air.refraction import Atmosphere, Refraction, Weather, refraction_rad
 from skysim.sources.photometry import Band
-from skysim.sources.solar_system.bodies import BODIES, bodies_at
+from skysim.sources.solar_system.bodies import BODIES, bodies_from
 from skysim.sources.solar_system.observer import observe_from
 
 BAND = Band.from_efficiency(0.5)
@@ -55,7 +55,7 @@ def test_refraction_is_that_of_astropy(place: tuple[float, float, float], weathe
     time, stars_of = datetime.datetime(2012, 6, 24, 23, 10), catalog.read_for("x", "hipparcos_hp6.5").to_limit(4.0)
     still = np.zeros(len(stars_of))
     stars_of = replace(stars_of, pm_ra_rad_yr=still, pm_dec_rad_yr=still, parallax_rad=still)
-    directions = stars.apparent(stars_of, time, observe_from(time, site_of(place)).from_earth_m_s)
+    directions = stars.apparent(stars_of, time, observe_from(time, site_of(place)).from_earth.velocity_m_s)
     keys = {"pressure_hpa": pressure_hpa, "temperature_c": temperature_c, "humidity": humidity}
     sky = air_at(place, **keys, wavelength=f"{nm} nm").at(time)
     azimuth, altitude = horizontal(sky.axes, directions)
@@ -110,7 +110,7 @@ def test_refraction_on_the_horizon_is_half_a_degree() -> None:
 def test_bodies_rise_as_stars_do() -> None:
     """The Moon is raised by the refraction of its place, and its bright limb stays across the line of sight."""
     time, air = datetime.datetime(2012, 6, 24, 20, 0), air_at(SITES[0])
-    for body in bodies_at(_bodies(), air.site, time, BAND):
+    for body in bodies_from(_bodies(), observe_from(time, air.site), BAND):
         sky = air.at(time)
         seen = sky.body_seen(body)
         moved = np.arccos(min(float(seen.place.direction @ body.place.direction), 1.0))
