@@ -50,12 +50,20 @@ def measure() -> list[dict[str, Any]]:
 
 
 def bodies() -> list[dict[str, Any]]:
-    """Wrong attitudes, and the solved share of frames with six catalog stars, with a body in or near each field."""
-    lights = {"light.bodies": {}}
+    """Wrong attitudes, and the solved share of frames with six catalog stars: a body in or near each field, a satellite
+    in every field in the mean, and the airglow of a dark site.
+    """
+    lights = {
+        "light.bodies": {},
+        "light.satellites": {"random": {"per_field": 1, "seed": SEED}},
+        "background": [{"kind": "sky", "mag_arcsec2": 21.9}],
+    }
     trials = study_trials("shefex2", lights, {"body": {"levels": BODIES}}, BODY_FRAMES)
     testbed = build_testbed(load("shefex2"))
     enough = np.array([catalog_stars(testbed, row) >= MIN_STARS for row in trials])
-    return shares(f"bodies in the field, {len(trials)} frames", trials[enough], len(trials), wrong_of=trials, bar=97)
+    return shares(
+        f"bodies, satellites and airglow, {len(trials)} frames", trials[enough], len(trials), wrong_of=trials, bar=97
+    )
 
 
 def narrow(fov_deg: float) -> list[dict[str, Any]]:

@@ -314,7 +314,7 @@ def satellites_during(testbed: Testbed, view: View, t_s: float, index: int) -> l
 
         found += known_satellites(testbed.satellites, config.standard_mag, view, time, observer_at)
     if config and config.random:
-        found += random_satellites(config.random, view, index)
+        found += random_satellites(config.random, view, scene.seed, index)
     return found
 
 

@@ -217,7 +217,7 @@ def test_satellites_of_the_field_are_those_that_cross_it(low_orbits: elements.El
 def test_random_satellites_have_their_density_rates_and_magnitudes() -> None:
     config = RandomSatellitesConfig(per_field=30.0, rate_deg_s=(0.1, 2.0), v_mag=(3.0, 5.0), seed=8)
     view = View(np.array([0.6, 0.0, 0.8]), 0.1, 0.0, 1.0)
-    drawn = [list(satellites.random_satellites(config, view, index)) for index in range(60)]
+    drawn = [list(satellites.random_satellites(config, view, 1, index)) for index in range(60)]
     lights = [light for frame in drawn for light in frame]
     inside = sum(light.place @ view.boresight > np.cos(view.field_rad) for light in lights)
     assert inside / 60 == pytest.approx(30, abs=4 * np.sqrt(30 / 60))
@@ -229,5 +229,7 @@ def test_random_satellites_have_their_density_rates_and_magnitudes() -> None:
     assert magnitudes.mean() == pytest.approx(4, abs=0.05)
     headings = np.array([light.motion[0] / np.linalg.norm(light.motion[0]) for light in lights])
     assert np.abs(headings.mean(axis=0)).max() < 0.05
-    again = list(satellites.random_satellites(config, view, 3))
+    other_run = list(satellites.random_satellites(config, view, 2, 3))
+    assert [light.truth for light in other_run] != [light.truth for light in drawn[3]]
+    again = list(satellites.random_satellites(config, view, 1, 3))
     assert [str(light.truth) for light in again] == [str(light.truth) for light in drawn[3]]

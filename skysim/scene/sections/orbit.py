@@ -20,7 +20,7 @@ class RandomSatellitesConfig(ConfigModel):
     per_field  : mean number in the camera's field (the circle around its chip) at any moment
     rate_deg_s : least and greatest angular rate against the stars; its logarithm is uniformly distributed
     v_mag      : least and greatest V magnitude, uniformly distributed
-    seed       : of all these draws
+    seed       : of all these draws, together with the scene's
     """
 
     per_field: Annotated[Number, Field(gt=0, le=1000)]

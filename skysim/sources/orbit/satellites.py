@@ -129,13 +129,13 @@ def path(
     return place, motion
 
 
-def random_satellites(config: RandomSatellitesConfig, view: View, index: int) -> Iterator[MovingLight]:
-    """Random satellites that can cross the field in the exposure of a frame.
+def random_satellites(config: RandomSatellitesConfig, view: View, run_seed: int, index: int) -> Iterator[MovingLight]:
+    """Random satellites that can cross the field in the exposure of a frame of the run with a scene's seed.
 
     They are uniformly distributed over a cone that holds all paths through the field, as many (Poisson) as `per_field`
     gives for its solid angle, and move along great circles.
     """
-    rng = random_stream(config.seed, SATELLITES, index)
+    rng = random_stream(config.seed, SATELLITES, run_seed, index)
     slowest, fastest = np.radians(config.rate_deg_s)
     reach_rad = min(view.field_rad + (view.turn_rad + fastest * view.duration_s) / 2, np.pi)
     mean = config.per_field * (1 - np.cos(reach_rad)) / (1 - np.cos(view.field_rad))
