@@ -183,8 +183,9 @@ class StarSources(Sources):
 
 
 def with_sources(parts: Sequence[Sources]) -> Sources:
-    """All sources of several sets, in their order."""
-    return Sources(*(np.concatenate([getattr(part, name) for part in parts]) for name in Sources.__slots__))
+    """All sources of several sets of which none moves, in their order."""
+    names = [name for name in Sources.__slots__ if name != "motion"]
+    return Sources(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 @dataclass(frozen=True, slots=True)
