@@ -64,6 +64,7 @@ def test_daylight_is_as_bright_as_the_day() -> None:
     assert (np.diff(falling) < 0).all()
 
 
+@pytest.mark.slow
 def test_the_moon_lights_the_sky_only_above_the_horizon() -> None:
     full_up, full_down = "2012-06-03T23:00:00", "2012-06-04T10:00:00"
     mean = {}

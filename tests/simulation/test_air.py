@@ -75,6 +75,7 @@ def test_stars_are_raised_and_dimmed_in_the_frame() -> None:
     np.testing.assert_allclose(lost_mag[inside], 0.172 * masses[inside], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_the_skyline_hides_stars_and_the_truth_says_which() -> None:
     low = {"light.air.horizon": "{azimuth_deg: [0, 180], altitude_deg: [20, 20]}"}
     free, hilly = (frame_at(bed(**keys), 20.0) for keys in ({}, low))
@@ -88,6 +89,7 @@ def test_the_skyline_hides_stars_and_the_truth_says_which() -> None:
     assert len(frame_at(bed(), -20.0).sources.id) == 0
 
 
+@pytest.mark.slow
 def test_stars_twinkle_by_frame_and_star() -> None:
     testbed = bed(**{"light.air.scintillation": "true"})
     sources = [frame_at(testbed, 60.0, index).sources for index in (0, 0, 1)]
@@ -106,6 +108,7 @@ def test_stars_twinkle_by_frame_and_star() -> None:
     assert ratio.var() == pytest.approx(variance, rel=0.25)
 
 
+@pytest.mark.slow
 def test_seeing_widens_images_by_its_variance() -> None:
     """20" at the zenith before a lens of 200 mm; at 30 degrees of altitude 2^0.6 times that."""
     keys, areas = {"camera.focal_length": "200 mm", "camera.f_number": "4"}, []

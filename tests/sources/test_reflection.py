@@ -106,6 +106,7 @@ def test_floor_under_one_led() -> None:
     assert at_floor[0] == pytest.approx(2.5**2 / (0.7**2 + 2.5**2) ** 2, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_dome_that_stands_on_the_floor_keeps_its_light() -> None:
     """Wall and floor absorb what the LED emits; patches beside the edge, where K is singular, make 3 %."""
     rim = Rim(half_rad=math.radians(120))
