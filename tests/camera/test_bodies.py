@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.discs import bodies as drawing
-from skysim.camera.discs.disc_image import Exposed, points_of
+from skysim.camera.discs.disc_image import Exposed, convolved, points_of
 from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render
 from skysim.core.types import Floats, Mount, Trajectory
@@ -165,3 +165,12 @@ def test_a_star_behind_the_moon_is_hidden() -> None:
     assert by_both is not None
     assert by_both(stars).all()
     assert drawing.behind([], None) is None
+
+
+def test_a_disc_takes_no_light_from_the_pixels_around_it() -> None:
+    """Rounding of the transforms is far below zero beside a bright disc; sums of such pixels alone were negative."""
+    light, patches = np.zeros((40, 40)), np.zeros((2, 2, 9, 9))
+    light[10:30, 10:30], patches[:, :, 4, 4] = 1e12, 1.0
+    image = convolved(light, patches)
+    assert image.min() == 0.0
+    assert image.sum() == pytest.approx(light.sum(), rel=1e-12)

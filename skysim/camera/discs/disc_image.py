@@ -144,13 +144,17 @@ def disc_image(body: BodyLight, disc: DiscOnChip, exposed: Exposed, hidden: Hidd
 
 
 def convolved(light: Floats, patches: Floats) -> Floats:
-    """The sum over phases (q, p) of the convolutions of light[q::s, p::s] with patches[q, p], in full."""
+    """The sum over phases (q, p) of the convolutions of light[q::s, p::s] with patches[q, p], in full.
+
+    The transforms round where there is no light; what falls below zero is cut, as a disc's edge alone may be on the
+    chip, whose light would be negative.
+    """
     steps, _, height, width = patches.shape
     full = (len(light) // steps + height - 1, len(light) // steps + width - 1)
     shape = [fft.next_fast_len(size, real=True) for size in full]
     by_phase = light.reshape(len(light) // steps, steps, -1, steps).transpose(1, 3, 0, 2)
     spectrum = (fft.rfft2(by_phase, shape) * fft.rfft2(patches, shape)).sum(axis=(0, 1))
-    return np.asarray(fft.irfft2(spectrum, shape)[: full[0], : full[1]])
+    return np.maximum(fft.irfft2(spectrum, shape)[: full[0], : full[1]], 0.0)
 
 
 def lattice_light(body: BodyLight, radius_from_px: Floats, reach_px: int, steps: int, hidden: Hidden | None) -> Floats:
