@@ -223,12 +223,11 @@ def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]
     span_rad = float(np.arccos(np.clip(boresight @ boresight[0], -1, 1)).max())
     cos_limit, cos_any = (math.cos(min(angle_rad, math.pi)) for angle_rad in (half_rad, half_rad + span_rad))
     place, camera_m = sources.place, np.ascontiguousarray(poses.camera_m)
-    deep = isinstance(sources, StarSources) and len(sources) >= MIN_TREE_STARS
-    if not deep or (1 - cos_any) / 2 > MAX_TREE_SHARE:
-        return np.flatnonzero(_in_cone(place, boresight, camera_m, cos_limit, cos_any))
-    assert isinstance(sources, StarSources)
-    near = sources.within(boresight[0], half_rad + span_rad)
-    return near[_in_cone(place[near], boresight, camera_m, cos_limit, cos_any)]
+    by_tree = len(sources) >= MIN_TREE_STARS and (1 - cos_any) / 2 <= MAX_TREE_SHARE
+    if by_tree and isinstance(sources, StarSources):
+        near = sources.within(boresight[0], half_rad + span_rad)
+        return near[_in_cone(place[near], boresight, camera_m, cos_limit, cos_any)]
+    return np.flatnonzero(_in_cone(place, boresight, camera_m, cos_limit, cos_any))
 
 
 @jit

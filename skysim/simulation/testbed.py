@@ -191,7 +191,8 @@ def build_testbed(
     mount = multibody.camera_mount(vehicle)
     profiles = load_profiles(scene, mount, profile)
     orbit, satellites = build_orbit(scene.orbit, scene.start_time), getattr(scene.light, "satellites", None)
-    sources = light_sources(scene, band, orbit)
+    stars = scene_stars(scene)
+    sources = light_sources(scene, band, orbit, stars)
     return Testbed(
         scene,
         vehicle,
@@ -204,7 +205,7 @@ def build_testbed(
         np.empty((scene.camera.height_px, scene.camera.width_px), dtype),
         Trajectory.at_rest(lab_from_body_start(scene, mount, profiles), 1.0),
         build_clocks(scene.light, sources, scene.seed),
-        build_air(scene, band),
+        build_air(scene, band, stars),
         build_obstacles(scene, vehicle),
         reflecting_dome(scene.light, sources),
         programs=programs,
@@ -216,11 +217,10 @@ def build_testbed(
     )
 
 
-def build_air(scene: Scene, band: Band) -> Air | None:
+def build_air(scene: Scene, band: Band, stars: catalog.Catalog | None) -> Air | None:
     """The air over the scene's site; None without the section `light.air`."""
-    if not isinstance(scene.light, StarsConfig) or scene.light.air is None:
+    if not isinstance(scene.light, StarsConfig) or scene.light.air is None or stars is None:
         return None
-    stars = catalog.read_for("light.catalog", scene.light.catalog)
     return Air.from_config(scene.light.air, scene.site, stars, band)
 
 
@@ -254,11 +254,24 @@ def lab_from_body_start(scene: Scene, mount: Mount, profiles: Sequence[AttitudeS
     return guidance.start_attitude(scene.motion, profiles)
 
 
-def light_sources(scene: Scene, band: Band, orbit: CameraOrbit | None = None) -> Sources:
-    """All light sources of the scene at its start, with strengths in the camera's band."""
+def scene_stars(scene: Scene) -> catalog.Catalog | None:
+    """The catalog of the scene's light; None for a dome."""
+    if isinstance(scene.light, DomeConfig):
+        return None
+    return catalog.read_for("light.catalog", scene.light.catalog)
+
+
+def light_sources(
+    scene: Scene, band: Band, orbit: CameraOrbit | None = None, stars: catalog.Catalog | None = None
+) -> Sources:
+    """All light sources of the scene at its start, with strengths in the camera's band.
+
+    stars : those of `scene_stars`, which are read if they are left out
+    """
     if isinstance(scene.light, DomeConfig):
         return dome.sources(scene.light, band)
-    stars = catalog.read_for("light.catalog", scene.light.catalog)
+    if stars is None:
+        stars = catalog.read_for("light.catalog", scene.light.catalog)
     if isinstance(scene.light, CollimatedDisplayConfig):
         return display.display_sources(scene.light, stars, scene.start_time, band)
     if scene.light.variability_seed is not None:

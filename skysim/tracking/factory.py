@@ -8,7 +8,6 @@ differ from the simulated hardware.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 from estimator.catalog import catalog
 from estimator.core.errors import ImageError
@@ -91,9 +90,6 @@ def solve_frame(
     if isinstance(estimator, UserTracker):
         return estimator.solve_frame(frame, streak_px)
     try:
-        if isinstance(estimator, OrbitStarTracker):
-            report = estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s)
-            return replace(report, attitude=estimator.corrected(report.attitude, frame.t_mid_s))
         if isinstance(estimator, StarTracker):
             return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s)
         return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s)

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
-from estimator.core.types import Attitude
-from estimator.trackers.pipeline import Settings
+from estimator.core.types import Attitude, RateEstimate
+from estimator.trackers.pipeline import Report, Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.types import Floats
 from skysim.sources.orbit.camera_orbit import CameraOrbit, state_at
-
-SPEED_OF_LIGHT_M_S = 299_792_458.0
 
 
 class OrbitStarTracker(StarTracker):
@@ -34,12 +34,24 @@ class OrbitStarTracker(StarTracker):
         self.orbit = orbit
         self.start_m_s = state_at(orbit, 0.0).velocity_m_s
 
+    def solve(
+        self,
+        image: NDArray[Any],
+        streak_px: tuple[float, float] | None = None,
+        rate: RateEstimate | None = None,
+        exposure_s: float | None = None,
+        t_s: float = 0.0,
+    ) -> Report:
+        """As `StarTracker.solve`; t_s : time of the frame since the orbit's start."""
+        report = super().solve(image, streak_px, rate, exposure_s)
+        return replace(report, attitude=self.corrected(report.attitude, t_s))
+
     def corrected(self, attitude: Attitude, t_s: float) -> Attitude:
         """The attitude of a frame at a time since the scene's start."""
         if attitude.cam_from_ref is None:
             return attitude
         boresight = attitude.cam_from_ref.inv().apply([0.0, 0.0, 1.0])
-        changed = (state_at(self.orbit, t_s).velocity_m_s - self.start_m_s) / SPEED_OF_LIGHT_M_S
+        changed = (state_at(self.orbit, t_s).velocity_m_s - self.start_m_s) / catalog.SPEED_OF_LIGHT_M_S
         now_from_start = Rotation.from_rotvec(np.cross(boresight, changed))
         return replace(attitude, cam_from_ref=attitude.cam_from_ref * now_from_start.inv())
 

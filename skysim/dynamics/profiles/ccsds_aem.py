@@ -12,12 +12,12 @@ from __future__ import annotations
 import datetime
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
+from skysim.core.io.ccsds import Segment, check_version, keyword_value, one_of
 from skysim.core.io.text import SCALES, Line, excerpt, seconds_since, to_numbers
 from skysim.core.types import Floats
 from skysim.dynamics.profiles.frames import REFERENCES, frame_of, icrs_from
@@ -30,13 +30,6 @@ TYPES = {"QUATERNION": 4, "QUATERNION/DERIVATIVE": 8, "QUATERNION/RATE": 7, "QUA
 DIRECTIONS, ORDERS = ("A2B", "B2A"), ("FIRST", "LAST")
 REQUIRED = ("REF_FRAME_A", "REF_FRAME_B", "TIME_SYSTEM", "ATTITUDE_TYPE")
 SAME_ATTITUDE_RAD = 1e-6  # of a sample that both of two adjoining segments have
-
-
-class Segment(NamedTuple):
-    """A segment: its metadata with their lines, and its data lines split into words."""
-
-    metadata: dict[str, Line]
-    data: list[tuple[int, list[str]]]
 
 
 def read_aem(path: Path, lines: list[Line], start: datetime.datetime) -> Samples:
@@ -64,17 +57,14 @@ def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[Segment]]:
         elif section == "DATA_START":
             segments[-1].data.append((n, line.split()))
         elif section in ("", "META_START"):
-            key, equals, value = (part.strip() for part in line.partition("="))
-            if not equals:
-                raise InputError(f"{path}, line {n}: {excerpt(line)} is not KEYWORD = value")
+            key, value = keyword_value(path, n, line)
             if section:
                 segments[-1].metadata[key] = (n, value)
             elif key == VERSION:
                 version = value
         else:
             raise InputError(f"{path}, line {n}: {excerpt(line)} after {section}; allowed: DATA_START or META_START")
-    if version not in VERSIONS:
-        raise InputError(f"{path}: {VERSION} is {excerpt(version)}; allowed: {', '.join(VERSIONS)}")
+    check_version(path, VERSION, version, VERSIONS)
     if section not in ("", "DATA_STOP"):
         raise InputError(f"{path}: ends within a segment, after {section}: the file is cut off")
     return version, segments
@@ -92,9 +82,7 @@ def next_section(where: str, section: str, keyword: str) -> str:
 def segment_samples(path: Path, version: str, segment: Segment, start: datetime.datetime) -> Samples:
     """The samples of one segment within its useable span. Raises InputError."""
     metadata, source = segment.metadata, str(path)
-    for key in (*REQUIRED, *(("ATTITUDE_DIR", "QUATERNION_TYPE") if version == "1.0" else ())):
-        if key not in metadata:
-            raise InputError(f"{path}: {key} is missing in the metadata of a segment")
+    segment.require(path, (*REQUIRED, *(("ATTITUDE_DIR", "QUATERNION_TYPE") if version == "1.0" else ())))
     system = one_of(path, metadata, "TIME_SYSTEM", SCALES)
     width = TYPES[one_of(path, metadata, "ATTITUDE_TYPE", TYPES)]
     frames = [frame_of(f"{path}, line {metadata[key][0]}", metadata[key][1]) for key in REQUIRED[:2]]
@@ -117,15 +105,6 @@ def segment_samples(path: Path, version: str, segment: Segment, start: datetime.
     samples = from_quaternions(source, "line", lines, t_s, (a, b), xyzw, absolute=True)
     useable = within_span(path, metadata, t_s, start, system)
     return take(to_icrs(samples, names), useable)
-
-
-def one_of(path: Path, metadata: dict[str, Line], key: str, allowed: object) -> str:
-    """A keyword's value if it is allowed. Raises InputError."""
-    line, value = metadata[key]
-    names = list(allowed)  # type: ignore[call-overload]
-    if value.upper() not in names:
-        raise InputError(f"{path}, line {line}: {key} = {excerpt(value)}; allowed: {', '.join(names)}")
-    return value.upper()
 
 
 def within_span(path: Path, metadata: dict[str, Line], t_s: Floats, start: datetime.datetime, system: str) -> slice:

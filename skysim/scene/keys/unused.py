@@ -324,7 +324,7 @@ RULES = (
     Rule(
         ("tracker.refraction",),
         lambda scene: not has_air(scene) or external(scene),
-        "there is no air, or an external tracker that is not told of it",
+        "there is no air, or the tracker is external and does not get the weather",
         "light.air and tracker.name: own",
     ),
     Rule(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import erfa
 import numpy as np
@@ -115,6 +116,7 @@ class Sky:
         return at_zenith_px and at_zenith_px * float(self.air_mass(boresight[None])[0] ** 0.6)
 
 
+@lru_cache(maxsize=8)  # a frame asks several times
 def topocentric_axes(time: datetime.datetime, site: SiteConfig) -> Floats:
     """(3, 3) rows north, east and the ellipsoid's zenith at a site, in ICRS axes at a time.
 

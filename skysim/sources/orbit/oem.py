@@ -15,7 +15,8 @@ import numpy as np
 from scipy.interpolate import BPoly
 
 from skysim.core.errors import InputError
-from skysim.core.io.text import SCALES, Line, excerpt, read_lines, seconds_since, to_numbers
+from skysim.core.io.ccsds import Segment, check_version, keyword_value, one_of
+from skysim.core.io.text import SCALES, read_lines, seconds_since, to_numbers
 from skysim.core.types import Floats
 from skysim.sources.orbit.earth import J2, MU_M3_S2, RADIUS_M
 
@@ -46,13 +47,6 @@ class Ephemeris(NamedTuple):
                 f"orbit.file: {self.source} is from {first:.6g} to {last:.6g} s after start_time, not at {worst:.6g} s"
             )
         return self.path(after_s), self.path.derivative()(after_s)
-
-
-class Segment(NamedTuple):
-    """A segment: its metadata with their lines, and its data lines split into words."""
-
-    metadata: dict[str, Line]
-    data: list[tuple[int, list[str]]]
 
 
 def read_oem(path: str, start: datetime.datetime) -> Ephemeris:
@@ -98,29 +92,24 @@ def split_segments(path: str) -> list[Segment]:
             if word == "META_START":
                 segments.append(Segment({}, []))
         elif section in ("", "META_START"):
-            key, equals, value = (part.strip() for part in line.partition("="))
-            if not equals:
-                raise InputError(f"{path}, line {n}: {excerpt(line)} is not KEYWORD = value")
+            key, value = keyword_value(path, n, line)
             if section:
                 segments[-1].metadata[key] = (n, value)
             elif key == VERSION:
                 version = value
         elif section == "META_STOP":
             segments[-1].data.append((n, line.split()))
-    if version not in VERSIONS:
-        raise InputError(f"{path}: {VERSION} is {excerpt(version)}; allowed: {', '.join(VERSIONS)}")
+    check_version(path, VERSION, version, VERSIONS)
     return segments
 
 
 def segment_samples(path: str, segment: Segment, start: datetime.datetime) -> tuple[Floats, Floats]:
     """Times (N,) and positions, velocities, accelerations (N, 9) of a segment, SI, GCRS axes. Raises InputError."""
     metadata = segment.metadata
-    for key in REQUIRED:
-        if key not in metadata:
-            raise InputError(f"{path}: {key} is missing in the metadata of a segment")
+    segment.require(path, REQUIRED)
     frame = one_of(path, metadata, "REF_FRAME", FRAMES)
     one_of(path, metadata, "CENTER_NAME", ("EARTH",))
-    system = one_of(path, metadata, "TIME_SYSTEM", tuple(SCALES))
+    system = one_of(path, metadata, "TIME_SYSTEM", SCALES)
     if not segment.data:
         raise InputError(f"{path}: a segment without data; allowed: lines of an epoch, a position and a velocity")
     lines, rows = [n for n, _ in segment.data], [words[1:] for _, words in segment.data]
@@ -133,11 +122,3 @@ def segment_samples(path: str, segment: Segment, start: datetime.datetime) -> tu
         bias, _, _ = erfa.bp06(erfa.DJ00, 0.0)
         numbers = (numbers.reshape(-1, 3) @ bias).reshape(-1, 9)
     return t_s, numbers
-
-
-def one_of(path: str, metadata: dict[str, Line], key: str, allowed: tuple[str, ...]) -> str:
-    """A keyword's value if it is allowed. Raises InputError."""
-    line, value = metadata[key]
-    if value.upper() not in allowed:
-        raise InputError(f"{path}, line {line}: {key} = {excerpt(value)}; allowed: {', '.join(allowed)}")
-    return value.upper()
