@@ -186,7 +186,7 @@ def build_testbed(
     catalog.require_catalog("tracker.catalog", scene.tracker.catalog)
     EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # raises for a bad PSF file
     vehicle = multibody.build(scene.vehicle)
-    band = Band.from_efficiency(scene.camera.detector.quantum_efficiency)
+    band = Band.from_camera(scene.camera)
     dtype = np.float32 if scene.camera.detector.noise else np.float64
     mount = multibody.camera_mount(vehicle)
     profiles = load_profiles(scene, mount, profile)

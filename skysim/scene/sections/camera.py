@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, field_validator, model_validator
 
 from skysim.core.errors import unknown_name
 from skysim.core.paths import DATA
@@ -226,6 +226,24 @@ Efficiency = Annotated[
 ]
 
 
+def transmission_tag(value: Any) -> str:
+    """Tag of the kind of transmission: a text that ends in .csv is a curve, all else a number."""
+    return "curve" if isinstance(value, str) and value.endswith(".csv") else "number"
+
+
+def curve_exists(value: str) -> str:
+    if not Path(value).is_file():
+        raise ValueError(f"no file {value!r}; allowed: a CSV file of wavelength_nm and response, or a number to 1")
+    return value
+
+
+Transmission = Annotated[
+    Annotated[Annotated[Number, Field(gt=0, le=1)], Tag("number")]
+    | Annotated[Annotated[str, AfterValidator(curve_exists)], Tag("curve")],
+    Discriminator(transmission_tag),
+]
+
+
 class DetectorConfig(ConfigModel):
     """The chip and its electronics, in the order of the signal path. Each effect's parameter can switch it off.
 
@@ -302,6 +320,8 @@ class DetectorConfig(ConfigModel):
 class CameraConfig(ConfigModel):
     """Lens and chip as the hardware is. What the tracker assumes about them is in `tracker`.
 
+    transmission  : of the lens: one number for all wavelengths, or a CSV file of wavelength_nm and transmission, 0
+        beyond its ends
     ghosts, glare : stray light of what is in the field; light from outside is `background` of kind stray
     """
 
@@ -311,7 +331,7 @@ class CameraConfig(ConfigModel):
     focal_length_m: Annotated[Length, Field(ge=1e-5, le=1e3)]
     f_number: Annotated[Number, Field(ge=0.3, le=1e6)]
     focus_m: Annotated[float, BeforeValidator(focus_distance, json_schema_input_type=FocusText), Field(gt=0)] = math.inf
-    transmission: Annotated[Number, Field(gt=0, le=1)] = 1.0
+    transmission: Transmission = 1.0
     vignetting: Annotated[TwoStopsConfig | VignettingTableConfig, Field(discriminator="kind")] | None = None
     distortion: tuple[Radial, Radial, Tangential, Tangential, Radial] = (0.0, 0.0, 0.0, 0.0, 0.0)
     principal_point_px: tuple[Number, Number] | None = None
@@ -331,6 +351,11 @@ class CameraConfig(ConfigModel):
     def pupil_m(self) -> float:
         """Diameter of the entrance pupil."""
         return self.focal_length_m / self.f_number
+
+    @property
+    def gray_transmission(self) -> float:
+        """Transmission of the lens at all wavelengths; 1 where it has a curve, which is in the band (`Band`)."""
+        return 1.0 if isinstance(self.transmission, str) else self.transmission
 
     @property
     def image_distance_m(self) -> float:

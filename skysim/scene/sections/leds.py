@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
 
+from skysim.core.paths import DATA
 from skysim.core.quantities.tolerance import LengthError, NumberError, Tolerance
 from skysim.core.quantities.units import (
     Ascending,
@@ -17,6 +19,7 @@ from skysim.core.quantities.units import (
     RadiantIntensity,
     Time,
     check_table,
+    with_unit,
 )
 
 
@@ -90,10 +93,41 @@ class ClockConfig(ConfigModel):
     drift_ppm_h: Annotated[NumberError, Field(le=10_000)] = 1.0
 
 
+def spectrum_file(spectrum: str) -> Path:
+    """The file of an LED's spectrum: data/led/white.csv, or a path. Raises ValueError if there is none."""
+    path = DATA / "led" / "white.csv" if spectrum == "white" else Path(spectrum)
+    if not path.is_file():
+        raise ValueError(
+            f"no file {spectrum!r}; allowed: white, a CSV file of wavelength_nm and power, or a wavelength"
+        )
+    return path
+
+
+def spectrum_exists(spectrum: str) -> str:
+    spectrum_file(spectrum)
+    return spectrum
+
+
+def spectrum_tag(value: Any) -> str:
+    """Tag of the kind of spectrum: white or a text that ends in .csv is measured, all else a wavelength."""
+    return "measured" if isinstance(value, str) and (value == "white" or value.endswith(".csv")) else "wavelength"
+
+
+Wavelength = Annotated[
+    Number, with_unit("m", "wavelength", '"630 nm", or white, or a CSV file'), Field(ge=300e-9, le=1100e-9)
+]
+LedSpectrum = Annotated[
+    Annotated[Annotated[str, AfterValidator(spectrum_exists)], Tag("measured")]
+    | Annotated[Wavelength, Tag("wavelength")],
+    Discriminator(spectrum_tag),
+]
+
+
 class LedConfig(ConfigModel):
     """The one LED type of the dome: intensity along its normal, in candela or in watts per steradian.
 
-    spectrum : white (data/led/white.csv), or the peak wavelength of a colored LED
+    spectrum : white (data/led/white.csv) or a CSV file of wavelength_nm and relative power, or the peak wavelength of a
+        colored LED
     fwhm     : width of a colored LED's spectrum at half maximum, a Gaussian in power; a narrow line if left out
     color_scatter : of the peak wavelength from LED to LED, at the same intensity: standard deviation or tolerance (a
         bin); from the layout's hardware_seed
@@ -108,7 +142,7 @@ class LedConfig(ConfigModel):
     disk_diameter_m: Annotated[Length, Field(gt=0, le=0.1)]
     falloff: Literal["inverse_square"] = "inverse_square"
     lobe: Lobe = CosineLobeConfig()
-    spectrum: Literal["white"] | Annotated[Length, Field(ge=300e-9, le=1100e-9)] = "white"
+    spectrum: LedSpectrum = "white"
     fwhm_m: Annotated[Length, Field(ge=3e-9, le=200e-9)] | None = None
     color_scatter_m: Annotated[LengthError, Field(le=30e-9)] = 0.0
     scatter: Annotated[NumberError, Field(lt=0.5)] = 0.0
@@ -124,9 +158,9 @@ class LedConfig(ConfigModel):
 
     @model_validator(mode="after")
     def check_color(self) -> LedConfig:
-        if self.spectrum == "white" and (self.fwhm_m is not None or self.color_scatter_m):
+        if isinstance(self.spectrum, str) and (self.fwhm_m is not None or self.color_scatter_m):
             key = "color_scatter" if self.fwhm_m is None else "fwhm"
-            raise ValueError(f"{key}: a white LED has a spectrum of its own; allowed: a wavelength as spectrum")
+            raise ValueError(f"{key}: {self.spectrum} is a whole spectrum; allowed: a wavelength as spectrum")
         return self
 
     @field_validator("scatter")

@@ -52,8 +52,8 @@ def saturation(context: Context, samples: Samples) -> str:
     cures = dimmer(context, factor)
     first, value = next(iter(cures.items()))
     others = "".join(f", or {key} to {other}" for key, other in cures.items() if key != first)
-    if factor < FILTER_BELOW:
-        others += f", or camera.transmission to {short(factor * scene.camera.transmission, 2)}, a gray filter"
+    if factor < FILTER_BELOW and isinstance(transmission := scene.camera.transmission, float):
+        others += f", or camera.transmission to {short(factor * transmission, 2)}, a gray filter"
     return f"{first}: {text} {value}{others}"
 
 
