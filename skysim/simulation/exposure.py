@@ -30,6 +30,7 @@ from skysim.camera.stray import ghosts, glare, wall
 from skysim.core.random_streams import DETECTOR, SCINTILLATION, random_stream
 from skysim.core.types import Floats, Frame, Sources, SourceTruth, Truth, with_sources
 from skysim.dynamics import multibody
+from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.testbed import (
     Testbed,
     bodies_during,
@@ -41,7 +42,7 @@ from skysim.simulation.testbed import (
     time_tag_error_s,
 )
 from skysim.sources.air.air import Sky
-from skysim.sources.dome.led import Emitter
+from skysim.sources.dome.led import Emitter, warm_up_factor
 from skysim.sources.orbit.earth import sun_m
 from skysim.sources.orbit.satellites import MovingLight, View, as_sources
 from skysim.sources.photometry import SUN
@@ -103,15 +104,15 @@ def fill_background(
     exposure_s: float,
 ) -> None:
     """Set the image to all extended light: background and air, the dome's wall, the Earth, a display's black level."""
-    optics, band = testbed.optics, testbed.band
+    optics, band, left = testbed.optics, testbed.band, light_left(testbed, t_s)
     glow = background.glow_map(testbed.scene.background, optics, cam_from_lab, band, sky_light(sky))
     if testbed.reflecting:
-        glow = glow + wall.wall_glow(testbed.reflecting, optics, cam_from_lab, camera_m, band)
+        glow = glow + left * wall.wall_glow(testbed.reflecting, optics, cam_from_lab, camera_m, band)
     background.fill(light_e, glow, exposure_s)
     add_earth(light_e, testbed, cam_from_lab, t_s, exposure_s)
     black_level = display_glow.black_glow(testbed.scene.light, optics, cam_from_lab, camera_m, band)
     if black_level is not None:
-        light_e += black_level * exposure_s
+        light_e += black_level * (left * exposure_s)
 
 
 def satellite_sources(testbed: Testbed, sky: Sky | None, satellites: Sequence[MovingLight]) -> Sources | None:
@@ -163,8 +164,20 @@ def view_of(testbed: Testbed, window: Window, cam_from_lab: Rotation, middle_s: 
     return View(cam_from_lab.inv().apply([0.0, 0.0, 1.0]), testbed.optics.field_rad, turn_rad, duration_s)
 
 
+def light_left(testbed: Testbed, t_s: float) -> float:
+    """Light of the dome's LEDs at that time, over that when they were switched on."""
+    light = testbed.scene.light
+    return warm_up_factor(light.led.warm_up, t_s) if isinstance(light, DomeConfig) else 1.0
+
+
 def at_time(testbed: Testbed, t_s: float) -> Testbed:
-    """The test bed with LEDs, mount and lens where the temperature of that time has moved them."""
+    """The test bed with LEDs as bright as they are at that time, and LEDs, mount and lens where the temperature has
+    moved them.
+    """
+    left = light_left(testbed, t_s)
+    if left < 1:
+        dimmed = replace(testbed.sources, strength=left * testbed.sources.strength)
+        testbed = replace(testbed, sources=dimmed)
     if testbed.scene.thermal is None:
         return testbed
     hardware = thermal.Hardware(testbed.sources, testbed.mount, testbed.optics)

@@ -83,6 +83,13 @@ CASES = [
         "5 nm",
         {},
     ),
+    Case(
+        DOME,
+        FLAT | DIRECT | {"light.layout": PANEL, "light.led.aging": "{hours: 9000, life_hours: 30000}"},
+        "light.led.aging.scatter",
+        "0.2",
+        {},
+    ),
     Case(DOME, DIRECT, "light.led.clock.offset_ppm", "7", {"light.led.drive": "{kind: pwm}"}),
     Case(DOME, {"light.layout": BOARDS}, "light.layout.lit", "[1, 2]", {"light.layout": SPREAD}),
     Case(

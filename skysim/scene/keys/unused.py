@@ -89,14 +89,11 @@ def listed_boards(scene: Scene) -> bool:
 
 def dome_draws_nothing(scene: Scene) -> bool:
     """Whether LEDs, their brightness and their pulses are all without anything random."""
-    if (
-        not isinstance(scene.light, DomeConfig)
-        or not steady(scene)
-        or scene.light.led.scatter
-        or scene.light.led.color_scatter_m
-    ):
+    if not isinstance(scene.light, DomeConfig) or not steady(scene):
         return False
-    layout = scene.light.layout
+    led, layout = scene.light.led, scene.light.layout
+    if led.scatter or led.color_scatter_m or (led.aging and led.aging.scatter):
+        return False
     if isinstance(layout, FibersConfig) and layout.radius_variation:
         return False
     points = layout.points if isinstance(layout, FibersConfig | LcdConfig) else layout
@@ -219,7 +216,7 @@ RULES = (
         "light.led.drive: {kind: pwm}",
     ),
     Rule(
-        ("light.led.color_scatter",),
+        ("light.led.color_scatter", "light.led.aging.scatter"),
         lambda scene: isinstance(getattr(scene.light, "layout", None), LcdConfig),
         "the pixels of a panel share their light",
         "another light.layout",

@@ -93,6 +93,40 @@ class ClockConfig(ConfigModel):
     drift_ppm_h: Annotated[NumberError, Field(le=10_000)] = 1.0
 
 
+class AgingConfig(ConfigModel):
+    """Light lost over the hours of operation: each LED has exp(-a hours) of its light left, a = ln(1 / 0.7) / life
+    (IES TM-21).
+
+    hours      : of operation so far
+    life_hours : L70 of the data sheet, after which 70 % of the light is left
+    scatter    : of a from LED to LED: standard deviation of its logarithm, or its tolerance as a fraction; from the
+        layout's hardware_seed
+    """
+
+    hours: Annotated[Number, Field(gt=0, le=1e6)]
+    life_hours: Annotated[Number, Field(gt=0, le=1e7)]
+    scatter: Annotated[NumberError, Field(lt=1)] = 0.0
+
+    @field_validator("scatter")
+    @classmethod
+    def check_scatter(cls, value: float) -> float:
+        if isinstance(value, Tolerance) and value.half_width >= 1:
+            raise ValueError(f"a tolerance of {value.half_width:g} makes light; allowed: below 1")
+        return value
+
+
+class WarmUpConfig(ConfigModel):
+    """Light lost while the LEDs warm up from the scene's start, when they are switched on.
+
+    steady + (1 - steady) exp(-t / time) is left of the light of cold LEDs, which is that of a pulsed data sheet.
+
+    steady : share that is left when they are warm;  time : in which 63 % of the loss are reached
+    """
+
+    steady: Annotated[Number, Field(gt=0, lt=1)]
+    time_s: Annotated[Time, Field(gt=0)]
+
+
 def spectrum_file(spectrum: str) -> Path:
     """The file of an LED's spectrum: data/led/white.csv, or a path. Raises ValueError if there is none."""
     path = DATA / "led" / "white.csv" if spectrum == "white" else Path(spectrum)
@@ -133,6 +167,7 @@ class LedConfig(ConfigModel):
         bin); from the layout's hardware_seed
     scatter : of the intensity from LED to LED: standard deviation of its logarithm, or its tolerance as a fraction
         (a bin of ±10 %: {tolerance: 0.1})
+    aging, warm_up : how much light is left of it
     drive : how its level is made; pwm_period belongs to the kind pwm
     clock : the oscillators that time the pulses; every run starts with phases of its own
     """
@@ -146,6 +181,8 @@ class LedConfig(ConfigModel):
     fwhm_m: Annotated[Length, Field(ge=3e-9, le=200e-9)] | None = None
     color_scatter_m: Annotated[LengthError, Field(le=30e-9)] = 0.0
     scatter: Annotated[NumberError, Field(lt=0.5)] = 0.0
+    aging: AgingConfig | None = None
+    warm_up: WarmUpConfig | None = None
     drive: Drive = PwmConfig()
     clock: ClockConfig = ClockConfig()
     pwm_period_s: Annotated[Time, Field(gt=0)] = 1e-3

@@ -14,7 +14,14 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import HOLES, LitConfig
 from skysim.scene.sections.leds import LedConfig
-from skysim.sources.dome.led import DRIVES, DriveInput, color_factors, full_strength_e_s_sr, strength_factors
+from skysim.sources.dome.led import (
+    DRIVES,
+    DriveInput,
+    aging_factors,
+    color_factors,
+    full_strength_e_s_sr,
+    strength_factors,
+)
 from skysim.sources.dome.shell.surface import Surface
 from skysim.sources.photometry import Band
 
@@ -51,6 +58,8 @@ def led_sources(placed: PlacedLeds, led: LedConfig, band: Band, rng: np.random.G
     pulses = DRIVES[led.drive.kind](led, DriveInput(placed.level, placed.id // HOLES), rng)
     if led.color_scatter_m:  # drawn last, so that all else is the same without it
         strength = strength * color_factors(led, band, rng.standard_normal(count))
+    if led.aging:
+        strength = strength * aging_factors(led.aging, rng.standard_normal(count))
     return Sources(
         id=placed.id,
         place=np.column_stack([placed.place_m, np.ones(count)]),
