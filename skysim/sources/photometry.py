@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +20,7 @@ import numpy as np
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.types import Floats
-from skysim.scene.sections.camera import CameraConfig, EfficiencyConfig, curve_file
+from skysim.scene.sections.camera import CameraConfig, ChromaticConfig, EfficiencyConfig, curve_file
 from skysim.scene.sections.leds import spectrum_file
 
 HC_J_M = 6.62607015e-34 * 299792458.0  # energy of a photon times its wavelength
@@ -45,10 +45,12 @@ class Band:
 
     wavelength_m : (K,) ascending; the response is zero beyond its ends
     response     : (K,) electrons per photon, linear in between
+    chromatic    : the lens's chromatic aberration, which weighs its wavelengths by this response
     """
 
     wavelength_m: Floats
     response: Floats
+    chromatic: ChromaticConfig | None = None
 
     @classmethod
     def from_camera(cls, camera: CameraConfig) -> Band:
@@ -56,11 +58,11 @@ class Band:
 
         Raises as `from_efficiency`.
         """
-        efficiency = cls.from_efficiency(camera.detector.quantum_efficiency)
-        if not isinstance(camera.transmission, str):
-            return efficiency
-        path = Path(camera.transmission)
-        return _product(efficiency, _read_curve(path, path.stat().st_mtime_ns))
+        band = cls.from_efficiency(camera.detector.quantum_efficiency)
+        if isinstance(camera.transmission, str):
+            path = Path(camera.transmission)
+            band = _product(band, _read_curve(path, path.stat().st_mtime_ns))
+        return _through(band, camera.chromatic) if camera.chromatic else band
 
     @classmethod
     def from_efficiency(cls, quantum_efficiency: float | str | EfficiencyConfig) -> Band:
@@ -104,6 +106,11 @@ def _flat(quantum_efficiency: float) -> Band:
 @lru_cache(maxsize=64)
 def _scaled(band: Band, peak: float) -> Band:
     return Band(band.wavelength_m, band.response * (peak / band.response.max()))
+
+
+@lru_cache(maxsize=64)
+def _through(band: Band, chromatic: ChromaticConfig) -> Band:
+    return replace(band, chromatic=chromatic)
 
 
 @lru_cache(maxsize=64)
@@ -232,6 +239,59 @@ def star_flux_e_s_m2(v_mag: float | Floats, b_v: float | Floats, v_i: float | Fl
     inverse_k, log_e = _black_bodies(band)
     log_v0 = np.interp(1 / temperature_k(b_v, v_i), inverse_k, log_e)
     return np.asarray(10.0 ** (log_v0 - 0.4 * np.asarray(v_mag, dtype=float)))
+
+
+@lru_cache(maxsize=64)
+def _black_body_moments(band: Band) -> tuple[Floats, Floats]:
+    """(256,) inverse temperatures and (256, 4) `chromatic_moments`."""
+    inverse_k, _ = _black_bodies(band)
+    return inverse_k, chromatic_moments(band, lambda wavelength_m: black_body_v0(wavelength_m, 1 / inverse_k))
+
+
+def star_chromatic(b_v: float | Floats, v_i: float | Floats, band: Band) -> Floats | None:
+    """(..., 4) `chromatic_moments` of stars of these colors; None for a lens without chromatic aberration."""
+    if band.chromatic is None:
+        return None
+    inverse_k, moments = _black_body_moments(band)
+    own_k = 1 / temperature_k(b_v, v_i)
+    return np.stack([np.interp(own_k, inverse_k, column) for column in moments.T], axis=-1)
+
+
+def led_chromatic(spectrum: Spectrum, band: Band, fwhm_m: float | None = None) -> Floats:
+    """(4,) `chromatic_moments` of an LED; arguments as in `led_strength_e_s_sr`."""
+    if not isinstance(spectrum, str) and fwhm_m is None:
+        focus_m, corner_px = chromatic_shifts(band, np.array([spectrum]))[:, 0]
+        return np.array([focus_m, 0.0, corner_px, 0.0])
+    power = measured(spectrum).response_at if isinstance(spectrum, str) else colored(spectrum, fwhm_m or 0.0)
+    return chromatic_moments(band, lambda wavelength_m: power(wavelength_m) * wavelength_m)
+
+
+def chromatic_moments(band: Band, photons: Callable[[Floats], Floats]) -> Floats:
+    """(..., 4) mean and standard deviation over a light's photo-electrons of the shift of focus, m, and at the corner,
+    px; 0 for a light that the camera does not see.
+
+    photons : spectrum in photons, to any scale, as in `Band.integral`
+    """
+    total = np.maximum(band.integral(photons), np.finfo(float).tiny)
+
+    def mean_of(power: int, column: int, origin: Floats) -> Floats:
+        def weighted(wavelength_m: Floats) -> Floats:
+            return photons(wavelength_m) * (chromatic_shifts(band, wavelength_m)[column] - origin[..., None]) ** power
+
+        return np.asarray(band.integral(weighted) / total)
+
+    means = [mean_of(1, column, np.zeros(())) for column in range(2)]
+    spreads = [np.sqrt(mean_of(2, column, mean)) for column, mean in enumerate(means)]
+    return np.stack([means[0], spreads[0], means[1], spreads[1]], axis=-1)
+
+
+def chromatic_shifts(band: Band, wavelength_m: Floats) -> Floats:
+    """(2, M) shift of the focus, m, and at the chip's corner, px, of light of (M,) wavelengths."""
+    config = band.chromatic
+    assert config is not None
+    none = np.zeros(len(config.wavelength_m))
+    columns = [none if column is None else column for column in (config.focus_m, config.corner_px)]
+    return np.array([np.interp(wavelength_m, config.wavelength_m, column) for column in columns])
 
 
 def synthetic_mag(v_mag: float | Floats, b_v: float | Floats, v_i: float | Floats, band: Band) -> Floats:

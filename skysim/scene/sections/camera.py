@@ -114,6 +114,29 @@ class VignettingTableConfig(ConfigModel):
         return self
 
 
+class ChromaticConfig(ConfigModel):
+    """Chromatic aberration: where light of other wavelengths is imaged, linear between them, constant beyond them.
+
+    focus     : axial color: the image distance minus that of the lens's focal length, for a light at infinity
+    corner_px : lateral color: shift away from the principal point at the farthest corner of the chip, proportional to
+        the distance from it
+    """
+
+    wavelength_m: Annotated[tuple[Annotated[Length, Field(ge=200e-9, le=2e-6)], ...], Field(min_length=2)]
+    focus_m: Annotated[tuple[Annotated[Length, Field(ge=-1e-3, le=1e-3)], ...], Field(min_length=2)] | None = None
+    corner_px: Annotated[tuple[Annotated[Number, Field(ge=-100, le=100)], ...], Field(min_length=2)] | None = None
+
+    @model_validator(mode="after")
+    def check_columns(self) -> ChromaticConfig:
+        columns = {"focus": self.focus_m, "corner_px": self.corner_px}
+        for name, column in columns.items():
+            if column is not None:
+                check_table(self.wavelength_m, column, name, "wavelength")
+        if not any(column and any(column) for column in columns.values()):
+            raise ValueError("nothing depends on the wavelength; allowed: focus or corner_px other than 0")
+        return self
+
+
 class GhostConfig(ConfigModel):
     """A ghost of every light: light that a pair of the lens's surfaces reflects back to the chip.
 
@@ -336,6 +359,7 @@ class CameraConfig(ConfigModel):
     distortion: tuple[Radial, Radial, Tangential, Tangential, Radial] = (0.0, 0.0, 0.0, 0.0, 0.0)
     principal_point_px: tuple[Number, Number] | None = None
     psf: Psf = GaussianPsfConfig()
+    chromatic: ChromaticConfig | None = None
     ghosts: tuple[GhostConfig, ...] = ()
     glare: GlareConfig | None = None
     shutter: Shutter = GlobalShutterConfig()

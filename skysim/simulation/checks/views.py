@@ -28,7 +28,7 @@ from skysim.camera.glow import background
 from skysim.camera.glow.air_glow import sky_light
 from skysim.camera.optics import Optics
 from skysim.camera.psf.kernel import build_kernel
-from skysim.camera.psf.otf import blur_radius_px, field_sigma_px
+from skysim.camera.psf.otf import blur_radius_px, chromatic_sigma_px, field_sigma_px
 from skysim.camera.render import Poses, project
 from skysim.core.types import Floats, Sources
 from skysim.dynamics import multibody
@@ -180,8 +180,12 @@ def view(
     )
     depth_m = np.where(is_led, offset_m[:, 2], np.inf)
     disk_px = np.where(is_led, optics.camera.focal_px * chosen.radius_m / distance_m, 0.0)
-    defocus_px = blur_radius_px(optics.camera, depth_m)
     lens2_px2 = camera.lens_px**2 + field_sigma_px(optics.camera.psf, optics.camera, xy_px) ** 2
+    shift_m: Floats | float = 0.0
+    if chosen.chromatic is not None:
+        shift_m = chosen.chromatic[:, 0]
+        lens2_px2 = lens2_px2 + chromatic_sigma_px(optics.camera, chosen.chromatic, xy_px) ** 2
+    defocus_px = blur_radius_px(optics.camera, depth_m, shift_m)
     share = peak_share(lens2_px2, disk_px, defocus_px, np.linalg.norm(streak_px, axis=1))
     sigma_px = np.sqrt(lens2_px2 + (disk_px**2 + defocus_px**2) / 4)
     return View(

@@ -27,7 +27,7 @@ from skysim.scene.sections.leds import (
     SequentialConfig,
     WarmUpConfig,
 )
-from skysim.sources.photometry import Band, led_strength_e_s_sr, radiant_strength_e_s_sr
+from skysim.sources.photometry import Band, led_chromatic, led_strength_e_s_sr, radiant_strength_e_s_sr
 
 LIFE_SHARE = 0.7  # of its light that is left of an LED at the end of its life, L70
 COLORS = 129  # wavelengths at which a colored LED's strength is computed
@@ -105,11 +105,27 @@ def color_factors(led: LedConfig, band: Band, normal: Floats) -> Floats:
 
     They are interpolated between COLORS wavelengths.
     """
-    assert not isinstance(led.spectrum, str)
-    peak_m = led.spectrum + scaled_errors(led.color_scatter_m, normal)
-    grid_m = np.linspace(peak_m.min(), peak_m.max(), COLORS)
+    peak_m, grid_m = peaks_m(led, normal)
     strengths = [full_strength_e_s_sr(led.model_copy(update={"spectrum": one}), band) for one in grid_m.tolist()]
     return np.interp(peak_m, grid_m, strengths) / full_strength_e_s_sr(led, band)
+
+
+def peaks_m(led: LedConfig, normal: Floats) -> tuple[Floats, Floats]:
+    """(N,) peak wavelengths of LEDs, from standard normal numbers, and COLORS ones from the least to the greatest."""
+    assert not isinstance(led.spectrum, str)
+    peak_m = led.spectrum + scaled_errors(led.color_scatter_m, normal)
+    return peak_m, np.linspace(peak_m.min(), peak_m.max(), COLORS)
+
+
+def chromatic_of(led: LedConfig, band: Band, normal: Floats) -> Floats | None:
+    """(N, 4) `Sources.chromatic` of LEDs, from the numbers of `color_factors`; None for a lens without aberration."""
+    if band.chromatic is None:
+        return None
+    if not led.color_scatter_m:
+        return np.tile(led_chromatic(led.spectrum, band, led.fwhm_m), (len(normal), 1))
+    peak_m, grid_m = peaks_m(led, normal)
+    table = np.array([led_chromatic(one, band, led.fwhm_m) for one in grid_m.tolist()])
+    return np.column_stack([np.interp(peak_m, grid_m, column) for column in table.T])
 
 
 def strength_factors(scatter: float, normal: Floats) -> Floats:
