@@ -1,4 +1,4 @@
-"""Draw the figures of the pages on conventions and near stars with the simulator's code. `make figures` runs it."""
+"""Draw the figures of several pages with the simulator's code. `make figures` runs it."""
 
 from __future__ import annotations
 
@@ -23,6 +23,15 @@ from skysim.simulation.testbed import bodies_during, build_testbed
 from skysim.sources import stars as star_sources
 from skysim.sources.catalog import read
 from skysim.sources.dome.shell import surface
+from skysim.sources.photometry import (
+    Band,
+    black_body_v0,
+    chromatic_shifts,
+    led_chromatic,
+    measured,
+    star_chromatic,
+    temperature_k,
+)
 
 mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "skysim", "font.family": "sans-serif", "font.size": 11})
 LABEL_BOX = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}  # an opaque background for labels
@@ -279,13 +288,42 @@ def bodies(path: Path) -> None:
     save(fig, path)
 
 
+def color(path: Path) -> None:
+    """Photo-electrons of four lights by wavelength, the lateral color of a lens, and the mean of each."""
+    lens = "{wavelength: [450 nm, 550 nm, 650 nm, 850 nm], corner_px: [-0.38, -0.13, 0.12, 0.62]}"
+    band = Band.from_camera(loader.load("shefex2", {"camera.chromatic": lens}).camera)
+    nm = np.arange(390.0, 1000.0)
+    lights = (
+        ("star A0V", (0.0, 0.004), "#1f6fb2"),
+        ("G2V", (0.65, 0.713), LIGHT),
+        ("M1V", (1.485, 2.005), CAM),
+        ("white LED", None, "#27ae60"),
+    )
+    fig, (spectra, shift) = plt.subplots(2, 1, figsize=(6.4, 5), sharex=True)
+    shift.plot(nm, chromatic_shifts(band, nm * 1e-9)[1], color=INK)
+    for name, colors, paint in lights:
+        if colors:
+            photons = black_body_v0(nm * 1e-9, temperature_k(*colors))
+            moments = star_chromatic(*colors, band)
+        else:
+            photons, moments = measured("white").response_at(nm * 1e-9) * nm, led_chromatic("white", band)
+        electrons = photons * band.response_at(nm * 1e-9)
+        spectra.plot(nm, electrons / electrons.max(), color=paint, label=name)
+        shift.plot(np.interp(moments[2], chromatic_shifts(band, nm * 1e-9)[1], nm), moments[2], "o", color=paint)
+    spectra.set(ylabel="photo-electrons, relative")
+    spectra.legend(frameon=False)
+    shift.set(xlabel="wavelength [nm]", ylabel="shift at the corner [px]")
+    fig.align_ylabels()
+    save(fig, path)
+
+
 def save(fig: plt.Figure, path: Path) -> None:
     """Save a figure without a date, so that equal figures have equal bytes."""
     fig.savefig(path, metadata={"Date": None}, bbox_inches="tight")
     plt.close(fig)
 
 
-FIGURES = {"axes": axes, "pixels": pixels, "roll": roll, "lever": lever, "bodies": bodies}
+FIGURES = {"axes": axes, "pixels": pixels, "roll": roll, "lever": lever, "bodies": bodies, "color": color}
 
 
 def main(folder: Path) -> None:
