@@ -34,6 +34,7 @@ FLAT_M = (
 )  # the silicon camera's bandpass, where one number stands for a curve (reference §2)
 
 STEP_M = 1e-9
+LONGEST_NM = 10_000.0  # of a curve: beyond, its integral has too many steps
 ARCSEC2_SR = math.radians(1 / 3600) ** 2
 SUN = (0.650, 0.713)  # B-V and V-I of a G2 star, the zero point of every instrumental magnitude
 Spectrum = str | float  # of an LED: "white" or a file, or the peak wavelength in m
@@ -139,11 +140,12 @@ def _read_curve(path: Path, _changed_ns: int = 0, largest: float = 1.0) -> Band:
         raise InputError(
             f"{path}: not a response curve ({error}); allowed: two columns, wavelength_nm and response"
         ) from None
-    rising = np.all(np.diff(wavelength_nm, prepend=0.0) > 0)
-    if not rising or not np.all((response >= 0) & (response <= largest)) or not np.any(response):
+    rising = np.all(np.diff(wavelength_nm, prepend=0.0) > 0) and wavelength_nm[-1] <= LONGEST_NM
+    within = np.all((response >= 0) & (response <= largest) & np.isfinite(response))
+    if not (rising and within and np.any(response)):
         raise InputError(
-            f"{path}: not a response curve; allowed: ascending wavelength_nm, response within 0 and {largest:g}, not"
-            " always 0"
+            f"{path}: not a response curve; allowed: ascending wavelength_nm to {LONGEST_NM:.0f}, response within 0 and"
+            f" {largest:g}, not always 0"
         )
     return Band(wavelength_nm * 1e-9, response)
 

@@ -378,6 +378,8 @@ def test_a_user_s_own_curve_is_read_and_read_anew_when_it_changes(tmp_path: Path
         "a,b\n600,.1\n500,.1\n",
         "a,b\n400,.5\n500,1.5\n",
         "a\n1\n2\n",
+        "a,b\n400,.5\n1e15,.5\n",
+        "a,b\n400,0\n500,0\n",
     ],
 )
 def test_a_file_that_is_no_curve_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
@@ -475,6 +477,13 @@ def test_a_measured_spectrum(tmp_path: Path) -> None:
     assert watts == pytest.approx(radiant_strength_e_s_sr(0.3, *gaussian), rel=1e-4)
     white = str(DATA / "led" / "white.csv")
     assert led_strength_e_s_sr(0.3, white, band) == led_strength_e_s_sr(0.3, "white", band)
+
+
+def test_a_power_without_bound_is_no_spectrum(tmp_path: Path) -> None:
+    path = tmp_path / "bad.csv"
+    path.write_text("wavelength_nm,power\n400,1\n500,inf\n")
+    with pytest.raises(InputError, match=r"not a response curve; allowed: .* within 0 and inf"):
+        led_strength_e_s_sr(0.3, str(path), ALL)
 
 
 def test_an_invisible_spectrum_has_no_candelas(tmp_path: Path) -> None:
