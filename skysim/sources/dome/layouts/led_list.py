@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import StringConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources.dome.display import ideal_led
@@ -14,7 +14,7 @@ from skysim.sources.dome.layouts.placing import Ints
 from skysim.sources.dome.layouts.registry import LAYOUTS
 from skysim.sources.dome.layouts.string import winding_m
 from skysim.sources.dome.led import full_strength_e_s_sr
-from skysim.sources.dome.shell.surface import build_surface
+from skysim.sources.dome.shell.surface import Surface, build_surface
 from skysim.sources.photometry import Band
 
 HEADER = """\
@@ -30,10 +30,9 @@ def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:
     Columns are id, place, direction from the bearing and level; of tapes also the place along them. The level is that
     of the drive, without the scatter from LED to LED.
     """
-    led = ideal_led(config.led)
-    leds = LAYOUTS[config.layout.kind](config.layout, build_surface(config.surface), led, band)
+    leds = design_leds(config, build_surface(config.surface), band)
     place_m = leds.place[:, :3]
-    level = leds.strength / max(full_strength_e_s_sr(led, band), float(leds.strength.max()))
+    level = leds.strength / max(full_strength_e_s_sr(ideal_led(config.led), band), float(leds.strength.max()))
     azimuth_deg = np.degrees(np.arctan2(place_m[:, 1], place_m[:, 0])) % 360
     tilt_deg = np.degrees(np.arctan2(np.hypot(*place_m[:, :2].T), place_m[:, 2]))
     columns = {
@@ -48,7 +47,17 @@ def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:
     columns["level"] = [f"{value:.9g}" for value in level]
     rows = [",".join(row) for row in zip(*columns.values(), strict=True)]
     header = HEADER.format(name=name, tape=TAPE if "tape" in columns else "")
-    return header + "\n".join([",".join(columns), *rows, ""]), math.ceil(tilt_deg.max())
+    return header + "\n".join([",".join(columns), *rows, ""]), math.ceil(max_tilt_deg(place_m))
+
+
+def design_leds(config: DomeConfig, surface: Surface, band: Band) -> Sources:
+    """The LEDs of a dome without their scatter."""
+    return LAYOUTS[config.layout.kind](config.layout, surface, ideal_led(config.led), band)
+
+
+def max_tilt_deg(place_m: Floats) -> float:
+    """Greatest angle of these places (N, 3) from the zenith, seen from the bearing."""
+    return float(np.degrees(np.arctan2(np.hypot(*place_m[:, :2].T), place_m[:, 2])).max())
 
 
 def along_tape(config: DomeConfig, layout: StringConfig, led: Ints) -> tuple[Ints, Floats]:
