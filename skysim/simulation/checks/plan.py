@@ -17,7 +17,7 @@ from skysim.simulation.checks.dome import assumptions, lookalike
 from skysim.simulation.checks.expected_error import expected
 from skysim.simulation.checks.facts import FACTS, Fact, Sampled, Samples
 from skysim.simulation.checks.findings import FINDINGS
-from skysim.simulation.checks.sky import bodies, claims, depth
+from skysim.simulation.checks.sky import bodies, claims, depth, stray
 from skysim.simulation.checks.views import views
 from skysim.simulation.reference_limits import check_reference
 from skysim.simulation.testbed import Testbed
@@ -61,7 +61,8 @@ def check(testbed: Testbed, tilt_deg: float | None = None, rate_body_rad_s: Floa
         fact for build in (*FACTS, depth.faintest_star, claims.fact) if (fact := build(context, samples)) is not None
     ]
     findings = [line for find in (*FINDINGS, *SKY_FINDINGS) if (line := find(context, samples))]
-    findings += bodies.bodies_near(context, samples)
+    for finder in (bodies.bodies_near, stray.stray_light, stray.exclusion):
+        findings += finder(context, samples)
     alike = lookalike.of(context, samples)
     if alike is not None and isinstance(scene.light, DomeConfig):
         facts.insert(2, lookalike.fact(alike))
