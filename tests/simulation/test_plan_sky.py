@@ -23,6 +23,7 @@ SPACE = {
     "exposure.frames": "1",
     "background": "[]",
 }
+DOES_NOT_KNOW = {"tracker__orbit_velocity": "false"}
 
 
 def plan_of(scene: str, **keys: str) -> tuple[Context, Samples]:
@@ -80,3 +81,12 @@ def test_a_baffle_replaces_the_advice_to_add_one() -> None:
     lit = check(build_testbed(loader.load("shefex2", SPACE | keys | {"camera.baffle": BAFFLE}))).findings
     assert not any("add camera.baffle" in line for line in lit)
     assert any(line.startswith("camera.baffle.pst") for line in lit)
+
+
+@pytest.mark.slow
+def test_the_tracker_of_a_plan_knows_the_orbit_s_velocity() -> None:
+    """Else its stars are off by the orbit's aberration, up to 5.2"."""
+    errors = [plan_of("shefex2", orbit=ORBIT, **keys)[0].beliefs.direction_error for keys in ({}, DOES_NOT_KNOW)]
+    off_arcsec = [float(np.median(np.degrees(np.linalg.norm(one, axis=1)))) * 3600 for one in errors]
+    assert off_arcsec[0] < 0.2
+    assert 3 < off_arcsec[1] < 5.2
