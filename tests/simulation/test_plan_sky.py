@@ -7,13 +7,19 @@ import re
 import numpy as np
 import pytest
 
+from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.types import Floats
 from skysim.scene import loader
-from skysim.simulation.checks import attitudes
+from skysim.simulation import exposure, run
+from skysim.simulation.checks import attitudes, findings
 from skysim.simulation.checks.detection import Context, context_of
+from skysim.simulation.checks.dome import reflections
 from skysim.simulation.checks.facts import Samples
 from skysim.simulation.checks.plan import check, sampled
-from skysim.simulation.checks.sky import depth, stray
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.checks.sky import air, depth, stray
+from skysim.simulation.testbed import build_testbed, build_tracker
+from skysim.sources.false_lights import MIRRORED
+from skysim.tracking.factory import solve_frame
 
 BAFFLE = "{angle_deg: [20, 50, 90, 120], pst: [1e-3, 1e-7, 1e-9, 1e-12]}"
 ORBIT = "{kind: circular, altitude: 500 km, inclination_deg: 97, exclusion: {sun_deg: 40, earth_deg: 25}}"
@@ -22,6 +28,12 @@ SPACE = {
     "motion.rate_deg_s": "[0, 0, 0]",
     "exposure.frames": "1",
     "background": "[]",
+}
+NIGHT = {"light__air": "{}", "site": "{latitude_deg: 53, longitude_deg: 9}", "start_time": "2012-06-24T23:00:00"}
+SHINY = {
+    "light__surface": "{kind: sphere, apex: 5 ft, radius: 4 ft, rim_deg: 130}",
+    "light__reflection": "{specular: 0.5}",
+    "exposure__frames": "1",
 }
 DOES_NOT_KNOW = {"tracker__orbit_velocity": "false"}
 
@@ -90,3 +102,76 @@ def test_the_tracker_of_a_plan_knows_the_orbit_s_velocity() -> None:
     off_arcsec = [float(np.median(np.degrees(np.linalg.norm(one, axis=1)))) * 3600 for one in errors]
     assert off_arcsec[0] < 0.2
     assert 3 < off_arcsec[1] < 5.2
+
+
+@pytest.mark.slow
+def test_refraction_that_the_tracker_does_not_know_is_warned_of() -> None:
+    """A tan h + B tan^3 h with the textbooks' 58.3" less 2 % for red light, some 25 degrees high; none if it knows."""
+    low_in_the_south = {"motion__start": pointing(222.0, -10.0)}
+    context, samples = plan_of("shefex2", **low_in_the_south, **NIGHT)
+    found = re.match(
+        r"tracker.refraction: the air raises stars by ([\d.]+)″ at RA 222.0° .*, ([\d.]+)° above the horizon, and"
+        r" shortens the field by ([\d.]+)″, .*; change it to true",
+        air.refraction(context, samples),
+    )
+    assert found
+    raised, altitude_deg, shortened = map(float, found.groups())
+    assert 15 < altitude_deg < 30
+    half_deg = np.degrees(context.camera.optics.field_rad)
+    middle, low, high = bent_arcsec(np.array([0.0, -half_deg, half_deg]) + altitude_deg)
+    assert raised == pytest.approx(middle, rel=0.02)
+    assert shortened == pytest.approx(low - high, rel=0.05)
+    assert not air.refraction(*plan_of("shefex2", **low_in_the_south, **NIGHT, tracker__refraction="true"))
+    assert not air.refraction(*plan_of("shefex2", **low_in_the_south))
+
+
+def bent_arcsec(altitude_deg: Floats) -> Floats:
+    tangent = 1 / np.tan(np.radians(altitude_deg))
+    return np.asarray(57.3 * tangent - 0.067 * tangent**3)
+
+
+@pytest.mark.slow
+def test_images_in_the_wall_that_are_detected_are_warned_of() -> None:
+    """As many as the tracker detects in a frame near a mirrored LED of its truth; none in a wall as dull as advised."""
+    context, samples = plan_of("apl_dome", **SHINY)
+    line = reflections.mirror_images(context, samples)
+    found = re.match(
+        r"light.reflection.specular: the tracker detects up to (\d+) images .* change it to ([\d.]+)$", line
+    )
+    assert found
+    frame, truth = exposure.render_frame(run.simulate_motion(context.testbed), 0)
+    seen = solve_frame(build_tracker(context.testbed), frame).centroids.xy_px
+    mirrored = truth.sources.xy_px[truth.sources.id >= MIRRORED]
+    near = (np.linalg.norm(mirrored[:, None] - seen, axis=2).min(axis=1) < 2).sum()
+    assert near > 0
+    assert abs(int(found[1]) - near) <= max(1, 0.2 * near)
+    dull = SHINY | {"light__reflection": f"{{specular: {found[2]}}}"}
+    assert not reflections.mirror_images(*plan_of("apl_dome", **dull))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mount", [(20.0, -15.0, 5.0), (0.0, 0.0, 0.0)])
+def test_drift_is_a_rotation_of_the_mount_and_a_shift_of_the_dome(mount: tuple[float, ...]) -> None:
+    """25 K times the mount's coefficients, and a dome that creeps across by 1 mm, by first order about the bearing.
+
+    A camera d from the dome, which is L from the bearing, sees a small turn w about the bearing as L w / d. So its own
+    rotation r is solved as r d / L, and the creep as 1 mm / L. The roll is the mount's.
+    """
+    keys = {"temperature": "{kind: steady, temperature_c: 45}", "dome_ppm_k": "0.001", "lens_ppm_k": "0", "speed": "1"}
+    keys |= {"mount_arcsec_k": str(list(mount)), "creep": f"[{0 if any(mount) else 1} mm, 0 mm, 0 mm]"}
+    context, samples = plan_of("thermal_drift", **{f"thermal__{key}": value for key, value in keys.items()})
+    view, at = samples.frames.used[0], samples.frames.attitudes
+    distance_m, arm_m = (np.median(np.linalg.norm(one, axis=1)) for one in (view.offset_m, view.arm_m))
+    turn = findings.drift_rad(view, at.lab_from_body[0], 0.0, context) / ARCSEC_RAD
+    if any(mount):
+        np.testing.assert_allclose(turn[:2], 25 * np.array(mount[:2]) * distance_m / arm_m, rtol=0.01)
+        assert turn[2] == pytest.approx(25 * mount[2], rel=0.01)
+        line = findings.thermal_drift(context, samples)
+        assert re.match(rf"thermal.reference_c: .* by {np.hypot(*turn[:2]):.0f}″ \(cross\) at 45.0 °C, t = ", line)
+    else:
+        assert np.hypot(*turn[:2]) == pytest.approx(1e-3 / arm_m / ARCSEC_RAD, rel=0.01)
+
+
+@pytest.mark.slow
+def test_the_scene_that_drifts_stays_within_its_survey() -> None:
+    assert findings.thermal_drift(*plan_of("thermal_drift")) == ""
