@@ -113,6 +113,7 @@ CASES = [
         "0.5",
         {"light.reflection": f"{{diffuse: 0.5, floor: {FLOOR}}}"},
     ),
+    Case(SKY, {}, "camera.baffle", "{angle_deg: [20, 90], pst: [1e-6, 1e-9]}", MOON),
     Case(SKY, {"camera.detector.dark_e_s": "0"}, "camera.detector.dsnu", "0.5", {"camera.detector.dark_e_s": "20"}),
     Case(SKY, {"camera.detector.hot_e_s": "0"}, "camera.detector.hot_pixels", "0.01", {"camera.detector.hot_e_s": "9"}),
     Case(SKY, {"camera.detector.hot_pixels": "0"}, "camera.detector.hot_e_s", "9", {"camera.detector.hot_pixels": "1"}),

@@ -143,6 +143,12 @@ def seen_from_ground(scene: Scene) -> bool:
     return has_air(scene) or (seen_from_earth(scene) and scene.site.longitude_deg is not None)
 
 
+def nothing_beside_the_field(scene: Scene) -> bool:
+    """Whether no body and no lit Earth throws stray light."""
+    lit_earth = scene.orbit is not None and scene.orbit.earth is not None
+    return getattr(scene.light, "bodies", None) is None and not lit_earth
+
+
 def seeing_is_narrow(scene: Scene) -> bool:
     air = getattr(scene.light, "air", None)
     return air is not None and not air.seeing_px(scene.camera.focal_px)
@@ -250,6 +256,12 @@ RULES = (
         dome_draws_nothing,
         "nothing of this dome is random",
         "light.led.scatter, pulsed LEDs or a random layout",
+    ),
+    Rule(
+        ("camera.baffle",),
+        nothing_beside_the_field,
+        "neither a body nor the lit Earth is in the scene",
+        "light.bodies or orbit.earth",
     ),
     Rule(
         ("camera.detector.dsnu",),

@@ -168,6 +168,24 @@ class GlareConfig(ConfigModel):
     core_px: Annotated[Number, Field(ge=2, le=1000)]
 
 
+class BaffleConfig(ConfigModel):
+    """Point source transmittance (PST) of baffle and lens, by which bodies outside the field light the chip.
+
+    angle_deg, pst : irradiance on the chip over irradiance before the lens, against the angle from the boresight. Its
+        logarithm is linear between the rows; beyond them it is constant
+    """
+
+    angle_deg: Ascending
+    pst: Annotated[tuple[Fraction, ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def check_columns(self) -> BaffleConfig:
+        check_table(self.angle_deg, self.pst, "pst")
+        if not 0 <= self.angle_deg[0] < self.angle_deg[-1] <= 180:
+            raise ValueError("angle_deg: outside of half a circle; allowed: 0 to 180")
+        return self
+
+
 class GlobalShutterConfig(ConfigModel):
     """All rows are exposed at the same time."""
 
@@ -345,7 +363,8 @@ class CameraConfig(ConfigModel):
 
     transmission  : of the lens: one number for all wavelengths, or a CSV file of wavelength_nm and transmission, 0
         beyond its ends
-    ghosts, glare : stray light of what is in the field; light from outside is `background` of kind stray
+    ghosts, glare : stray light of what is in the field
+    baffle        : stray light of the bodies and of the Earth, where they are at the time; none if left out
     """
 
     width_px: Annotated[int, Field(ge=16, le=20000)]
@@ -362,6 +381,7 @@ class CameraConfig(ConfigModel):
     chromatic: ChromaticConfig | None = None
     ghosts: tuple[GhostConfig, ...] = ()
     glare: GlareConfig | None = None
+    baffle: BaffleConfig | None = None
     shutter: Shutter = GlobalShutterConfig()
     detector: DetectorConfig
 
