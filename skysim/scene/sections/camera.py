@@ -172,7 +172,7 @@ class BaffleConfig(ConfigModel):
     """Point source transmittance (PST) of baffle and lens, by which bodies outside the field light the chip.
 
     angle_deg, pst : irradiance on the chip over irradiance before the lens, against the angle from the boresight. Its
-        logarithm is linear between the rows; beyond them it is constant
+        logarithm is linear between the rows; beyond them it is constant. A curve of `transmission` counts in addition
     """
 
     angle_deg: Ascending
