@@ -72,7 +72,7 @@ def render_frame(
     fill_background(light_e, testbed, sky, cam_from_lab, camera_m, middle_s, window.exposure_s, stray_e_s)
     view = view_of(testbed, window, cam_from_lab, middle_s)
     satellites = satellites_during(testbed, view, middle_s, index)
-    stars = lights_during(testbed, view, middle_s)
+    stars = lights_during(testbed, view, middle_s, window.exposure_s)
     if sky:
         stars = seen_stars(testbed, stars, sky, window, index)
     streaks = satellite_sources(testbed, sky, satellites)

@@ -54,10 +54,25 @@ class DirectConfig(ConfigModel):
     kind: Literal["direct"]
 
 
+class LowPassConfig(ConfigModel):
+    """An RC low-pass filter for each LED, whose light follows the filter's voltage.
+
+    time_constant : R C
+    error         : relative standard deviation of R C from LED to LED, or its tolerance (both parts' together)
+    """
+
+    time_constant_s: Annotated[Time, Field(gt=0)]
+    error: Annotated[NumberError, Field(lt=0.5)] = 0.0
+
+
 class PwmConfig(ConfigModel):
-    """Hardware PWM: lit for its level of every led.pwm_period, each LED with a random phase."""
+    """Hardware PWM: lit for its level of every led.pwm_period, each LED with a random phase.
+
+    filter : turns the pulses into nearly steady light; none if left out
+    """
 
     kind: Literal["pwm"] = "pwm"
+    filter: LowPassConfig | None = None
 
 
 class SequentialConfig(ConfigModel):
