@@ -31,6 +31,7 @@ from estimator.trackers.star_tracker import NO_STARS
 COLLECTING = "codes: too few lights have been seen long enough"
 MISSED_FRAMES = 2  # successive frames without a light after which its track ends, if LEDs are never dark
 MIN_BITS = 3  # a light measured in fewer frames could be any LED
+MIN_FREE_BITS = 8  # where the code's time is unknown
 PHASE_REACH = 25.0  # phases of the code's clock with a misfit above the best one's by more are left out
 
 
@@ -95,8 +96,10 @@ class CodedTracker(DomeTracker):
             goes_dark,
         )
         self.templates = np.zeros((len(code.phases), len(code.levels), self.tracks.frames))
+        self.spread = np.zeros_like(self.templates)
+        self.phases = np.ones(len(code.phases), bool)  # those of the code's clock that the lights have not excluded
         self.last_s: float | None = None
-        codes.misfits(np.ones((1, 1)), np.ones((1, 1)), np.ones((1, 1)))  # compiles it, or loads it, before the frames
+        codes.misfits(*np.ones((4, 1, 1)))  # compiles it, or loads it, before the frames
 
     def solve(
         self,
@@ -129,8 +132,8 @@ class CodedTracker(DomeTracker):
         clock, exposure_s = clock or Clock(), exposure_s or 0.0
         self._advance(centroids, t_s, rate)
         middle_s = t_s or 0.0
-        templates = self.code.templates(frame, middle_s - exposure_s / 2, middle_s + exposure_s / 2)
-        self.templates[:, :, self.tracks.column] = templates
+        templates, spread = self.code.templates(frame, middle_s - exposure_s / 2, middle_s + exposure_s / 2)
+        self.templates[:, :, self.tracks.column], self.spread[:, :, self.tracks.column] = templates, spread
         if not len(centroids):
             return Attitude(NO_STARS)
         match = self._identify_codes(centroids)
@@ -148,6 +151,7 @@ class CodedTracker(DomeTracker):
         elapsed_s = 0.0 if self.last_s is None or t_s is None else t_s - self.last_s
         if elapsed_s <= 0:
             self.tracks.clear()
+            self.phases[:] = True
         self.last_s = t_s
         turn = None
         if rate is not None and rate.sign_known:
@@ -159,7 +163,9 @@ class CodedTracker(DomeTracker):
         """The LEDs of the tracks that are seen now, or the reason for a refusal."""
         tracks = self.tracks
         measured = np.isfinite(tracks.light).sum(axis=1)
-        usable = np.flatnonzero((tracks.row >= 0) & (measured >= MIN_BITS))
+        usable = np.flatnonzero(
+            (tracks.row >= 0) & (measured >= (MIN_BITS if len(self.phases) == 1 else MIN_FREE_BITS))
+        )
         if len(usable) < 2:
             return COLLECTING
         # An error of the same size in all frames of a light: relative errors of its dim frames would invite noise.
@@ -169,6 +175,7 @@ class CodedTracker(DomeTracker):
         plausible = misfit.min(axis=1) <= codes.expected_misfit(measured[usable])
         usable, misfit = usable[plausible], misfit[plausible]
         if len(usable) < 2:
+            self.phases[:] = True
             return COLLECTING
         row = tracks.row[usable]
         lights = naming.NamedLights(*self._tangents(centroids.take(row)), misfit)
@@ -176,11 +183,23 @@ class CodedTracker(DomeTracker):
         return match if isinstance(match, str) else replace(match, observed=row[match.observed])
 
     def _misfit(self, light: Floats, sigma: Floats) -> Floats:
-        """(T, N) misfit of each LED's code at the phases of the code's clock that all lights allow."""
-        phases, leds, _ = self.templates.shape
-        each = codes.misfits(light, sigma, self.templates.reshape(phases * leds, -1)).reshape(-1, phases, leds)
+        """(T, N) misfit of each LED's code at the phases of the code's clock that all lights allow.
+
+        The next frame tries these phases and their neighbors.
+        """
+        tried, leds = np.flatnonzero(self.phases), len(self.code.levels)
+        templates, spread = (one[tried].reshape(len(tried) * leds, -1) for one in (self.templates, self.spread))
+        each = np.full((len(light), len(templates)), np.inf)
+        for one, row, error in zip(each, light, sigma, strict=True):
+            likely = codes.likely(row, templates) if len(tried) > 1 else np.arange(leds)
+            one[likely] = codes.misfits(row[None], error[None], templates[likely], spread[likely])[0]
+        each = each.reshape(-1, len(tried), leds)
         common = each.min(axis=2).sum(axis=0)
-        return each[:, common <= common.min() + PHASE_REACH].min(axis=1)
+        allowed = common <= common.min() + PHASE_REACH
+        self.phases[:] = False
+        for step in (-1, 0, 1):
+            self.phases[(tried[allowed] + step) % len(self.phases)] = True
+        return each[:, allowed].min(axis=1)
 
     def _tangents(self, centroids: Centroids) -> tuple[Floats, Floats]:
         """(K, 3) rays of centroids and (K,) errors of their tangents, of the LED map and the lever too."""

@@ -6,7 +6,8 @@ frames j is its negative log likelihood, with normal errors sigma of which a few
 
     misfit = min over a of sum over j of min((y_j - a T_j)^2 / (2 sigma_j^2), GROSS)
 
-A receiver that does not know the code's time tries all words at all phases of it.
+A receiver that does not know the code's time tries all words at some phases of it, and adds the error of a level by
+that of the phase to sigma: an exposure that crosses a bit's edge counts less.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
 GROSS = 7.0  # misfit of a gross error: one of a thousand
-PHASES_PER_BIT = 8  # phases that a free-running receiver tries; an edge is then within a sixteenth of a bit
+ROUGH, LIKELY = 0.1, 40.0  # errors at first sight, and the greatest excess of their misfit
+PHASES_PER_BIT = 8  # phases that a free-running receiver tries
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,13 +57,23 @@ class LedCode:
             return np.zeros(1)
         return np.arange(self.bits * PHASES_PER_BIT) / PHASES_PER_BIT
 
-    def templates(self, frame: int, begin_s: float, end_s: float) -> Floats:
-        """(P, N) mean level of each LED in the exposure of a frame, at each phase."""
+    def templates(self, frame: int, begin_s: float, end_s: float) -> tuple[Floats, Floats]:
+        """(P, N) mean level of each LED in the exposure of a frame, at each phase, and its error by the phase.
+
+        The phase is uniform over a step of the phases, and the level about linear in it: the standard deviation is the
+        change over the step divided by sqrt(12).
+        """
         if self.bit_time_s is None:
-            return self.levels[None, :, frame % self.bits]
+            shown = self.levels[None, :, frame % self.bits]
+            return shown, np.zeros_like(shown)
         begin = begin_s / self.bit_time_s % self.bits + self.phases
         length = max((end_s - begin_s) / self.bit_time_s, 1e-6)
-        return (self._shown_until(begin + length) - self._shown_until(begin)).T / length
+        half = 0.5 / PHASES_PER_BIT
+        before, at, after = (
+            (self._shown_until(begin + step + length) - self._shown_until(begin + step)).T / length
+            for step in (-half, 0.0, half)
+        )
+        return at, np.maximum(np.abs(at - before), np.abs(after - at)) / np.sqrt(3)
 
     def _shown_until(self, time: Floats) -> Floats:
         """(N, P) integral of each LED's level from 0 to P times, in bits."""
@@ -71,54 +83,69 @@ class LedCode:
         return total[:, -1:] * periods + total[:, bit] + (within - bit) * self.levels[:, bit]
 
 
-def misfits(light: Floats, sigma: Floats, templates: Floats) -> Floats:
-    """(T, W) misfit of W templates (W, J) to each of T lights (T, J) with errors sigma; a NaN is no measurement."""
-    light, sigma, templates = (np.ascontiguousarray(one, dtype=float) for one in (light, sigma, templates))
+def misfits(light: Floats, sigma: Floats, templates: Floats, spread: Floats) -> Floats:
+    """(T, W) misfit of W templates (W, J) to each of T lights (T, J) with errors sigma; a NaN is no measurement.
+
+    spread : (W, J) error of a template by the unknown phase
+    """
+    arrays = (np.ascontiguousarray(one, dtype=float) for one in (light, sigma, templates, spread))
     out = np.empty((len(light), len(templates)))
-    _misfits(light, sigma, templates, out)
+    _misfits(*arrays, out)
     return out
 
 
 @jit
-def _misfits(light: Floats, sigma: Floats, templates: Floats, out: Floats) -> None:
+def _misfits(light: Floats, sigma: Floats, templates: Floats, spread: Floats, out: Floats) -> None:
     """Write the misfits. The brightness is fitted twice: from all frames, and from the brightest one."""
+    weight = np.empty(light.shape[1])
     for t in range(len(light)):
         top = 0.0
         for j in range(light.shape[1]):
             if light[t, j] > top:
                 top = light[t, j]
         for w in range(len(templates)):
-            all_frames = _brightness(light[t], sigma[t], templates[w], 0.0, False)
+            for j in range(len(weight)):
+                weight[j] = 0.0
+                if abs(light[t, j]) < np.inf:
+                    weight[j] = 1 / (sigma[t, j] ** 2 + (top * spread[w, j]) ** 2)
             least = np.inf
-            for start in (all_frames, top):
-                fitted = _brightness(light[t], sigma[t], templates[w], start, True)
-                for brightness in (start, fitted):
-                    least = min(least, _misfit(light[t], sigma[t], templates[w], brightness))
+            for start in (_brightness(light[t], weight, templates[w], 0.0, False), top):
+                fitted = _brightness(light[t], weight, templates[w], start, True)
+                least = min(least, _misfit(light[t], weight, templates[w], fitted))
             out[t, w] = least
 
 
 @jit
-def _brightness(light: Floats, sigma: Floats, template: Floats, start: float, selects: bool) -> float:
+def _brightness(light: Floats, weight: Floats, template: Floats, start: float, selects: bool) -> float:
     """Least-squares brightness; with `selects` of the frames without a gross error at a first brightness."""
     product, square = 0.0, 0.0
     for j in range(len(light)):
-        if not abs(light[j]) < np.inf:
+        if weight[j] == 0 or (selects and (light[j] - start * template[j]) ** 2 * weight[j] > 2 * GROSS):
             continue
-        weight = 1 / sigma[j] ** 2
-        if selects and (light[j] - start * template[j]) ** 2 * weight > 2 * GROSS:
-            continue
-        product += weight * light[j] * template[j]
-        square += weight * template[j] ** 2
+        product += weight[j] * light[j] * template[j]
+        square += weight[j] * template[j] ** 2
     return product / square if square > 0 else start
 
 
 @jit
-def _misfit(light: Floats, sigma: Floats, template: Floats, brightness: float) -> float:
+def _misfit(light: Floats, weight: Floats, template: Floats, brightness: float) -> float:
     total = 0.0
     for j in range(len(light)):
-        if abs(light[j]) < np.inf:
-            total += min(((light[j] - brightness * template[j]) / sigma[j]) ** 2 / 2, GROSS)
+        if weight[j] > 0:
+            total += min((light[j] - brightness * template[j]) ** 2 * weight[j] / 2, GROSS)
     return total
+
+
+def likely(light: Floats, templates: Floats) -> Ints:
+    """Rows of the (W, J) templates that a light (J,) does not exclude at first sight; a NaN is no measurement.
+
+    By least squares with errors of ROUGH of the brightest frame, which make little of an edge or a failed bit.
+    """
+    seen = np.isfinite(light)
+    y, shown = light[seen] / light[seen].max() / ROUGH, templates[:, seen]
+    square = np.maximum(np.einsum("wj,wj->w", shown, shown), 1e-300)
+    misfit = (y @ y - (shown @ y) ** 2 / square) / 2
+    return np.flatnonzero(misfit <= misfit.min() + LIKELY)
 
 
 def expected_misfit(measured: Floats | Ints) -> Floats:

@@ -23,7 +23,7 @@ from estimator.identification.leds.search import MARGIN_DEX
 REACH = 30.0  # names with a misfit that exceeds the best one's by more are left out
 STRANGER = 14.0  # misfit of a light that fits no LED: a reflection, or a track that changed its LED
 TRUSTED = 5.0  # by which the misfit of two codes may exceed that of their best names
-MAX_HYPOTHESES = 400
+MAX_HYPOTHESES = 150  # more of them are not decided yet
 UNDECIDED = "codes: more than one attitude fits the lights"
 CONTRADICTED = "codes: the names of the lights contradict their places"
 
@@ -90,10 +90,11 @@ def _pair_names(lights: NamedLights, sphere: Sphere, excess: Floats, first: int,
     """(M, 2) names of two lights, the likeliest ones, whose angle about the bearing is that of the lights."""
     rows = [np.flatnonzero(excess[light] <= REACH) for light in (first, second)]
     seen = [_seen_directions(lights.ray[light], sphere, row) for light, row in zip((first, second), rows, strict=True)]
-    cosine = np.clip(seen[0] @ seen[1].T, -1, 1)
-    known = np.clip(sphere.direction[rows[0]] @ sphere.direction[rows[1]].T, -1, 1)
+    cosine = seen[0] @ seen[1].T
+    known = sphere.direction[rows[0]] @ sphere.direction[rows[1]].T
     gate = GATE_SIGMA * np.hypot(lights.sigma[first], lights.sigma[second])
-    a, b = np.nonzero(np.abs(np.arccos(cosine) - np.arccos(known)) < gate)
+    # The difference of two angles that are much greater than it is that of their cosines over the sine.
+    a, b = np.nonzero(np.abs(cosine - known) < gate * np.sqrt(np.maximum(1 - cosine**2, gate**2)))
     names = np.column_stack([rows[0][a], rows[1][b]])
     names = names[names[:, 0] != names[:, 1]]
     cost = excess[first, names[:, 0]] + excess[second, names[:, 1]]
@@ -127,23 +128,27 @@ def _evaluate(
     lights: NamedLights, sphere: Sphere, excess: Floats, R_cam_from_lab: Floats, pair: tuple[int, int], names: Ints
 ) -> tuple[Floats, NDArray[np.int64]]:
     """(M,) misfit of each hypothesis and (M, T) its names of the lights, -1 for none."""
-    offset = np.einsum("mij,nj->mni", R_cam_from_lab, sphere.position_m) - sphere.pupil_m
+    offset = (R_cam_from_lab.reshape(-1, 3) @ sphere.position_m.T).reshape(-1, 3, len(sphere.position_m))
+    offset = offset - sphere.pupil_m[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        tangent = np.where(offset[..., 2:] > 0, offset[..., :2] / offset[..., 2:], np.inf)
+        tangent = np.where(offset[:, 2:] > 0, offset[:, :2] / offset[:, 2:], np.inf)
     seen = lights.ray[:, :2] / lights.ray[:, 2:]
     middle, length2 = seen[list(pair)].mean(axis=0), np.sum((seen[pair[0]] - seen[pair[1]]) ** 2)
     total = excess[pair[0], names[:, 0]] + excess[pair[1], names[:, 1]]
     star = np.full((len(names), len(seen)), -1)
     star[:, pair] = names
+    cost = np.full((len(names), len(sphere.position_m) + 1), STRANGER)  # of each LED, and at last (-1) of none of them
+    named = list(pair)
     for light in set(range(len(seen))) - set(pair):
         # The pair's attitude adds half of a light's variance, and more with the distance from the pair's middle.
         factor = 1.5 + 2 * np.sum((seen[light] - middle) ** 2) / length2
-        squared = np.sum((tangent - seen[light]) ** 2, axis=2) / (factor * lights.sigma[light] ** 2)
-        cost = np.where(squared < GATE_SIGMA**2, squared / 2 + excess[light], np.inf)
-        taken = np.any(star[:, :, None] == np.arange(cost.shape[1]), axis=1)
-        cost = np.where(taken, np.inf, cost)
-        named = cost.argmin(axis=1)
-        least = cost[np.arange(len(cost)), named]
-        star[:, light] = np.where(least < STRANGER, named, -1)
-        total = total + np.minimum(least, STRANGER)
+        squared = (tangent[:, 0] - seen[light, 0]) ** 2 + (tangent[:, 1] - seen[light, 1]) ** 2
+        squared /= factor * lights.sigma[light] ** 2
+        cost[:, :-1] = np.where(squared < GATE_SIGMA**2, squared / 2 + excess[light], np.inf)
+        np.put_along_axis(cost, star[:, named], np.inf, axis=1)  # an LED is one light at most
+        cost[:, -1] = STRANGER
+        star[:, light] = cost.argmin(axis=1)
+        total = total + cost.min(axis=1)
+        star[star[:, light] == len(sphere.position_m), light] = -1
+        named.append(light)
     return total, star

@@ -32,13 +32,15 @@ def test_a_template_is_the_mean_level_of_an_exposure(rng: np.random.Generator, b
     free, triggered = LedCode(levels, 0.3), LedCode(levels)
     time = begin_s + (np.arange(2000) + 0.5) / 2000 * length_s
     bit = np.floor(time / 0.3 + free.phases[:, None]).astype(int) % free.bits
-    found = free.templates(0, begin_s, begin_s + length_s)
+    found, spread = free.templates(0, begin_s, begin_s + length_s)
+    assert spread.min() >= 0
     assert found.shape == (len(free.phases), 5)
     np.testing.assert_allclose(found, levels[:, bit].mean(axis=2).T, rtol=0, atol=2e-3)
-    np.testing.assert_array_equal(triggered.templates(17, 0.0, 1.0), levels[None, :, 3])
+    np.testing.assert_array_equal(triggered.templates(17, 0.0, 1.0)[0], levels[None, :, 3])
+    assert triggered.templates(17, 0.0, 1.0)[1].max() == 0
 
 
-@law(codes.misfits, codes.expected_misfit)
+@law(codes.misfits, codes.expected_misfit, codes.likely)
 @given(rng=SEEDS, gross=some.integers(0, 2))
 def test_a_misfit_is_the_least_over_the_brightness(rng: np.random.Generator, gross: int) -> None:
     """Of the true template it is that of a fine search of brightnesses; of others at least as much as theirs."""
@@ -47,7 +49,7 @@ def test_a_misfit_is_the_least_over_the_brightness(rng: np.random.Generator, gro
     light[0, :gross] = rng.uniform(0.3, 1.2, gross) * 1e4
     light[0, 5] = np.nan
     sigma = np.full((1, 20), 200.0)
-    found = codes.misfits(light, sigma, template)
+    found = codes.misfits(light, sigma, template, np.zeros_like(template))
 
     def misfit(brightness: float, row: Floats) -> float:
         each = ((light[0] - brightness * row) / sigma[0]) ** 2 / 2
@@ -59,6 +61,7 @@ def test_a_misfit_is_the_least_over_the_brightness(rng: np.random.Generator, gro
         assert found[0, n] >= best - 1e-6
         if n == 0:
             assert found[0, n] == pytest.approx(best, abs=0.02)
+    assert 0 in codes.likely(light[0], template)
     assert found[0, 0] <= codes.expected_misfit(np.array([19]))[0] + GROSS * gross
 
 
