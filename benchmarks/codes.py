@@ -1,42 +1,46 @@
 """LEDs that blink their names: attitudes found and wrong, bit errors against theory, frames to the first attitude.
 
 Centroids of scene coded_spiral, 400 LEDs on a spiral, at random attitudes within 30 degrees of tilt, at rest or turning
-at a constant rate about a random axis. A light's position and brightness have the errors of `Noise`, measured in
-rendered frames (`rendered_noise`). `python -m benchmarks.codes [ATTITUDES]` prints the rows.
+at a constant rate about a random axis. A light's position and brightness have the errors of `Noise`. Some sequences are
+rendered too. `python -m benchmarks.codes [ATTITUDES [RENDERED]]` prints the rows.
 """
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from benchmarks import bit_errors
 from benchmarks.dome_identify import attitude
 from benchmarks.timing import verdict
 from estimator.attitude.dome_map import project
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.coded_tracker import CodedTracker
 from skysim.core.random_streams import random_stream
+from skysim.core.types import Trajectory
 from skysim.results import metrics
 from skysim.scene import loader
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.exposure import render_frame
+from skysim.simulation.testbed import MARGIN_S, Testbed, build_testbed, build_tracker, exposure_window
 from skysim.sources.dome.led import irradiance_e_s_m2
+from skysim.tracking import factory
 
 Ints = NDArray[np.int64]
 
 SCENE = "coded_spiral"
-ATTITUDES = 10_000
+ATTITUDES, RENDERED = 10_000, 50
 RATES_DEG_S = (0.0, 5.0)
 BORDER_PX = 12.0  # half of an LED's image, which the tracker drops where the border cuts it off
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Errors of a light, from `rendered_noise` with some margin: pixels, and part of its brightness."""
+    """Errors of a light, above those of rendered frames (`rendered`): pixels, and part of its brightness."""
 
     position_px: float = 0.2
     light: float = 0.02
@@ -87,6 +91,28 @@ class Bench:
                     break
         return Sequence(first, wrong, fewest)
 
+    def rendered(self, rate_deg_s: float, seed: int) -> Sequence:
+        """As `sequence`, in rendered frames, of which all are solved."""
+        rng, scene = random_stream(seed), self.testbed.scene
+        start, axis, begin = attitude(rng), rng.standard_normal(3), int(rng.integers(0, 1000))
+        turn_rad_s = np.radians(rate_deg_s) * axis / np.linalg.norm(axis)
+        last = begin + self.tracker.code.bits
+        t_s = np.array([exposure_window(scene, n).open_s - MARGIN_S for n in (begin, last)])
+        body_from_lab = Rotation.from_rotvec(turn_rad_s * (t_s - t_s[0])[:, None]) * start
+        trajectory = Trajectory(t_s, body_from_lab.inv(), np.tile(-turn_rad_s, (2, 1)))
+        testbed = replace(self.testbed.in_run(seed), trajectory=trajectory)
+        first, wrong, fewest = 0, False, 99
+        self.tracker.last_s = None
+        for n in range(begin, last):
+            frame, truth = render_frame(testbed, n)
+            report = factory.solve_frame(self.tracker, frame)
+            fewest = min(fewest, len(report.centroids))
+            if report.attitude.solved:
+                first = first or n - begin + 1
+                apart = np.linalg.norm(report.centroids.xy_px[:, None] - truth.sources.flux_xy_px, axis=2)
+                wrong |= is_wrong(report.attitude, truth.cam_from_lab, truth.sources.id[apart.argmin(axis=1)])
+        return Sequence(first, wrong, fewest)
+
     def centroids(
         self, testbed: Testbed, body_from_lab: Rotation, frame: int, rng: np.random.Generator
     ) -> tuple[Centroids, Ints]:
@@ -126,23 +152,23 @@ def is_wrong(solved: Attitude, cam_from_lab: Rotation, name: Ints) -> bool:
     return metrics.is_wrong(error_rad, nees) or bool(np.any(name[solved.match.observed] != solved.match.star))
 
 
-def measure(attitudes: int = ATTITUDES) -> list[dict[str, Any]]:
-    """All rows."""
-    return identified(attitudes)
+def measure(attitudes: int = ATTITUDES, rendered: int = RENDERED) -> list[dict[str, Any]]:
+    """All rows; bit errors against theory in benchmarks/bit_errors.py."""
+    return identified("centroids", attitudes) + identified("rendered", rendered) + bit_errors.measure()
 
 
-def identified(attitudes: int) -> list[dict[str, Any]]:
+def identified(kind: str, attitudes: int) -> list[dict[str, Any]]:
     """Attitudes found within the code's length of frames, and wrong ones, at rest and turning."""
     bench, rows = Bench(), list[dict[str, Any]]()
+    one = bench.rendered if kind == "rendered" else bench.sequence
     for rate_deg_s in RATES_DEG_S:
-        results = [bench.sequence(rate_deg_s, seed) for seed in range(attitudes)]
-        first = np.array([one.first for one in results])
-        name = f"spiral of 400, {rate_deg_s:g} deg/s"
-        found = 100 * float(np.mean(first > 0))
-        wrong = sum(one.wrong for one in results)
+        results = [one(rate_deg_s, seed) for seed in range(attitudes)]
+        found = 100 * float(np.mean([result.first > 0 for result in results]))
+        name, bits = f"spiral of 400, {kind}, {rate_deg_s:g} deg/s", bench.tracker.code.bits
+        wrong = sum(result.wrong for result in results)
         rows += [
-            verdict(f"{name}: attitude within {bench.tracker.code.bits} frames", found, "%", "", 99.9, least=True),
-            verdict(f"{name}: wrong of {attitudes}", wrong, "attitudes", "", 0),
+            verdict(f"{name}: attitude within {bits} frames", found, "%", f"{attitudes} attitudes", 99.9, least=True),
+            verdict(f"{name}: wrong", wrong, "attitudes", f"{attitudes} attitudes", 0),
         ]
     return rows
 

@@ -25,8 +25,11 @@ ANY = [row for row in ROWS if row["expect"] == "any"]
 needs_photographs = pytest.mark.skipif(not ROWS, reason=f"no photographs of the real sky in {FOLDER}")
 
 
-def by_file(rows):
-    return pytest.mark.parametrize("row", rows, ids=[row["file"] for row in rows])
+def by_file(rows, quick: int = 1):
+    """A test for each photograph; of which every `quick`-th is not slow."""
+    marks = [() if k % quick == 0 else pytest.mark.slow for k in range(len(rows))]
+    params = [pytest.param(row, marks=mark, id=row["file"]) for row, mark in zip(rows, marks, strict=True)]
+    return pytest.mark.parametrize("row", params)
 
 
 def answer(row, fov_error: float) -> dict:
@@ -59,7 +62,7 @@ def check_right(found: dict, row) -> None:
 
 
 @needs_photographs
-@by_file(TO_SOLVE)
+@by_file(TO_SOLVE, quick=4)
 def test_a_photograph_is_solved_with_its_field_known_to_five_per_cent(row):
     worst = 0.05 if TO_SOLVE.index(row) % 2 else -0.05
     check_right(answer(row, worst), row)

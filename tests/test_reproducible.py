@@ -105,6 +105,7 @@ def test_a_command_says_once_that_it_compiles_and_nothing_once_it_has(tmp_path: 
     assert said[1:] == ["end\n"] * 3
 
 
+@pytest.mark.slow
 def test_the_first_picture_ever_says_that_it_compiles(tmp_path: Path) -> None:
     """Half a minute of silence otherwise. It is stopped as soon as it has said so."""
     cv2.imwrite(str(tmp_path / "x.png"), np.random.default_rng(0).integers(0, 99, (64, 80), np.uint8))

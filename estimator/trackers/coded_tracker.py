@@ -189,11 +189,11 @@ class CodedTracker(DomeTracker):
         """
         tried, leds = np.flatnonzero(self.phases), len(self.code.levels)
         templates, spread = (one[tried].reshape(len(tried) * leds, -1) for one in (self.templates, self.spread))
-        each = np.full((len(light), len(templates)), np.inf)
-        for one, row, error in zip(each, light, sigma, strict=True):
+        flat = np.full((len(light), len(templates)), np.inf)
+        for one, row, error in zip(flat, light, sigma, strict=True):
             likely = codes.likely(row, templates) if len(tried) > 1 else np.arange(leds)
             one[likely] = codes.misfits(row[None], error[None], templates[likely], spread[likely])[0]
-        each = each.reshape(-1, len(tried), leds)
+        each = flat.reshape(-1, len(tried), leds)
         common = each.min(axis=2).sum(axis=0)
         allowed = common <= common.min() + PHASE_REACH
         self.phases[:] = False

@@ -104,8 +104,10 @@ def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None)
     ("change", "fov_deg", "says"),
     [
         (mirror, FOV_DEG, r"^perhaps mirrored: it solves when flipped left to right; "),
-        (np.flipud, FOV_DEG, r"^perhaps mirrored: "),
-        (np.array, 30.0, r"^perhaps another field of view: it solves with --fov 14\.8$"),
+        pytest.param(np.flipud, FOV_DEG, r"^perhaps mirrored: ", marks=pytest.mark.slow),
+        pytest.param(
+            *(np.array, 30.0, r"^perhaps another field of view: it solves with --fov 14\.8$"), marks=pytest.mark.slow
+        ),
         pytest.param(  # the vertical one
             *(np.array, 11.1, r"^perhaps another field of view: it solves with --fov 14\.8$"), marks=pytest.mark.slow
         ),
@@ -246,6 +248,7 @@ def test_few_lights_are_not_tried_any_further(monkeypatch: pytest.MonkeyPatch) -
     assert diagnosis.mirrored(nothing) == diagnosis.other_field(nothing) == diagnosis.shallow_catalog(nothing) == ""
 
 
+@pytest.mark.slow
 def test_a_refusal_is_printed_with_what_was_seen_and_tried(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image = mirror(photograph())
     cv2.imwrite(str(tmp_path / "x.png"), image)

@@ -160,6 +160,7 @@ def test_a_phone_s_wide_field_is_solved_by_its_focal_length(tmp_path: Path) -> N
     check_right(found, truth, 66.2)
 
 
+@pytest.mark.slow
 def test_a_wrong_focal_length_is_given_up(sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path) -> None:
     """A crop, or a lens without contacts; 0 and absurd ones are not even tried."""
     check_right(answer(with_exif(tmp_path / "x.jpg", gray, 1, 50), None), sky[2])
@@ -201,8 +202,8 @@ def test_every_hypothesis_takes_its_share_of_chance(
 # FITS
 
 
-@pytest.mark.parametrize("order", ["TOP-DOWN", "BOTTOM-UP", None])
-@pytest.mark.parametrize("highest_first", [True, False])
+@pytest.mark.parametrize("order", ["TOP-DOWN", pytest.param("BOTTOM-UP", marks=pytest.mark.slow), None])
+@pytest.mark.parametrize("highest_first", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_fits_picture_is_the_same_sky_in_either_row_order(
     sky: tuple[Scene, Frame, Truth], tmp_path: Path, order: str | None, highest_first: bool
 ) -> None:
@@ -219,6 +220,7 @@ def test_a_fits_picture_is_the_same_sky_in_either_row_order(
     assert ("no ROWORDER in the header" in found["hint"]) is (order is None and highest_first)
 
 
+@pytest.mark.slow
 def test_a_mirrored_fits_picture_of_known_order_is_refused(sky: tuple[Scene, Frame, Truth], tmp_path: Path) -> None:
     fits.PrimaryHDU(sky[1].image_dn[:, ::-1], fits.Header([("ROWORDER", "TOP-DOWN")])).writeto(tmp_path / "x.fits")
     found = answer(tmp_path / "x.fits")
@@ -226,6 +228,7 @@ def test_a_mirrored_fits_picture_of_known_order_is_refused(sky: tuple[Scene, Fra
     assert "perhaps mirrored: it solves when flipped left to right" in found["hint"]
 
 
+@pytest.mark.slow
 def test_our_own_frames_say_their_row_order_and_read_as_written(
     sky: tuple[Scene, Frame, Truth], tmp_path: Path
 ) -> None:
@@ -298,6 +301,7 @@ def test_json_is_stable_and_says_more(gray: NDArray, tmp_path: Path) -> None:
     assert found["hint"] == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["x.JPG", pytest.param("x.fits.gz", marks=pytest.mark.slow)])
 def test_the_browser_s_panel_sees_the_same_picture(
     sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path, name: str

@@ -44,6 +44,7 @@ def test_a_picture_with_a_town_below_is_solved_by_its_upper_half() -> None:
     assert (outcome.report.centroids.xy_px[:, 1] < 480).all()
 
 
+@pytest.mark.slow
 def test_clouds_are_taken_away_and_stars_stay() -> None:
     """The clouds change the sky by more than the noise within a tile of the background."""
 

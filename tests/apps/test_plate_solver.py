@@ -15,6 +15,7 @@ from estimator.trackers.pipeline import Clock
 from estimator.trackers.residuals.refinement import NO_MATCH
 from estimator.trackers.star_tracker import NO_STARS
 from skysim.apps import plate_solver
+from skysim.apps.plate_solver import solver as searching
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.quantities.units import ARCSEC_RAD
@@ -66,7 +67,7 @@ class FixedTracker:
         self.attitude = attitude
         self.calls = 0
 
-    def solve_centroids(self, centroids: Centroids, clock: Clock, effort: int) -> Attitude:
+    def solve_centroids(self, centroids: Centroids, clock: Clock | None, effort: int) -> Attitude:
         self.calls += 1
         return self.attitude
 
@@ -85,10 +86,20 @@ def outcome(*solution: Attitude) -> tuple[Attitude, list[int]]:
 REFUSED = Attitude(NO_MATCH)
 
 
-def test_a_decisive_answer_is_taken_at_once() -> None:
+def test_a_decisive_answer_is_taken_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(searching, "THREADS", 1)
     attitude, calls = outcome(REFUSED, answer(ATTITUDE, -20.0), answer(OTHER_ATTITUDE, -30.0))
     assert attitude.cam_from_ref is ATTITUDE
     assert calls == [1, 1, 0]
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_answers_are_taken_in_the_order_of_the_trackers(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many threads there are: the first decisive one is taken, not the quickest."""
+    monkeypatch.setattr(searching, "THREADS", threads)
+    for decisive in itertools.permutations([answer(ATTITUDE, -20.0), answer(OTHER_ATTITUDE, -30.0)]):
+        attitude, _ = outcome(REFUSED, *decisive, REFUSED)
+        assert attitude.cam_from_ref is decisive[0].cam_from_ref
 
 
 def test_as_many_tries_are_allowed_as_much_chance_as_one() -> None:

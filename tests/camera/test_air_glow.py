@@ -89,6 +89,7 @@ def up_pointing(testbed: Testbed) -> Rotation:
     return Rotation.from_matrix(np.stack([-east, -north, up]))
 
 
+@pytest.mark.slow
 def test_below_the_skyline_there_is_no_glow() -> None:
     testbed = bed("2012-06-24T23:00:00")
     sky = sky_during(testbed, 0.0)

@@ -99,7 +99,7 @@ def traced(
     return np.s_[y : y + PATCH, x : x + PATCH], total
 
 
-@pytest.mark.parametrize("focus", [f"{DEPTH_M} m", "0.5 m"])
+@pytest.mark.parametrize("focus", [f"{DEPTH_M} m", pytest.param("0.5 m", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("xy_px", [CENTER, CORNER])
 @pytest.mark.parametrize(
     ("incidence_deg", "around_deg", "exponent"),
@@ -198,6 +198,7 @@ def test_a_moving_ellipse_is_the_mean_of_still_ones() -> None:
     np.testing.assert_allclose(rolled.sum(), drawn(lens, source)[0].sum() / 2, rtol=1e-5, atol=0)
 
 
+@pytest.mark.slow
 @settings(max_examples=40, derandomize=True, deadline=None)
 @given(st.floats(0, 30), st.floats(0, 75), st.floats(0, 360), st.floats(0, 360), st.floats(0.5, 4))
 def test_rim_and_mean_light_are_those_of_the_projected_disk(

@@ -171,6 +171,7 @@ def test_a_gzipped_file_is_read(tmp_path: Path, name: str) -> None:
     np.testing.assert_array_equal(images.read_picture(path).pixels, FRAME)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("packed", [False, True], ids=["fz", "fz in gz"])
 def test_a_file_of_tiles_is_read_with_its_header(tmp_path: Path, packed: bool) -> None:
     header = fits.Header([("ROWORDER", "TOP-DOWN"), ("DATE-OBS", "2012-06-22T21:00:00")])

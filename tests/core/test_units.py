@@ -7,7 +7,7 @@ import sys
 
 import pytest
 from astropy import units
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skysim.core.quantities.units import COMMON_UNITS, in_si
@@ -21,6 +21,7 @@ def by_astropy(text: str, si: str) -> float:
         return float(units.Quantity(text).to_value(si))
 
 
+@settings(max_examples=20)
 @pytest.mark.parametrize(("si", "unit"), PAIRS, ids=[unit for _, unit in PAIRS])
 @given(st.floats(-1e9, 1e9) | st.integers(-(10**9), 10**9), st.sampled_from(["", " "]))
 def test_a_common_unit_is_that_of_astropy(si: str, unit: str, value: float, space: str) -> None:
@@ -39,6 +40,7 @@ def test_what_is_not_common_goes_to_astropy(text: str) -> None:
         assert in_si(text, "m") == pytest.approx(expected, rel=0, abs=0, nan_ok=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["shefex2", pytest.param("afit_simsat", marks=pytest.mark.slow)])
 def test_a_scene_is_loaded_without_astropy(name: str) -> None:
     code = f"import sys; from skysim.scene import loader; loader.load({name!r}); print('astropy' in sys.modules)"

@@ -141,6 +141,7 @@ def test_feed_forward_is_eulers_equation() -> None:
     assert np.abs(np.cross(rate, STORED)).max() > 0.1  # which is not nothing
 
 
+@pytest.mark.slow
 def test_a_rigid_body_is_on_the_reference_all_along_a_slew() -> None:
     """By the feed-forward alone: the error that feedback might amend never comes to be."""
     tour = told(SLEW)

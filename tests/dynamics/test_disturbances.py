@@ -53,6 +53,7 @@ def gusts() -> Floats:
     return np.array([air.sample() for _ in range(100_000)])
 
 
+@pytest.mark.slow
 def test_gusts_have_their_rms_and_no_mean(gusts: Floats) -> None:
     """Of N samples of an Ornstein-Uhlenbeck process, a = exp(-period / time): the mean's variance is rms^2 / N
     (1 + a) / (1 - a), the mean square's 2 rms^4 / N (1 + a^2) / (1 - a^2). Four sigma."""

@@ -163,6 +163,7 @@ def test_a_vehicle_of_mesh_files_stands_alone(tmp_path: Path) -> None:
     np.testing.assert_allclose(here, vertices_m(vehicle.model, own, "hull"), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_has_its_own_camera_lab_is_refused(tmp_path: Path) -> None:
     (tmp_path / "v.xml").write_text(
         """<mujoco><worldbody><camera name="lab"/><body name="bus"><geom size="0.1" mass="80"/>

@@ -307,6 +307,7 @@ def test_pose_inside_an_exposure_of_a_vehicle_shaken_by_its_wheels() -> None:
     assert apart.max() < 3e-9
 
 
+@pytest.mark.slow
 def test_pose_inside_an_exposure_while_gimbals_are_driven() -> None:
     """CMGs at 2600 rpm whose gimbals are told another rate each 10 ms: within 1e-9 rad."""
     vehicle, rng = multibody.build(vehicle_config(cmgs={})), np.random.default_rng(6)

@@ -66,6 +66,7 @@ def test_the_law_catches_a_header_that_is_off() -> None:
         assert not oracles.Agreement(0, off_rad, 0.0, *sigma, 25).within
 
 
+@pytest.mark.slow
 def test_the_predicted_errors_are_those_of_least_squares() -> None:
     """Attitudes and plates of stars of unequal errors, by Monte Carlo: 2,000 draws tell sigma to 1.6 %."""
     rng = np.random.default_rng(2)

@@ -224,6 +224,7 @@ def test_a_noise_free_frame_keeps_every_digit(dome: Flown, tmp_path: Path) -> No
     np.testing.assert_array_equal(zarr.open_group(tmp_path / frames.ZARR, mode="r")["frames"][1], image)
 
 
+@pytest.mark.slow
 def test_a_sequence_is_chunked_by_frame_and_dated(stars: Flown, tmp_path: Path) -> None:
     testbed, run = stars
     export.export(run, ["zarr"], tmp_path, quiet)
@@ -304,6 +305,7 @@ def test_the_header_s_polynomials_are_the_renderer_s_lens(distortion: tuple[floa
     assert wcs.accuracy_warning(lens) == ""
 
 
+@pytest.mark.slow
 def test_a_lens_beyond_sip_is_told_of_in_header_and_doubt() -> None:
     lens = camera((-0.3, 0.1, 0.0, 0.0, -0.02), "6.5 mm")
     forwards, backwards = misfits(lens)

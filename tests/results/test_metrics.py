@@ -77,6 +77,7 @@ def test_normalized_error_by_hand() -> None:
     assert nees == pytest.approx(1 + 1 + 1, rel=1e-10)
 
 
+@pytest.mark.slow
 def test_normalized_error_is_chi_square_of_three_for_a_true_covariance() -> None:
     rng = np.random.default_rng(6)
     root = 1e-5 * np.array([[1, 0, 0], [0.3, 2, 0], [-0.5, 0.4, 8]])

@@ -134,6 +134,7 @@ def test_each_kind_of_file_is_told_and_each_fault_is_a_line(tmp_path: Path) -> N
         assert "\n" not in fault
 
 
+@pytest.mark.slow
 def test_whatever_skysim_reads_is_taken(tmp_path: Path) -> None:
     lens = tmp_path / "lens.yml"
     lens.write_text(opencv_calibration.text(load("shefex2").camera.calibration()))
@@ -170,6 +171,7 @@ def test_what_only_the_setup_finds_has_its_line(tmp_path: Path) -> None:
     assert "mine.yaml, line 4" in check_file(path).fault
 
 
+@pytest.mark.slow
 def test_the_command_refuses_with_2_and_prints_a_schema() -> None:
     done = CliRunner().invoke(main.app, ["validate", str(SCENES / "shefex2.yaml"), "nothing.yaml", "--json"])
     assert done.exit_code == 2

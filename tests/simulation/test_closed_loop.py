@@ -44,6 +44,7 @@ def bumped() -> Testbed:
     return prepared(**EARLY | EXACT_MAP)
 
 
+@pytest.mark.slow
 def test_the_tracker_is_compiled_before_the_first_frame_of_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     """One synthetic frame is solved first, whose report is none of the flight's."""
     solved: list[Frame] = []
@@ -93,6 +94,7 @@ def test_every_frame_is_solved_and_used(bumped: Testbed) -> None:
     assert {report.attitude.status for report in bumped.reports.values()} == {"solved"}
 
 
+@pytest.mark.slow
 def test_the_imu_is_wrong_for_good_by_the_turn_it_missed(bumped: Testbed) -> None:
     """What is beyond its limit of 10 deg/s about z, integrated along the true rate: 0.58 deg; it stays."""
     telemetry, path = told(bumped), bumped.trajectory
@@ -167,6 +169,7 @@ def test_the_vehicle_is_brought_back(bumped: Testbed) -> None:
     assert off[told(bumped).t_s > 7].max() < 0.05
 
 
+@pytest.mark.slow
 def test_steered_by_the_imu_it_stays_where_the_imu_is_wrong() -> None:
     telemetry = told(prepared(**EARLY | {key.replace(".", "__"): value for key, value in IMU_ALONE.items()}))
     assert telemetry.lab_from_filter is None

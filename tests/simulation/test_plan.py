@@ -110,6 +110,7 @@ def test_a_tilt_beyond_the_stop_is_refused_as_by_a_run(changes: dict[str, str], 
 # Facts
 
 
+@pytest.mark.slow
 def test_the_field_and_the_pixel_are_the_pinhole_s(afit: plan.Check) -> None:
     """1600 pixels of 4 um, 36.53 mm behind the lens: 10.0 deg, as the scene says."""
     field = fact(afit, "field of view").values
@@ -141,6 +142,7 @@ def test_the_least_lights_are_where_it_says() -> None:
     assert len(plan.sampled(there, context).used[0]) == pytest.approx(samples.reach.counts().min(), abs=1)
 
 
+@pytest.mark.slow
 def test_the_depth_of_focus_ends_where_defocus_is_a_pixel(afit: plan.Check) -> None:
     """By similar triangles: a pupil of 35 / 8 mm, a chip 36.53 mm behind it focused at 33 in."""
     values = fact(afit, "depth of focus").values
@@ -234,6 +236,7 @@ def test_causes_are_in_order_and_each_is_found_where_it_is_put() -> None:
     assert next(iter(values["cross_causes_arcsec"])) in ("lever survey", "survey rotation")
 
 
+@pytest.mark.slow
 def test_what_cross_and_sigma_are_of_is_said() -> None:
     """Cross is of two axes; a survey's error is constant in one dome, unlike the noise of centroids."""
     over_surveys = "of the survey: 1σ over surveys; one dome has one survey, whose error stays the same"
@@ -403,11 +406,13 @@ def test_the_brightest_hundred_of_many_lights_are_no_fault() -> None:
     assert not [line for line in result.findings if "detects" in line]
 
 
+@pytest.mark.slow
 def test_only_an_led_s_image_has_the_part_of_an_led(afit: plan.Check) -> None:
     assert ", LED 2" in fact(afit, "image size").lines[0]
     assert "LED" not in fact(check(bed("shefex2")), "image size").lines[0]
 
 
+@pytest.mark.slow
 def test_the_rate_at_which_an_image_is_as_long_as_wide_is_told() -> None:
     result = check(bed("shefex2"))
     rate_deg_s, width_px = (
@@ -419,6 +424,7 @@ def test_the_rate_at_which_an_image_is_as_long_as_wide_is_told() -> None:
     assert "as long as the image is wide at" in fact(result, "smear").lines[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("focal_length", "solved"), [("25.01 mm", 3), ("25.5 mm", 3), ("27 mm", 0)])
 def test_a_wrong_focal_length_is_warned_of_where_the_tracker_refuses(focal_length: str, solved: int) -> None:
     testbed = bed("shefex2", tracker__assumed_focal_length=focal_length, exposure__frames="3")
@@ -479,6 +485,7 @@ def test_the_star_of_a_signal_to_noise_of_five_is_that_of_the_truth_table() -> N
     assert np.median(v_mag[near]) == pytest.approx(limit, abs=0.3)
 
 
+@pytest.mark.slow
 def test_a_floor_that_the_check_proposes_makes_the_claims_true() -> None:
     """Of a chip whose pixels differ by 10 %, NEES is 5.4 as expected and 5.7 (median of 40 frames) as measured."""
     floor_px = 0.02
@@ -510,6 +517,7 @@ def test_bodies_in_the_field_and_near_it_are_warned_of() -> None:
     assert warned_of_bodies(154.9, 2.0, light__bodies="{moon: false, sun: false}") == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ra_deg", "dec_deg", "name"), [(174.9, 2.0, "Mars"), (154.9, 4.8, "Moon")])
 def test_a_body_fills_a_pixel_as_in_its_frame(ra_deg: float, dec_deg: float, name: str) -> None:
     """Within a factor of 1.5 of the brightest pixel's electrons: its place in the pixel, and the phase's shape."""

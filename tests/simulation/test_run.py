@@ -517,6 +517,7 @@ def test_the_moon_is_in_the_frame_and_in_its_truth() -> None:
     assert not any(body.name == "moon" for body in without.bodies)
 
 
+@pytest.mark.slow
 def test_the_moon_moves_among_the_stars_during_a_run() -> None:
     """By half a second of arc a second, so a frame a minute later has it elsewhere."""
     settings = MOON | {"exposure.frames": "2", "exposure.rate_hz": "0.0167"}

@@ -188,6 +188,7 @@ def test_what_the_vehicle_cannot_follow_is_refused(
         moved(scene, ways | {"exposure.first": "0.1 s"}, profile=swing(TIMES, size_deg / 5))
 
 
+@pytest.mark.slow
 def test_the_torque_of_a_profile_is_eulers() -> None:
     """Just refused by a limit below it and just allowed above: J alpha + w x J w, largest over the samples."""
     columns = swing(TIMES)

@@ -107,6 +107,7 @@ def test_an_oem_is_interpolated_between_its_samples(tmp_path: Path, monkeypatch:
         ("= GCRF", "= ITRF2000", "line 4: REF_FRAME = 'ITRF2000'"),
         ("TIME_SYSTEM = UTC\n", "", "TIME_SYSTEM is missing"),
         ("META_START", "META", "is not KEYWORD = value"),
+        ("META_START\n", "", "line 5: META_STOP before META_START"),
     ],
 )
 def test_bad_oems_are_refused_in_one_line(old: str, new: str, message: str, tmp_path: Path) -> None:

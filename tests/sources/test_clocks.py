@@ -92,6 +92,7 @@ def test_flicker_differs_from_frame_to_frame_and_from_run_to_run() -> None:
             assert np.abs(electrons[a, dimmed] / electrons[b, dimmed] - 1).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_exposures_begin_late_by_their_jitter_and_tags_err_as_the_scene_says() -> None:
     keys = {"trigger_jitter": "400 us", "time_tag_offset": "1 ms", "time_tag_jitter": "200 us"}
     scene = loader.load("afit_simsat", {f"exposure.{key}": value for key, value in keys.items()})

@@ -45,6 +45,7 @@ def test_words_are_as_far_apart_as_stated(code: Code, bits: int, distance: int) 
 
 
 @pytest.mark.parametrize("distance", [5, 7])
+@pytest.mark.slow
 def test_cyclic_words_are_as_far_apart_at_any_shift(distance: int) -> None:
     """From each other's shifts, and from their own."""
     words = codebook(CyclicCodeConfig(kind="cyclic", distance=distance), 400)

@@ -96,6 +96,7 @@ def test_whole_periods_shine_for_exactly_their_duty(begin: float, periods: int, 
     assert lit == pytest.approx(periods * on, abs=1e-12)  # t of 1000 s is held to 1e-13 s
 
 
+@pytest.mark.slow
 @settings(max_examples=100, derandomize=True, deadline=None)
 @given(span, span, span, st.floats(0.1, 2), st.floats(0, 1))
 def test_lit_time_of_two_intervals_adds(a: float, b: float, c: float, start: float, duty: float) -> None:

@@ -195,6 +195,49 @@ def test_circles_on_a_sphere_are_a_spacing_apart_and_as_long_as_they_are() -> No
     np.testing.assert_array_equal(counts, (2 * np.pi * 1.2 * np.sin(rings) / 0.01).astype(int))
 
 
+@pytest.mark.parametrize("on", SURFACES.values(), ids=SURFACES)
+def test_strips_lie_on_meridians_a_pitch_apart_and_reach_the_rim(on: dict[str, Any]) -> None:
+    place_m = lit({"kind": "string", "winding": "meridian", "pitch": "33 mm", "spacing": "10 cm"}, on).place[:, :3]
+    tilt, azimuth = angles(place_m)
+    strips = np.rint(azimuth % (2 * np.pi) * 64 / (2 * np.pi)).astype(int) % 64  # rim of 5 m: 64 strips
+    assert azimuth % (2 * np.pi / 64) == pytest.approx(0, abs=1e-9) or len(np.unique(strips)) in (32, 64)
+    for strip in np.unique(strips):
+        leds = place_m[strips == strip]
+        assert arcs_m(inside(on), leds) == pytest.approx(0.033, rel=1e-4)
+        assert np.radians(40) - tilt[strips == strip][-1] < 0.033 / 0.7
+
+
+def test_strips_are_between_half_a_spacing_and_a_spacing_apart() -> None:
+    """Under a sphere about the bearing, below where the first four begin."""
+    layout = {"kind": "string", "winding": "meridian", "pitch": "5 mm", "spacing": "8 cm"}
+    tilt, azimuth = angles(lit(layout).place[:, :3])
+    assert len(np.unique(np.round(azimuth, 6))) == 64  # 2 pi 1.2 m sin 40 deg over 8 cm is 60.6
+    for ring in np.radians([3.0, 8.0, 15.0, 25.0, 39.5]):
+        beside = np.unique(np.round(azimuth[np.abs(tilt - ring) < 0.0025 / 1.2], 6))
+        apart_m = 2 * np.pi * 1.2 * np.sin(ring) / len(beside)
+        assert 0.038 < apart_m < 0.08 * 1.01
+
+
+def test_tapes_are_off_by_their_pitch_and_their_glue() -> None:
+    """By 1 % of the pitch of each tape, and by 2 mm sideways, with a correlation of 1 / e after 0.3 m."""
+    layout = {"kind": "string", "winding": "meridian", "pitch": "20 mm", "spacing": "2 cm"}
+    ideal = lit(layout).place[:, :3]
+    made = lit(layout | {"pitch_error": 0.01, "glue_scatter": "2 mm"}).place[:, :3]
+    tilt, azimuth = angles(ideal)
+    begins = np.flatnonzero(np.append(True, np.diff(tilt) < 0))
+    radial = ideal / np.linalg.norm(ideal, axis=1, keepdims=True)
+    along = np.column_stack([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), -np.sin(tilt)])
+    sideways_mm = 1e3 * np.sum((made - ideal) * np.cross(radial, along), axis=1)
+    whole = [slice(a, b) for a, b in zip(begins, [*begins[1:], len(ideal)], strict=True) if b - a > 20]
+    assert len(whole) > 200
+    stretch = [(np.diff(angles(made[one])[0]) / np.diff(tilt[one])).mean() - 1 for one in whole]
+    assert np.std(stretch) == pytest.approx(0.01, rel=0.15)
+    same = np.concatenate([sideways_mm[one][:-5] for one in whole])
+    later = np.concatenate([sideways_mm[one][5:] for one in whole])
+    assert np.std(sideways_mm) == pytest.approx(2, rel=0.1)
+    assert np.corrcoef(same, later)[0, 1] == pytest.approx(np.exp(-1 / 3), abs=0.06)
+
+
 def test_a_surveyed_dome_takes_both_layouts(tmp_path: Any) -> None:
     rng = np.random.default_rng(1)
     rays = rng.normal(size=(800, 3)) * [1, 1, 0.3] + [0, 0, 1.0]

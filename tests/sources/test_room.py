@@ -104,6 +104,7 @@ def test_a_dome_down_to_below_the_bearing_has_all_of_its_shell() -> None:
     np.testing.assert_allclose(part_m(1, low), [1.8, 3.0, 3.0], rtol=2e-4)
 
 
+@pytest.mark.slow
 def test_the_check_says_how_a_dome_fits_its_room() -> None:
     """A cap of R = 1.5 m from 0.9 m up, on a bearing 1 m above the floor, in quarters through a door."""
     room = "{height: 2.9 m, bearing_height: 1 m, width: 4 m, door: [0.9 m, 2.1 m], segments: 4}"

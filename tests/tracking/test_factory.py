@@ -320,6 +320,7 @@ def test_a_camera_outside_of_the_dome_is_doubted(scene: str) -> None:
     assert not any("vehicle.camera" in line for line in doubted_of(scene, {}))
 
 
+@pytest.mark.slow
 def test_under_the_stars_there_is_no_surface_to_doubt() -> None:
     assert doubted_of("shefex2", {}) == []
 

@@ -21,6 +21,7 @@ FLIGHT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gyro", [False, True])
 def test_the_tracker_of_a_flight_gets_the_gyro_s_rate(gyro: bool) -> None:
     """An LN-200 tells the rate to a few seconds of arc a second; the frame alone to some hundred."""
@@ -35,6 +36,7 @@ def test_the_tracker_of_a_flight_gets_the_gyro_s_rate(gyro: bool) -> None:
     assert np.max(error) < 4 * np.max(sigma)
 
 
+@pytest.mark.slow
 def test_frames_during_the_motion_get_the_same_rate() -> None:
     scene = load("shefex2", FLIGHT | {"tracker.gyro": "true"})
     testbed = build_testbed(scene)

@@ -16,7 +16,10 @@ from __future__ import annotations
 import datetime
 import functools
 import math
+import os
+from collections import deque
 from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,6 +48,7 @@ CALIBRATED_UNCERTAINTY = 0.003
 FOV_UNCERTAINTY = 0.055  # 5 % that --fov allows, plus 0.5 % for the definition of the field of view
 FOV_LIMITS_DEG = 1.0, 120.0
 CATALOG = CATALOGS / "gaia_v8.0.ecsv"
+THREADS = min(os.cpu_count() or 1, 8)
 DEFAULT_EPOCH = datetime.datetime(2020, 1, 1, 12)
 
 
@@ -336,8 +340,8 @@ def best_attitude(
     different attitude by `margin_dex`; otherwise the result is NO_MATCH.
     """
     solutions: list[tuple[Attitude, StarTracker]] = []
-    for tracker in trackers:
-        attitude = tracker.solve_centroids(centroids, clock, effort)
+    for attitude, tracker in attitudes(centroids, trackers, effort):
+        clock.lap("identify")
         if log10_chance(attitude) <= FIELD_SEARCH.decisive_log10_chance:
             return attitude, tracker
         if attitude.solved:
@@ -350,6 +354,24 @@ def best_attitude(
     threshold = ACCEPT_LOG10_CHANCE - math.log10(tries)  # Bonferroni correction
     significant = log10_chance(best) <= min(threshold, min(rivals, default=0.0) - FIELD_SEARCH.margin_dex)
     return (best if significant else Attitude(NO_MATCH)), best_tracker
+
+
+def attitudes(
+    centroids: Centroids, trackers: Iterator[StarTracker], effort: int
+) -> Iterator[tuple[Attitude, StarTracker]]:
+    """Yield the attitudes of trackers in their order. THREADS of them solve at once: compiled code holds no GIL."""
+    pool = ThreadPoolExecutor(THREADS)
+    running: deque[tuple[Future[Attitude], StarTracker]] = deque()
+    try:
+        for tracker in trackers:
+            running.append((pool.submit(tracker.solve_centroids, centroids, None, effort), tracker))
+            if len(running) == THREADS:
+                future, first = running.popleft()
+                yield future.result(), first
+        for future, tracker in running:
+            yield future.result(), tracker
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def log10_chance(attitude: Attitude) -> float:

@@ -14,6 +14,7 @@ from skysim.camera.render import OcclusionTest, in_view, poses, render
 from skysim.core.types import Floats, Sources, SourceTruth
 from skysim.sources.solar_system.bodies import BodyLight
 from skysim.sources.solar_system.discs import disc_elements
+from skysim.sources.stars import steady_points
 
 POINT_PX = 0.3  # a disc of a smaller diameter is a point: its image is wider by 0.006 px^2, or half a percent
 SMALL_PX = 4.0  # one of a smaller diameter is a few points
@@ -31,9 +32,8 @@ def render_bodies(
     window = exposed.window
     few_poses = poses(exposed.trajectory, exposed.mount, np.linspace(window.open_s, window.close_s(len(image)), FEW))
     truths = []
-    for n, body in enumerate(bodies):
-        if not len(in_view(points_of(body, np.zeros((1, 2))), exposed.optics, few_poses)):
-            continue
+    for n in in_view(centers_of(bodies), exposed.optics, few_poses).tolist():
+        body = bodies[n]
         disc = disc_on_chip(body, exposed)
         diameter_px = 2 * float(np.linalg.norm(disc.px_from_radius, 2)) if np.isfinite(disc.center_px).all() else 0.0
         nearer = bodies[n + 1 :]
@@ -44,6 +44,14 @@ def render_bodies(
             hidden = behind(nearer, occluded)
             truths += render_points(image, body, diameter_px > POINT_PX, exposed, hidden, disc.center_px)
     return truths
+
+
+def centers_of(bodies: Sequence[BodyLight]) -> Sources:
+    """The centers of bodies as points with all of their light."""
+    number = [(body.id, body.flux_e_s_m2, body.magnitude) for body in bodies]
+    ids, flux_e_s_m2, magnitude = np.array(number, float).reshape(-1, 3).T
+    directions = np.array([body.place.direction for body in bodies]).reshape(-1, 3)
+    return steady_points(ids.astype(np.int64), directions, flux_e_s_m2, magnitude)
 
 
 def render_points(

@@ -16,19 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from skysim.camera.discs.lattice import lattice_light
 from skysim.camera.optics import Optics
 from skysim.camera.psf.kernel_cache import Kernels, source_kernels
 from skysim.camera.render import STEP, Window, draw, image_tracks, poses, project, sample_times
 from skysim.core.types import Floats, Mount, Trajectory
 from skysim.sources.dome.led import Emitter
 from skysim.sources.solar_system.bodies import BodyLight
-from skysim.sources.solar_system.discs import light_map
 from skysim.sources.stars import steady_points
 
 LATTICE = 0.7  # largest spacing of the lattice, in units of the star image's sharpest feature (sigma)
 SUBSAMPLES = 2  # least number of samples across a point of the lattice
 MIN_SAMPLES, MAX_SAMPLES = 160, 480  # across a disc
 CRESCENT_SAMPLES = 4  # wanted across a crescent
+ON_DISC = 1.2  # square of the radius within which a sample can have light
 SMALL = 1e-3  # of the radius: the step by which the disc's scale on the chip is found
 
 
@@ -139,7 +140,7 @@ def disc_image(body: BodyLight, disc: DiscOnChip, exposed: Exposed, hidden: Hidd
     sheared = np.eye(2) - np.outer(star.speed_px_s * exposed.window.row_time_s, [0.0, 1.0])
     radius_from_px = np.asarray(np.linalg.inv(disc.px_from_radius) @ sheared, float)
     reach_px = math.ceil(float(np.linalg.norm(np.linalg.inv(radius_from_px), 2))) + 4
-    light = lattice_light(body, radius_from_px, reach_px, steps, hidden)
+    light = light_on_lattice(body, radius_from_px, reach_px, steps, hidden)
     return DiscImage(convolved(light, star.patches), star.corner_px - reach_px, star.streak_px)
 
 
@@ -157,7 +158,9 @@ def convolved(light: Floats, patches: Floats) -> Floats:
     return np.maximum(fft.irfft2(spectrum, shape)[: full[0], : full[1]], 0.0)
 
 
-def lattice_light(body: BodyLight, radius_from_px: Floats, reach_px: int, steps: int, hidden: Hidden | None) -> Floats:
+def light_on_lattice(
+    body: BodyLight, radius_from_px: Floats, reach_px: int, steps: int, hidden: Hidden | None
+) -> Floats:
     """Shares of the light of the lattice's points, (n, n) from -reach_px to reach_px in both directions."""
     count = (2 * reach_px + 1) * steps
     radius_px = 1 / float(np.linalg.norm(radius_from_px, 2))
@@ -167,34 +170,9 @@ def lattice_light(body: BodyLight, radius_from_px: Floats, reach_px: int, steps:
     fine = count * subsamples
     # The cells of points 0, 1/s, ... are centered on them.
     axis_px = (np.arange(fine) + 0.5) / (steps * subsamples) - 0.5 / steps - reach_px
-    light = light_map(body.surface, axis_px, radius_from_px)
+    shown = np.ones((fine, fine)) if hidden else np.ones((0, 0))
     if hidden:
-        row, column = np.nonzero(light)
-        points_px = np.column_stack([axis_px[column], axis_px[row]])
-        light[row, column] *= ~hidden(points_px @ radius_from_px.T)
-    return gather(gather(light, count).T, count).T
-
-
-def gather(light: Floats, count: int) -> Floats:
-    """Light (..., fine) to (..., count) points of a lattice along the last axis, which zeros must surround.
-
-    Light between two points is shared between them by linear weights: a triangular filter, whose spectrum sinc^2
-    suppresses the frequencies that the lattice folds back. Below them it is undone by the second differences
-    D = -delta^2: 1 / sinc^2 = 1 + D / 12 + D^2 / 90 + ...
-    """
-    subsamples = light.shape[1] // count
-    offset = (np.arange(subsamples) + 0.5) / subsamples - 0.5
-    weights = np.stack([1 - np.abs(offset), np.maximum(offset, 0), np.maximum(-offset, 0)])
-    points, after, before = (weights @ light.reshape(-1, subsamples).T).reshape(3, len(light), count)
-    points[:, 1:] += after[:, :-1]
-    points[:, :-1] += before[:, 1:]
-    second = minus_second_difference(points)
-    return np.asarray(points + second / 12 + minus_second_difference(second) / 90)
-
-
-def minus_second_difference(values: Floats) -> Floats:
-    """2 v(k) - v(k-1) - v(k+1) along the last axis, zeros beyond its ends."""
-    second = 2 * values
-    second[:, 1:] -= values[:, :-1]
-    second[:, :-1] -= values[:, 1:]
-    return np.asarray(second)
+        xy = np.stack(np.meshgrid(axis_px, axis_px), axis=-1) @ radius_from_px.T
+        on_disc = np.sum(xy**2, axis=2) < ON_DISC
+        shown[on_disc] = ~hidden(xy[on_disc])
+    return lattice_light(body.surface, count, subsamples, axis_px, radius_from_px, shown)

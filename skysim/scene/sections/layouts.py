@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from skysim.core.quantities.tolerance import LengthError
+from skysim.core.quantities.tolerance import LengthError, NumberError
 from skysim.core.quantities.units import ConfigModel, Length, Number
 
 HOLES = 9  # of a patch board: 3x3
@@ -175,15 +175,20 @@ class StringConfig(LitConfig):
     """LED tape wound on the surface about the vertical through the bearing, numbered along the tape.
 
     winding : latitude: circles at equal angles from the zenith, each cut where it closes, the first half a spacing from
-        the apex; spiral: one tape from the apex to the rim
+        the apex; spiral: one tape from the apex to the rim; meridian: straight strips down to the rim, each from where
+        it has half a spacing to its neighbors
     pitch   : from one LED of the tape to the next, along the surface
-    spacing : between two circles or turns, along the surface, in the mean of all azimuths
+    spacing : between two circles or turns, along the surface, in the mean of all azimuths; greatest one of two strips
+    pitch_error  : relative standard deviation of a tape's pitch, or its tolerance
+    glue_scatter : standard deviation of a tape's place sideways, or its tolerance; it wanders over GLUE_M of tape
     """
 
     kind: Literal["string"]
     pitch_m: Annotated[Length, Field(ge=1e-3)]
     spacing_m: Annotated[Length, Field(ge=1e-3)]
-    winding: Literal["latitude", "spiral"] = "latitude"
+    winding: Literal["latitude", "spiral", "meridian"] = "latitude"
+    pitch_error: NumberError = 0.0
+    glue_scatter_m: LengthError = 0.0
 
 
 class OptimizedConfig(DimmedConfig):

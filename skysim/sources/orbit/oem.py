@@ -91,6 +91,8 @@ def split_segments(path: str) -> list[Segment]:
             section = word
             if word == "META_START":
                 segments.append(Segment({}, []))
+            elif not segments:
+                raise InputError(f"{path}, line {n}: {word} before META_START")
         elif section in ("", "META_START"):
             key, value = keyword_value(path, n, line)
             if section:

@@ -11,7 +11,6 @@ from functools import lru_cache
 from math import cos, sin, sqrt
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
 from skysim.core.jit import jit
@@ -52,17 +51,14 @@ class Surface(NamedTuple):
     earthshine: float = 0.0
 
 
-def light_map(surface: Surface, axis: Floats, radius_from_axes: Floats | None = None) -> Floats:
+def light_map(surface: Surface, axis: Floats) -> Floats:
     """Shares of the disc's light at the points of a square lattice that covers it; they add up to 1.
 
-    axis : (n,) the lattice's even coordinates in both directions
-    radius_from_axes : (2, 2) coordinates on the disc, in units of its radius, from those; the same if left out
-    Returns (n, n), [second coordinate, first coordinate].
+    axis : (n,) the lattice's even coordinates in both directions, in units of the disc's radius
+    Returns (n, n), [y, x].
     """
-    matrix = np.eye(2) if radius_from_axes is None else np.ascontiguousarray(radius_from_axes)
-    step = float(axis[1] - axis[0]) * sqrt(abs(float(np.linalg.det(matrix))))
     sunlit, earthlit = np.zeros((2, len(axis), len(axis)))
-    _fill(sunlit, earthlit, surface.law, surface.phase_rad, axis, matrix, step)
+    _fill(sunlit, earthlit, surface.law, surface.phase_rad, axis)
     light = sunlit / max(float(sunlit.sum()), 1e-300)
     if surface.earthshine:
         light += earthlit * (surface.earthshine / float(earthlit.sum()))
@@ -70,34 +66,46 @@ def light_map(surface: Surface, axis: Floats, radius_from_axes: Floats | None = 
     return np.asarray(light)
 
 
-@jit(parallel=True)
-def _fill(sunlit: Any, earthlit: Any, law: int, phase_rad: float, axis: Floats, matrix: Floats, step: float) -> None:
-    """Brightness times the part of the cell that is on the disc, lit from the Sun and from the observer.
+@jit
+def _fill(sunlit: Any, earthlit: Any, law: int, phase_rad: float, axis: Floats) -> None:
+    """Light of each point's cell, lit from the Sun and from the observer."""
+    sine, cosine, step = sin(phase_rad), cos(phase_rad), axis[1] - axis[0]
+    inner = inner_radius2(step)
+    for j in range(len(axis)):
+        for i in range(len(axis)):
+            sunlit[j, i], earthlit[j, i] = cell_light(law, sine, cosine, axis[i], axis[j], step, inner)
+
+
+@jit
+def inner_radius2(step: float) -> float:
+    """Square of the radius within which the brightness at a cell's center is its mean."""
+    return max(1 - RIM * step, 0.0) ** 2
+
+
+@jit
+def cell_light(
+    law: int, sine: float, cosine: float, x: float, y: float, step: float, inner: float
+) -> tuple[float, float]:
+    """Brightness at (x, y) times the part of a cell of width `step` that is on the disc, lit from the Sun and from the
+    observer, at a phase angle with this sine and cosine.
 
     Near the rim mu varies as a square root: the mean of mu over the cell's radial extent on the disc, from m1 inside
     to m2, is 2/3 (m1^2 + m1 m2 + m2^2) / (m1 + m2), as mu^2 is linear in the radius there.
     """
-    sine, cosine = sin(phase_rad), cos(phase_rad)
-    inner = max(1 - RIM * step, 0.0) ** 2
-    for j in numba.prange(len(axis)):
-        for i in range(len(axis)):
-            x = matrix[0, 0] * axis[i] + matrix[0, 1] * axis[j]
-            y = matrix[1, 0] * axis[i] + matrix[1, 1] * axis[j]
-            rho2 = x * x + y * y
-            if rho2 > (1 + step / 2) ** 2:
-                continue
-            covered, inward, mu = 1.0, 1.0, 0.0
-            if rho2 < inner:
-                mu = sqrt(1 - rho2)
-            else:
-                rho = sqrt(rho2)
-                covered = min(max(0.5 + (1 - rho) / step, 0.0), 1.0)
-                m1 = sqrt(max(1 - max(rho - step / 2, 0.0) ** 2, 0.0))
-                m2 = sqrt(max(1 - (rho + step / 2) ** 2, 0.0))
-                mu = 2 / 3 * (m1 * m1 + m1 * m2 + m2 * m2) / (m1 + m2) if m1 > 0 else 0.0
-                inward = 1.0 if covered == 1 else (1 + rho - step / 2) / (2 * rho)
-            sunlit[j, i] = covered * brightness(law, mu, inward * x * sine + mu * cosine)
-            earthlit[j, i] = covered * brightness(law, mu, mu)
+    rho2 = x * x + y * y
+    if rho2 > (1 + step / 2) ** 2:
+        return 0.0, 0.0
+    covered, inward, mu = 1.0, 1.0, 0.0
+    if rho2 < inner:
+        mu = sqrt(1 - rho2)
+    else:
+        rho = sqrt(rho2)
+        covered = min(max(0.5 + (1 - rho) / step, 0.0), 1.0)
+        m1 = sqrt(max(1 - max(rho - step / 2, 0.0) ** 2, 0.0))
+        m2 = sqrt(max(1 - (rho + step / 2) ** 2, 0.0))
+        mu = 2 / 3 * (m1 * m1 + m1 * m2 + m2 * m2) / (m1 + m2) if m1 > 0 else 0.0
+        inward = 1.0 if covered == 1 else (1 + rho - step / 2) / (2 * rho)
+    return covered * brightness(law, mu, inward * x * sine + mu * cosine), covered * brightness(law, mu, mu)
 
 
 class Elements(NamedTuple):

@@ -83,6 +83,7 @@ def test_lights_of_a_rolling_shutter_are_put_where_a_global_one_sees_them(rng: n
     assert motion.at_middle_row(GLOBAL, found, exact(seen.rate_rad_s)) is found
 
 
+@pytest.mark.slow
 @law(rate.from_streaks, rate.chords, rate.aligned, rate.inliers, rate.inverses, motion.streak_factor)
 @given(rng=SEEDS)
 def test_exact_streaks_give_the_rate_in_one_of_two_signs(rng: np.random.Generator) -> None:
@@ -123,6 +124,7 @@ def test_the_rate_of_streaks_errs_as_it_says() -> None:
     assert np.mean(nees) == pytest.approx(3, abs=4 * np.sqrt(6 / 300))
 
 
+@pytest.mark.slow
 @law(rolling.fit)
 @given(rng=SEEDS)
 def test_attitude_and_rate_are_found_together(rng: np.random.Generator) -> None:

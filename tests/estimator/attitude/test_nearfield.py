@@ -196,6 +196,7 @@ def monte_carlo(lever: Lever, count: int, surface: tuple, seed: int, trials: int
     return np.array(errors), np.array(claimed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lever", "surface"),
     [

@@ -390,6 +390,7 @@ def monte_carlo(count: int, half: float, trials: int, seed: int, name: str = "qu
     return np.array(errors), np.array(claimed)
 
 
+@pytest.mark.slow
 def test_fifteen_stars_err_as_the_reference_says() -> None:
     errors, claimed = monte_carlo(15, np.tan(FOV_RAD / 2), 1500, seed=45)
     cross, roll = np.sqrt([np.mean(errors[:, :2] ** 2), np.mean(errors[:, 2] ** 2)]) / ARCSEC_RAD

@@ -296,6 +296,7 @@ class Nearest:
         return Attitude("solved", cam_from_ref, np.eye(3), StarMatch(near, 20 * k + near, cam_from_ref, -20.0))
 
 
+@pytest.mark.slow
 def test_each_round_names_more_stars_until_none_are_gained() -> None:
     # With the sheet's camera only stars near the middle are where they should be.
     field = drawn(np.random.default_rng(98), frames=40)

@@ -509,6 +509,7 @@ def wild(*rotvec: float) -> Rotation:
     return Rotation.from_rotvec(rotvec)
 
 
+@pytest.mark.slow
 def test_the_gate_is_as_rare_as_so_many_sigma() -> None:
     # 1.5 sigma of one normal number is exceeded in 13.4 % of draws, here from the filter's own uncertainty.
     rng, count, outside = np.random.default_rng(64), 500, 0

@@ -84,6 +84,7 @@ def names_right(match: StarMatch, names: Floats) -> bool:
     return bool(np.all((named == match.star) | (named < 0)) and np.any(named >= 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("surface", [OVAL, FLAT], ids=["ellipsoid", "flat"])
 @pytest.mark.parametrize(
     ("dead", "false", "least"),

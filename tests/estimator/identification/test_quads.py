@@ -40,6 +40,7 @@ def code_of(stars):
     return place[order].ravel(), [a, b, rest[order[0]], rest[order[1]]]
 
 
+@pytest.mark.slow
 def test_the_index_holds_every_quad_of_locally_bright_stars_by_its_code() -> None:
     height = np.radians(85.0)
     vectors, mag = random_sky(45, 3)

@@ -69,6 +69,7 @@ def test_attitudes_are_even_over_what_is_allowed(spec, key):
     assert (level <= 1).all()
 
 
+@pytest.mark.slow
 def test_attitudes_near_the_zenith_are_at_their_altitudes():
     """Of the site at the scene's start, by astropy's AltAz."""
     site = {"latitude_deg": 53.1, "longitude_deg": 8.8}
@@ -86,6 +87,7 @@ def test_attitudes_near_the_zenith_are_at_their_altitudes():
     assert altitude_deg.std() > 1
 
 
+@pytest.mark.slow
 def test_attitudes_near_a_body_are_even_about_it():
     """By the cosine of the angle from the Moon's place and by the angle around it."""
     near = {"body": "moon", "off_deg": [2.0, 8.0]}
@@ -310,6 +312,7 @@ def test_a_flight_starts_anywhere_and_the_same_for_the_same_seed(name):
     assert (fixed.inv() * ready.testbed.trajectory.lab_from_body[0]).magnitude() == 0
 
 
+@pytest.mark.slow
 def test_a_flight_from_a_random_start_is_flown_from_there():
     changes = {"exposure.frames": 2, "exposure.first": "0.2 s"}
     trial = {"kind": "flight", "start": {"tilt_deg": [5, 12]}}

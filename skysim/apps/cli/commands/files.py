@@ -43,13 +43,19 @@ def scenes_show(scene: SceneArg, set_: Overrides = None, json: Json = False) -> 
 def scenes_export(
     scene: SceneArg,
     out: Annotated[
-        Path | None, typer.Option(help="Output file, .xml or .csv (list of a dome's LEDs); default: out/SCENE.xml.")
+        Path | None,
+        typer.Option(help="Output file, .xml, or of a dome .csv (LEDs), .svg (gores), .obj; default: out/SCENE.xml."),
     ] = None,
     seed: Seed = None,
     set_: Overrides = None,
 ) -> None:
-    """Write a scene as one MJCF file with dome, LEDs and camera, for MuJoCo's viewer, or a dome's LEDs as a list."""
+    """Write a scene as one MJCF file for MuJoCo's viewer, or what a builder of its dome needs.
+
+    The builder gets a list of the LEDs (.csv), a pattern of gores at full scale to print (.svg), or the shell with a
+    mark at each LED as a mesh (.obj).
+    """
     from skysim.core.io import files
+    from skysim.results.files import templates
     from skysim.simulation.testbed import build_testbed, export_leds, export_mjcf
 
     loaded = load(scene, None, seed, set_)
@@ -58,6 +64,8 @@ def scenes_export(
     if path.suffix.lower() == ".csv":
         text, cap_deg = export_leds(testbed)
         use = f"light.layout: {{kind: listed, cap_deg: {cap_deg}, file: {path}}}"
+    elif kind := {".svg": "gores", ".obj": "shell"}.get(path.suffix.lower()):
+        text, use = templates.template(testbed, kind), {"gores": "print it at 100 %", "shell": "in mm"}[kind]
     else:
         text = export_mjcf(testbed)
     files.make_folder(path.parent)

@@ -6,17 +6,17 @@ import math
 
 import numpy as np
 
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import StringConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources.dome.display import ideal_led
-from skysim.sources.dome.layouts.placing import Ints
 from skysim.sources.dome.layouts.registry import LAYOUTS
-from skysim.sources.dome.layouts.string import winding_m
+from skysim.sources.dome.layouts.string import wind
 from skysim.sources.dome.led import full_strength_e_s_sr
-from skysim.sources.dome.shell.surface import build_surface
+from skysim.sources.dome.shell.surface import Surface, build_surface
 from skysim.sources.photometry import Band
 
+BUILT = "glue_scatter_m", "glue_tilt_deg", "pitch_error"  # errors of a layout as built
 HEADER = """\
 # LEDs of {name}: x_m, y_m, z_m from the center of the bearing in the lab (z up); azimuth from +x toward +y, and tilt
 # from the zenith, seen from there; level: nominal brightness, 1 at the full drive{tape}.
@@ -30,10 +30,9 @@ def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:
     Columns are id, place, direction from the bearing and level; of tapes also the place along them. The level is that
     of the drive, without the scatter from LED to LED.
     """
-    led = ideal_led(config.led)
-    leds = LAYOUTS[config.layout.kind](config.layout, build_surface(config.surface), led, band)
+    leds = design_leds(config, build_surface(config.surface), band)
     place_m = leds.place[:, :3]
-    level = leds.strength / max(full_strength_e_s_sr(led, band), float(leds.strength.max()))
+    level = leds.strength / max(full_strength_e_s_sr(ideal_led(config.led), band), float(leds.strength.max()))
     azimuth_deg = np.degrees(np.arctan2(place_m[:, 1], place_m[:, 0])) % 360
     tilt_deg = np.degrees(np.arctan2(np.hypot(*place_m[:, :2].T), place_m[:, 2]))
     columns = {
@@ -43,24 +42,24 @@ def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:
         "tilt_deg": [f"{value:.6f}" for value in tilt_deg],
     }
     if isinstance(config.layout, StringConfig):
-        tape, tape_m = along_tape(config, config.layout, leds.id)
-        columns |= {"tape": [f"{number}" for number in tape], "tape_m": [f"{value:.6f}" for value in tape_m]}
+        wound = wind(config.layout, build_surface(config.surface))
+        columns |= {
+            "tape": [f"{number}" for number in wound.tape[leds.id]],
+            "tape_m": [f"{value:.6f}" for value in wound.tape_m[leds.id]],
+        }
     columns["level"] = [f"{value:.9g}" for value in level]
     rows = [",".join(row) for row in zip(*columns.values(), strict=True)]
     header = HEADER.format(name=name, tape=TAPE if "tape" in columns else "")
-    return header + "\n".join([",".join(columns), *rows, ""]), math.ceil(tilt_deg.max())
+    return header + "\n".join([",".join(columns), *rows, ""]), math.ceil(max_tilt_deg(place_m))
 
 
-def along_tape(config: DomeConfig, layout: StringConfig, led: Ints) -> tuple[Ints, Floats]:
-    """(N,) number of the tape, from 0, that bears each of these LEDs, and the LED's place along it, m.
+def design_leds(config: DomeConfig, surface: Surface, band: Band) -> Sources:
+    """The LEDs of a dome as designed: without their scatter, and without errors of the glue and of the tape."""
+    errors = {key: 0.0 for key in BUILT if hasattr(config.layout, key)}
+    layout = config.layout.model_copy(update=errors)
+    return LAYOUTS[layout.kind](layout, surface, ideal_led(config.led), band)
 
-    A spiral is one tape. Each circle is a tape whose first LED is at azimuth 0.
-    """
-    if layout.winding == "spiral":
-        return np.zeros_like(led), np.asarray(led * layout.pitch_m)
-    places_m = winding_m(layout, build_surface(config.surface))
-    azimuth_rad = np.arctan2(places_m[:, 1], places_m[:, 0]) % (2 * np.pi)
-    azimuth_rad[azimuth_rad > 2 * np.pi - 1e-9] = 0.0
-    first = np.flatnonzero(np.append(True, np.diff(azimuth_rad) <= 0))
-    tape = np.searchsorted(first, led, side="right").astype(np.int64) - 1
-    return tape, np.asarray((led - first[tape]) * layout.pitch_m)
+
+def max_tilt_deg(place_m: Floats) -> float:
+    """Greatest angle of these places (N, 3) from the zenith, seen from the bearing."""
+    return float(np.degrees(np.arctan2(np.hypot(*place_m[:, :2].T), place_m[:, 2])).max())

@@ -1,4 +1,4 @@
-"""LED tape wound on the surface, in circles about the zenith or in a spiral from the apex.
+"""LED tape wound on the surface: circles about the zenith, a spiral from the apex, or strips along meridians.
 
 A turn of the tape is the projection of a curve of directions from the bearing, tilt over azimuth, on the surface. The
 distance of the turns is measured along the surface's mean meridian (`Meridian`), the distance of two LEDs along the
@@ -8,11 +8,15 @@ The chords of a circle are too short by (2 pi / STEPS_PER_TURN)^2 / 24 of their 
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
+from skysim.core.quantities.tolerance import scaled_errors
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import StringConfig
 from skysim.scene.sections.leds import LedConfig
@@ -24,6 +28,8 @@ STEPS_PER_TURN = 720
 STEPS_PER_PITCH = 16
 MAX_STEPS = 1_000_000  # of all turns
 MERIDIAN_STEPS, MERIDIANS = 400, 36
+TAPE_STREAM = 3  # spawn key of the errors of tapes, which leave levels and gaps unchanged
+GLUE_M = 0.3  # of tape over which its sideways error is the same, assumed
 
 
 class Meridian(NamedTuple):
@@ -39,15 +45,78 @@ class Meridian(NamedTuple):
     ring_m: Floats
 
 
+class Tape(NamedTuple):
+    """A tape as laid: (K,) directions along it, and the length from its beginning to each; whether it is a ring."""
+
+    tilt_rad: Floats
+    azimuth_rad: Floats
+    length_m: Floats
+    closed: bool = False
+
+    def led_count(self, pitch_m: float) -> int:
+        """LEDs that fit: of a ring the last has a pitch to the first."""
+        fit = int(self.length_m[-1] / pitch_m)
+        return max(fit, 1) if self.closed else fit + 1
+
+    def rays(self, at_m: Floats) -> Floats:
+        """(N, 3) unit vectors from the bearing to places along it."""
+        tilt_rad, azimuth_rad = (np.interp(at_m, self.length_m, one) for one in (self.tilt_rad, self.azimuth_rad))
+        return directions(tilt_rad, azimuth_rad)
+
+
+class Wound(NamedTuple):
+    """The LEDs of all tapes in order: (N, 3) places, (N,) number of the tape, and length from its first LED."""
+
+    place_m: Floats
+    tape: NDArray[np.int64]
+    tape_m: Floats
+
+
 def string(config: StringConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
-    """LEDs of a tape, one every pitch along the surface. Raises InputError for too long a tape."""
-    return lit_sources(config, surface, winding_m(config, surface), led, band)
+    """LEDs of tapes, one every pitch along the surface. Raises InputError for too long a tape."""
+    return lit_sources(config, surface, wind(config, surface).place_m, led, band)
 
 
-def winding_m(config: StringConfig, surface: Surface) -> Floats:
-    """(N, 3) places of all LEDs of a tape, in its order; an LED's number is its row. Raises as `string` does."""
+def wind(config: StringConfig, surface: Surface) -> Wound:
+    """The LEDs of all tapes, as glued; an LED's number is its row. Raises as `string` does."""
     meridian = mean_meridian(surface, np.radians(config.cap_deg))
-    return {"latitude": circles, "spiral": spiral}[config.winding](config, surface, meridian)
+    tapes = WINDINGS[config.winding](config, surface, meridian)
+    if not tapes:
+        return Wound(project_from_bearing(surface, np.array([[0.0, 0.0, 1.0]])), np.zeros(1, np.int64), np.zeros(1))
+    design_m = [config.pitch_m * np.arange(tape.led_count(config.pitch_m), dtype=float) for tape in tapes]
+    rng = random_stream(config.hardware_seed, TAPE_STREAM)
+    stretch = 1 + scaled_errors(config.pitch_error, rng.standard_normal(len(tapes)))
+    place_m = [
+        aside(surface, tape, factor * at_m, scaled_errors(config.glue_scatter_m, wander(at_m, rng)))
+        for tape, at_m, factor in zip(tapes, design_m, stretch, strict=True)
+    ]
+    number = np.repeat(np.arange(len(tapes)), [len(at_m) for at_m in design_m])
+    return Wound(np.concatenate(place_m), number, np.concatenate(design_m))
+
+
+def wander(at_m: Floats, rng: np.random.Generator) -> Floats:
+    """Standard normal numbers at increasing places of a tape, correlated by exp(-d / GLUE_M) (Gauss-Markov)."""
+    normal = rng.standard_normal(len(at_m))
+    kept = np.exp(-np.diff(at_m) / GLUE_M)
+    for n, rho in enumerate(kept.tolist(), 1):
+        normal[n] = rho * normal[n - 1] + np.sqrt(1 - rho**2) * normal[n]
+    return normal
+
+
+def aside(surface: Surface, tape: Tape, at_m: Floats, sideways_m: Floats) -> Floats:
+    """(N, 3) places on the surface at (N,) lengths along a tape, displaced to its side by (N,) distances.
+
+    What is beyond an end stays at the end.
+    """
+    place_m = project_from_bearing(surface, tape.rays(at_m))
+    if not sideways_m.any():
+        return place_m
+    step_m = 1e-4 * tape.length_m[-1]
+    middle_m = np.clip(at_m, step_m, tape.length_m[-1] - step_m)
+    along = tape.rays(middle_m + step_m) - tape.rays(middle_m - step_m)
+    side = np.cross(surface.inward(place_m), along)
+    moved = place_m + sideways_m[:, None] * side / np.linalg.norm(side, axis=1, keepdims=True)
+    return project_from_bearing(surface, moved)
 
 
 def directions(tilt_rad: Floats, azimuth_rad: Floats) -> Floats:
@@ -78,24 +147,20 @@ def check_length(length_m: float, turns: float, config: StringConfig) -> None:
         )
 
 
-def circles(config: StringConfig, surface: Surface, meridian: Meridian) -> Floats:
-    """(N, 3) places of LEDs on circles of equal tilt, each from azimuth 0 as many as fit."""
+def circles(config: StringConfig, surface: Surface, meridian: Meridian) -> list[Tape]:
+    """Tapes on circles of equal tilt, each from azimuth 0."""
     arcs_m = np.arange(config.spacing_m / 2, meridian.arc_m[-1], config.spacing_m)
     check_length(2 * np.pi * float(np.interp(arcs_m, meridian.arc_m, meridian.ring_m).sum()), len(arcs_m), config)
-    rows = []
+    tapes = []
     for tilt_rad in np.interp(arcs_m, meridian.arc_m, meridian.tilt_rad):
         ring_m = float(np.interp(tilt_rad, meridian.tilt_rad, meridian.ring_m))
         steps = max(STEPS_PER_TURN, int(STEPS_PER_PITCH * 2 * np.pi * ring_m / config.pitch_m))
-        azimuth_rad = np.linspace(0, 2 * np.pi, steps + 1)
-        tape_m = tape_length_m(surface, np.full(steps + 1, tilt_rad), azimuth_rad)
-        leds_m = np.arange(max(int(tape_m[-1] / config.pitch_m), 1)) * config.pitch_m
-        at_rad = np.interp(leds_m, tape_m, azimuth_rad)
-        rows.append(project_from_bearing(surface, directions(np.full(len(at_rad), tilt_rad), at_rad)))
-    return np.concatenate(rows) if rows else project_from_bearing(surface, np.array([[0.0, 0.0, 1.0]]))
+        tapes.append(lay(surface, np.full(steps + 1, tilt_rad), np.linspace(0, 2 * np.pi, steps + 1), closed=True))
+    return tapes
 
 
-def spiral(config: StringConfig, surface: Surface, meridian: Meridian) -> Floats:
-    """(N, 3) places of LEDs on one tape whose turns are `spacing` apart on the mean meridian."""
+def spiral(config: StringConfig, surface: Surface, meridian: Meridian) -> list[Tape]:
+    """One tape whose turns are `spacing` apart on the mean meridian."""
     turns = float(meridian.arc_m[-1]) / config.spacing_m
     arc_m = np.linspace(0, meridian.arc_m[-1], int(20 * turns) + 1000)
     azimuth_rad = 2 * np.pi * arc_m / config.spacing_m
@@ -106,10 +171,34 @@ def spiral(config: StringConfig, surface: Surface, meridian: Meridian) -> Floats
     steps = np.append(0, np.cumsum((per_rad[1:] + per_rad[:-1]) / 2 * np.diff(azimuth_rad)))
     fine_rad = np.interp(np.arange(int(steps[-1]) + 1), steps, azimuth_rad)
     tilt_rad = np.interp(fine_rad, azimuth_rad, np.interp(arc_m, meridian.arc_m, meridian.tilt_rad))
-    tape_m = tape_length_m(surface, tilt_rad, fine_rad)
-    leds_m = np.arange(int(tape_m[-1] / config.pitch_m) + 1) * config.pitch_m
-    rays = directions(np.interp(leds_m, tape_m, tilt_rad), np.interp(leds_m, tape_m, fine_rad))
-    return project_from_bearing(surface, rays)
+    return [lay(surface, tilt_rad, fine_rad)]
+
+
+def strips(config: StringConfig, surface: Surface, meridian: Meridian) -> list[Tape]:
+    """Straight tapes down the meridians, 4 2^m of them, so many that they are at most `spacing` apart at the rim.
+
+    Every second one begins where all are half a spacing apart, half of the others where these are, and so on.
+    """
+    count, widest_m = 4, np.maximum.accumulate(meridian.ring_m)
+    while 2 * np.pi * widest_m[-1] > count * config.spacing_m:
+        count *= 2
+    check_length(count * float(meridian.arc_m[-1]), count, config)
+    steps = max(STEPS_PER_TURN, int(STEPS_PER_PITCH * float(meridian.arc_m[-1]) / config.pitch_m))
+    tapes = []
+    for number in range(count):
+        neighbors = count // math.gcd(number, count // 4)  # strips of the coarsest set that holds this one
+        first_rad = np.interp(neighbors * config.spacing_m / (4 * np.pi), widest_m, meridian.tilt_rad)
+        tilt_rad = np.linspace(first_rad, meridian.tilt_rad[-1], steps + 1)
+        tapes.append(lay(surface, tilt_rad, np.full(steps + 1, 2 * np.pi * number / count)))
+    return tapes
+
+
+WINDINGS = {"latitude": circles, "spiral": spiral, "meridian": strips}
+
+
+def lay(surface: Surface, tilt_rad: Floats, azimuth_rad: Floats, closed: bool = False) -> Tape:
+    """A tape along (K,) directions from the bearing."""
+    return Tape(tilt_rad, azimuth_rad, tape_length_m(surface, tilt_rad, azimuth_rad), closed)
 
 
 def tape_length_m(surface: Surface, tilt_rad: Floats, azimuth_rad: Floats) -> Floats:

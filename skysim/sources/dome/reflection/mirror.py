@@ -190,24 +190,18 @@ def linearized(wall: Surface, led_m: Floats, camera_m: Floats, toward: Floats) -
     """(K, 2) offsets of LEDs (K, 3) from the reflected rays, across them, (K, 2, 2) their derivatives with respect to
     two angles of the direction, and (K, 2, 3) the axes of these angles.
     """
-    center = reflect(wall, camera_m, toward)
-    axes, across = perpendicular(toward), perpendicular(center.along)
-    columns = []
-    for axis in (0, 1):
-        ends = []
-        for sign in (1, -1):
-            shifted = toward + sign * STEP_RAD * axes[:, axis]
-            rays = reflect(wall, camera_m, shifted / np.linalg.norm(shifted, axis=1, keepdims=True))
-            ends.append(offsets(led_m, rays, across))
-        columns.append((ends[0] - ends[1]) / (2 * STEP_RAD))
-    return offsets(led_m, center, across), np.stack(columns, axis=2), axes
-
-
-def offsets(led_m: Floats, rays: Rays, across: Floats) -> Floats:
-    """(K, 2) components along two axes (K, 2, 3) of the LEDs' offsets from the nearest points of the rays."""
-    to_led = led_m - rays.wall_m
-    offset = to_led - np.sum(to_led * rays.along, axis=1, keepdims=True) * rays.along
-    return np.asarray(np.einsum("kij,kj->ki", across, offset))
+    axes = perpendicular(toward)
+    first, second = STEP_RAD * np.moveaxis(axes, 1, 0)
+    shifted = toward + np.stack([0 * toward, first, -first, second, -second])
+    shifted /= np.linalg.norm(shifted, axis=2, keepdims=True)
+    rays = reflect(wall, camera_m, shifted.reshape(-1, 3))
+    wall_m, along = rays.wall_m.reshape(shifted.shape), rays.along.reshape(shifted.shape)
+    # The LEDs' offsets from the nearest points of the rays.
+    to_led = led_m - wall_m
+    offset = to_led - np.sum(to_led * along, axis=2, keepdims=True) * along
+    center, *ends = np.einsum("kij,skj->ski", perpendicular(along[0]), offset)
+    columns = [(ends[0] - ends[1]) / (2 * STEP_RAD), (ends[2] - ends[3]) / (2 * STEP_RAD)]
+    return center, np.stack(columns, axis=2), axes
 
 
 def perpendicular(unit: Floats) -> Floats:

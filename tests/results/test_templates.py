@@ -1,0 +1,118 @@
+"""Templates for a dome's builder: the printed pattern against spherical trigonometry, the mesh against the surface."""
+
+from __future__ import annotations
+
+import re
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.results.files import templates
+from skysim.scene import loader
+from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.sources.dome.shell.surface import Ellipsoid, Plane
+
+RADIUS_M = 1.2
+SPHERE = Ellipsoid(np.zeros(3), np.full(3, RADIUS_M))
+DOME = {
+    "light.surface": "{kind: sphere, apex: 1.2 m, radius: 1.2 m}",
+    "light.layout": "{kind: poisson_disk, count: 150, cap_deg: 35}",
+}
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+@pytest.fixture(scope="module")
+def testbed() -> Testbed:
+    return build_testbed(loader.load("afit_simsat", DOME | {"motion.maneuver": "[]", "motion.control": "null"}))
+
+
+def rays(count: int) -> Floats:
+    rng = np.random.default_rng(3)
+    tilt_rad, azimuth_rad = rng.uniform(0.05, 0.7, count), rng.uniform(-0.3, 0.3, count)
+    return templates.directions(tilt_rad, azimuth_rad)
+
+
+def test_on_a_sphere_the_paper_has_cassini_s_coordinates() -> None:
+    """sin(x / R) = sin t sin a and tan(y / R) = tan t cos a; here from vectors, about the meridian of x."""
+    some = rays(200)
+    x_m, y_m = templates.on_paper_m(SPHERE, some, 0.0).T
+    assert x_m == pytest.approx(RADIUS_M * np.arcsin(some[:, 1]), abs=1e-5)
+    assert y_m == pytest.approx(RADIUS_M * np.arctan2(some[:, 0], some[:, 2]), abs=1e-4)
+
+
+def test_a_flat_panel_is_its_own_paper() -> None:
+    some, height_m = rays(200), 1.5
+    place_m = height_m * some / some[:, 2:]
+    paper_m = templates.on_paper_m(Plane(np.array([0.0, 0.0, height_m])), some, 0.0)
+    assert paper_m == pytest.approx(place_m[:, 1::-1], abs=1e-12)
+
+
+def test_the_printed_leds_are_where_the_scene_has_them(testbed: Testbed) -> None:
+    """Each circle, measured from its gore's apex, names its LED's direction from the bearing."""
+    place_m = dict(zip(testbed.sources.id.tolist(), testbed.sources.place[:, :3], strict=True))
+    root = ElementTree.fromstring(templates.template(testbed, "gores"))
+    assert root.get("width") == f"{root.get('viewBox', '').split()[2]}mm"
+    gores, seen = 0, set()
+    for element, after in zip(root, [*root[2:], None, None], strict=True):
+        if element.tag == SVG + "polygon":
+            points = np.array([pair.split(",") for pair in str(element.get("points")).split()], float)
+            assert np.ptp(points[:, 0]) <= 1e3 * templates.MAX_WIDTH_M + 1
+            apex_mm, gores = points[0], gores + 1
+        elif element.tag == SVG + "circle":
+            assert after is not None
+            number = int(str(after.text))
+            seen.add(number)
+            left, y = np.array([float(str(element.get(key))) for key in ("cx", "cy")]) - apex_mm
+            # From inside, with the apex up, azimuths grow to the left.
+            across, along = -left / 1e3 / RADIUS_M, y / 1e3 / RADIUS_M
+            own = np.array([np.cos(across) * np.sin(along), np.sin(across), np.cos(across) * np.cos(along)])
+            meridian_rad = 2 * np.pi * (gores - 1) / 18
+            cosine, sine = np.cos(meridian_rad), np.sin(meridian_rad)
+            expected = place_m[number] / RADIUS_M @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+            assert own == pytest.approx(expected, abs=2e-5)
+    assert gores == 18  # 2 pi 1.2 m sin 35 deg over 0.25 m, rounded up
+    assert seen == place_m.keys()
+
+
+def test_the_mesh_is_the_surface_with_a_mark_at_each_led(testbed: Testbed) -> None:
+    objects = re.split(r"^o ", templates.template(testbed, "shell"), flags=re.M)[1:]
+    vertices = {
+        one.split("\n", 1)[0]: np.array([line.split()[1:] for line in one.split("\n") if line.startswith("v ")], float)
+        for one in objects
+    }
+    shell_mm = vertices.pop("shell")
+    assert np.linalg.norm(shell_mm, axis=1) == pytest.approx(1e3 * RADIUS_M, abs=1e-3)
+    assert np.degrees(np.arccos(shell_mm[:, 2].min() / 1200)) == pytest.approx(35, abs=0.01)
+    assert set(vertices) == {f"led_{number}" for number in testbed.sources.id}
+    for number, place in zip(testbed.sources.id, testbed.sources.place, strict=True):
+        mark_mm = vertices[f"led_{number}"]
+        assert mark_mm[:3].mean(axis=0) == pytest.approx(1e3 * place[:3], abs=1e-3)
+        assert np.linalg.norm(mark_mm[3]) == pytest.approx(1204, abs=1e-3)
+    used = [
+        int(word) for one in objects for line in one.split("\n") if line.startswith("f ") for word in line.split()[1:]
+    ]
+    assert set(used) == set(range(1, len(shell_mm) + 4 * len(vertices) + 1))
+
+
+def test_every_face_looks_inward_or_out_of_its_mark(testbed: Testbed) -> None:
+    """The shell is seen from inside, a mark from all sides: its volume is positive."""
+    lines = templates.template(testbed, "shell").split("\n")
+    points = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float)
+    corners = [np.array(line.split()[1:], int) - 1 for line in lines if line.startswith("f ")]
+    first = 1 + templates.RINGS * templates.SECTORS
+    for face in corners[::5]:
+        a, b, c = points[face[:3]]
+        normal = np.cross(b - a, c - a)
+        if face.max() < first:
+            assert normal @ a < 0
+        else:
+            mark = points[first + (face[0] - first) // 4 * 4 :][:4]
+            assert normal @ (a - mark.mean(axis=0)) > 0
+
+
+def test_the_sky_has_no_gores() -> None:
+    with pytest.raises(InputError, match=r"light.kind: stars has no gores; allowed: dome"):
+        templates.template(build_testbed(loader.load("shefex2")), "gores")
