@@ -19,6 +19,7 @@ from scipy.special import ndtr
 
 from estimator.centroiding.moments import MARGIN_PX
 from estimator.core.types import NO_PRIORS
+from estimator.detection.background import SAMPLE_ROWS, TILE_PX
 from estimator.detection.detect import DETECTORS
 from estimator.trackers.pipeline import Clock, detect_and_centroid
 from skysim.core.types import Floats
@@ -123,14 +124,20 @@ def bit_error_rate(case: Case, frames: int) -> tuple[float, float]:
 
 
 def window_noise_e2(testbed: Testbed) -> float:
-    """Variance of an LED's light by the chip: of the pixels' read and rounding noise, over those of a median window."""
+    """Variance of an LED's light by the chip: read and rounding noise of the pixels of a median window, and of its sky.
+
+    The sky's level is that of SAMPLE_ROWS rows of a tile after the binomial filter [1 2 1], which leaves 6/16 of the
+    variance, and is interpolated between tiles, which leaves 4/9 of it on average.
+    """
     frame, _ = render_frame(testbed.at_rest(testbed.trajectory.lab_from_body[0], 0), 0)
     settings, detector = assumed_settings(testbed.scene), testbed.scene.camera.detector
     blobs = DETECTORS[settings.detector](
         frame.image_dn, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, NO_PRIORS
     )
     width, height = (blobs.box_px[:, 2:] - blobs.box_px[:, :2] + 1 + 2 * MARGIN_PX).T
-    return float(np.median(width * height)) * (detector.read_noise_e**2 + detector.gain_e_dn**2 / 12)
+    pixels = float(np.median(width * height))
+    sky_share = 4 / 9 * 6 / 16 / (SAMPLE_ROWS * TILE_PX)  # of a pixel's variance
+    return pixels * (1 + pixels * sky_share) * (detector.read_noise_e**2 + detector.gain_e_dn**2 / 12)
 
 
 def read_lights(testbed: Testbed, frames: int) -> tuple[Floats, NDArray[np.bool_], Floats]:
