@@ -135,3 +135,17 @@ def test_lights_keep_their_tracks_while_the_vehicle_turns(
 @pytest.mark.parametrize("levels", [np.ones((3, 4)), np.full((2, 2), 2.0), np.zeros((0, 3)), np.ones(3)])
 def test_codes_that_name_nothing_are_refused(levels: Floats) -> None:
     assert answered(lambda: LedCode(levels), ImageError) is None
+
+
+@pytest.mark.parametrize(("excess", "decided"), [(2.0, False), (11.0, False), (12.0, True)])
+def test_two_lights_have_names_if_no_other_pair_is_a_hundred_thousandth_as_likely(excess: float, decided: bool) -> None:
+    """Of eight LEDs on a circle all neighbors are as far apart; ln(10^5) is 11.5."""
+    azimuth = np.arange(8) * np.pi / 4
+    ring = np.column_stack([0.1 * np.cos(azimuth), 0.1 * np.sin(azimuth), np.full(8, 0.99499)])
+    sphere = naming.Sphere(1.2 * ring, np.full(8, 1.2), ring, LEVER.camera_body_m)
+    _, xy_px = field(sphere, Rotation.identity())
+    misfit = np.full((2, 8), 100.0)
+    misfit[[0, 1], [0, 1]] = 3.0
+    misfit[[0, 1], [4, 5]] = 3.0 + excess / 2
+    found = naming.identify(naming.NamedLights(CAMERA.rays(xy_px[:2]), np.full(2, 3e-4), misfit), sphere)
+    assert (found == naming.UNDECIDED) if not decided else found.star.tolist() == [0, 1]
