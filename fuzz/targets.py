@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import math
 import tempfile
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -125,7 +126,9 @@ def tables(data: bytes) -> None:
     path = write_file(data, "table.csv")
     rejects(lambda: listed.read_csv(path), InputError)
     rejects(lambda: point_cloud.fit(point_cloud.read(str(path), "m"), 2, str(path)), InputError)
-    rejects(lambda: photometry._read_curve.__wrapped__(path), InputError)  # bypass the cache, whose key is the path
+    for largest in (1.0, math.inf):  # a response, the spectrum of an LED
+        # bypass the cache, whose key is the path
+        rejects(lambda largest=largest: photometry._read_curve.__wrapped__(path, 0, largest), InputError)
     rejects(lambda: otf.read_cells.__wrapped__(str(path)), InputError)
 
 

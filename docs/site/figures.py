@@ -1,4 +1,4 @@
-"""Draw the figures of the pages on conventions and near stars with the simulator's code. `make figures` runs it."""
+"""Draw the figures of the explanations with the simulator's code. `make figures` runs it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import matplotlib as mpl
 mpl.use("svg")
 import matplotlib.pyplot as plt
 import numpy as np
+from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics
@@ -18,11 +19,26 @@ from skysim.core.types import Floats, Mount, Sources, Trajectory
 from skysim.dynamics import multibody
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.orbit import ExclusionConfig
 from skysim.simulation import exposure, run
+from skysim.simulation.exposure import stray_light_e_s
 from skysim.simulation.testbed import bodies_during, build_testbed
 from skysim.sources import stars as star_sources
+from skysim.sources.air import scintillation, starlight
+from skysim.sources.air.refraction import Refraction, Weather
 from skysim.sources.catalog import read
 from skysim.sources.dome.shell import surface
+from skysim.sources.false_lights import GHOST, MIRRORED
+from skysim.sources.orbit.availability import Pointing, sample
+from skysim.sources.photometry import (
+    Band,
+    black_body_v0,
+    chromatic_shifts,
+    led_chromatic,
+    measured,
+    star_chromatic,
+    temperature_k,
+)
 
 mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "skysim", "font.family": "sans-serif", "font.size": 11})
 LABEL_BOX = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}  # an opaque background for labels
@@ -279,13 +295,141 @@ def bodies(path: Path) -> None:
     save(fig, path)
 
 
+def color(path: Path) -> None:
+    """Photo-electrons of four lights by wavelength, the lateral color of a lens, and the mean of each."""
+    lens = "{wavelength: [450 nm, 550 nm, 650 nm, 850 nm], corner_px: [-0.38, -0.13, 0.12, 0.62]}"
+    band = Band.from_camera(loader.load("shefex2", {"camera.chromatic": lens}).camera)
+    nm = np.arange(390.0, 1000.0)
+    lights = (
+        ("star A0V", (0.0, 0.004), "#1f6fb2"),
+        ("G2V", (0.65, 0.713), LIGHT),
+        ("M1V", (1.485, 2.005), CAM),
+        ("white LED", None, "#27ae60"),
+    )
+    fig, (spectra, shift) = plt.subplots(2, 1, figsize=(6.4, 5), sharex=True)
+    shift.plot(nm, chromatic_shifts(band, nm * 1e-9)[1], color=INK)
+    for name, colors, paint in lights:
+        if colors:
+            photons = black_body_v0(nm * 1e-9, temperature_k(*colors))
+            moments = star_chromatic(*colors, band)
+        else:
+            photons, moments = measured("white").response_at(nm * 1e-9) * nm, led_chromatic("white", band)
+        electrons = photons * band.response_at(nm * 1e-9)
+        spectra.plot(nm, electrons / electrons.max(), color=paint, label=name)
+        shift.plot(np.interp(moments[2], chromatic_shifts(band, nm * 1e-9)[1], nm), moments[2], "o", color=paint)
+    spectra.set(ylabel="photo-electrons, relative")
+    spectra.legend(frameon=False)
+    shift.set(xlabel="wavelength [nm]", ylabel="shift at the corner [px]")
+    fig.align_ylabels()
+    save(fig, path)
+
+
+def air(path: Path) -> None:
+    """Refraction and extinction against altitude, and scintillation against the aperture."""
+    refraction = Refraction(Weather(0.0, np.radians(53), 1013.25, 15.0, 0.5, 650e-9))
+    altitude_deg = np.geomspace(2, 89.5, 300)
+    fig, (bent, dimmed, twinkling) = plt.subplots(1, 3, figsize=(11, 3.1), layout="constrained")
+    apparent_rad = np.radians(altitude_deg)
+    # The table has zenith distances without air; the curve is drawn against the altitude that is seen.
+    raised_rad = refraction.bending_rad(np.pi / 2 - apparent_rad)
+    for _ in range(3):
+        raised_rad = refraction.bending_rad(np.pi / 2 - apparent_rad + raised_rad)
+    bent.loglog(altitude_deg, np.degrees(raised_rad) * 3600, color=BODY)
+    bent.set(title="refraction", ylabel="raised by (arcsec)")
+    mass = starlight.air_mass(apparent_rad)
+    for extinction_mag, color in ((0.1, BODY), (0.17, LIGHT), (0.3, CAM)):
+        dimmed.loglog(altitude_deg, extinction_mag * mass, color=color, label=f"{extinction_mag:g} mag an air mass")
+    dimmed.set(title="extinction", ylabel="fainter by (mag)")
+    for ax in (bent, dimmed):
+        ax.set(xlabel="altitude (deg)", xlim=(2, 90), xticks=[2, 5, 10, 20, 45, 90])
+        ax.set_xticklabels(["2", "5", "10", "20", "45", "90"])
+        ax.minorticks_off()
+    aperture_m = np.geomspace(2e-3, 1, 25)
+    ours = np.sqrt([scintillation.variance(np.ones(1), d, 0.05, 0.0, 650e-9)[0] for d in aperture_m])
+    young = np.sqrt(scintillation.YOUNG_M_S * scintillation.C_Y**2 * aperture_m ** (-4 / 3) / 0.05)
+    twinkling.loglog(100 * aperture_m, ours, color=BODY, label="simulated")
+    twinkling.loglog(100 * aperture_m, young, color=LAB, linestyle="--", label="Young's law")
+    twinkling.set(
+        title="scintillation, zenith, 50 ms", xlabel="aperture (cm)", ylabel="standard deviation", ylim=(0.01, 2)
+    )
+    for ax in (dimmed, twinkling):
+        ax.legend(frameon=False, fontsize=9)
+    save(fig, path)
+
+
+def orbit(path: Path) -> None:
+    """Two revolutions of a camera that looks at one place: angles of Sun, Earth and Moon, and their stray light."""
+    settings = {
+        "orbit": "{kind: circular, altitude: 500 km, inclination_deg: 97.4, raan_deg: 20, earth: {albedo: 0.3}}",
+        "light.bodies": "{planets: false}",
+        "camera.baffle": "{angle_deg: [20, 40, 60, 90, 120], pst: [1e-4, 1e-6, 1e-8, 1e-10, 1e-12]}",
+        "motion.start": "{ra_deg: 30, dec_deg: -35, roll_deg: 0}",
+        "start_time": "2012-06-24T21:00:00",
+    }
+    testbed = build_testbed(loader.load("shefex2", settings))
+    assert testbed.orbit is not None
+    cam_from_lab = testbed.mount.cam_from_body * testbed.trajectory.lab_from_body[0].inv()
+    boresight, t_s = cam_from_lab.inv().apply([0.0, 0.0, 1.0]), np.arange(0, 2 * 5677, 20.0)
+    seen = sample(testbed.orbit, testbed.scene.start_time, t_s, Pointing("inertial", boresight), boresight[None], 0.1)
+    limits = ExclusionConfig(sun_deg=60, earth_deg=25, moon_deg=20)
+    stray = [stray_light_e_s(testbed, bodies_during(testbed, t), cam_from_lab, t) for t in t_s.tolist()]
+    fig, (angles, light) = plt.subplots(2, 1, figsize=(8.5, 5.4), sharex=True, layout="constrained")
+    outside = seen.outside(limits)
+    usable = outside["Sun"] & outside["Earth"] & outside["Moon"]
+    minutes = t_s / 60
+    for ax in (angles, light):
+        ax.fill_between(minutes, 0, 1, where=usable, transform=ax.get_xaxis_transform(), color="#d5e8d4", lw=0)
+    for name, color in (("sun", LIGHT), ("earth", BODY), ("moon", LAB)):
+        label = "the Earth's limb" if name == "earth" else f"the {name.capitalize()}"
+        angles.plot(minutes, getattr(seen, f"{name}_deg"), color=color, label=label)
+        angles.axhline(getattr(limits, f"{name}_deg"), color=color, linestyle=":", linewidth=1)
+        light.semilogy(minutes, [one.get(name, np.nan) for one in stray], color=color)
+    angles.set(ylabel="from the boresight (deg)", ylim=(-80, 180))
+    angles.legend(frameon=False, ncols=3, loc="upper right")
+    light.set(ylabel="stray light (e⁻/s a pixel)", xlabel="minutes", xlim=(0, minutes[-1]))
+    save(fig, path)
+
+
+def reflections(path: Path) -> None:
+    """A frame without noise under a dome: black, and with mirror images and ghosts of its LEDs."""
+    deep = "{kind: sphere, apex: 5 ft, radius: 4 ft, rim_deg: 130}"
+    settings = {"light.surface": deep, "exposure.frames": "1", "camera.detector.noise": "false"}
+    settings |= {f"camera.detector.{key}": "0" for key in ("prnu", "dsnu", "hot_pixels", "column_offset_e")}
+    lens = {"camera.ghosts": "[{magnification: 0.5, share: 0.02, radius_px: 6}]"}
+    wall = {"light.reflection": "{specular: 0.1}"}
+    fig, both = plt.subplots(1, 2, figsize=(10, 3.7), layout="constrained")
+    titles = "black wall, clean lens", "satin wall that mirrors 10 %, one ghost"
+    for ax, changes, title in zip(both, ({}, wall | lens), titles, strict=True):
+        testbed = run.prepare(loader.load("apl_dome", settings | changes))
+        frame, truth = exposure.render_frame(testbed, 0)
+        light = frame.image_dn.astype(float)
+        light -= np.median(light)
+        # Every pixel as large as seven, on a logarithmic scale, so that LEDs and ghosts are seen.
+        ax.imshow(np.log10(np.clip(maximum_filter(light, 7), 1e-3, None)), cmap="gray_r", vmin=-3, vmax=3)
+        number = truth.sources.id
+        kinds = (
+            ("LED", number < MIRRORED, BODY),
+            ("its image in the wall", (number >= MIRRORED) & (number < GHOST), LIGHT),
+            ("its ghost", (number >= GHOST) & (number % GHOST < MIRRORED), CAM),
+        )
+        for name, chosen, color in kinds:
+            ax.plot(*truth.sources.xy_px[chosen].T, "o", ms=13, mfc="none", mew=1.3, color=color, label=name)
+        height, width = light.shape
+        ax.set(xticks=[], yticks=[], title=title, xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+    both[1].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
+    save(fig, path)
+
+
 def save(fig: plt.Figure, path: Path) -> None:
     """Save a figure without a date, so that equal figures have equal bytes."""
     fig.savefig(path, metadata={"Date": None}, bbox_inches="tight")
     plt.close(fig)
 
 
-FIGURES = {"axes": axes, "pixels": pixels, "roll": roll, "lever": lever, "bodies": bodies}
+FIGURES = {
+    **{"axes": axes, "pixels": pixels, "roll": roll, "lever": lever, "bodies": bodies},
+    **{"color": color, "air": air, "orbit": orbit, "reflections": reflections},
+}
 
 
 def main(folder: Path) -> None:

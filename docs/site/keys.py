@@ -79,6 +79,8 @@ TEXTS = {
     "light.satellites.file": "a TLE file, or an OMM file as CSV, XML or JSON",
     "orbit.file": "a TLE or OMM file, or with `kind: oem` a CCSDS OEM file",
     "camera.psf.file": "a table of numbers",
+    "camera.transmission": "a number > 0 to 1, or a CSV file",
+    "light.led.spectrum": "`white`, a CSV file, or a wavelength from 300 nm to 1100 nm",
     "camera.detector.quantum_efficiency": f"a number to 1, or {stems(CURVE_FOLDER, 'csv')}, or a CSV file",
     "camera.detector.quantum_efficiency.curve": f"{stems(CURVE_FOLDER, 'csv')}, or a CSV file",
     "vehicle.model": "an MJCF file",

@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.motion import covariance_of, error_gain, streak_factor
@@ -22,6 +23,7 @@ from estimator.core.camera import Camera
 from estimator.core.types import Centroids, RateEstimate
 
 MAX_STEPS, CONVERGED_RAD = 25, 1e-12
+FREE_STEPS = 15  # after which outliers stay what they are: at its limit a light may turn one with every second step
 
 
 class Fit(NamedTuple):
@@ -57,7 +59,8 @@ def fit(
     """
     cam_from_ref, rate = start
     delay_s, prior_information = camera.row_delays_s(centroids.xy_px), np.linalg.inv(prior.covariance_rad2_s2)
-    for _ in range(MAX_STEPS):
+    keep: list[NDArray[np.bool_]] = []
+    for n in range(MAX_STEPS):
         normal, gradient = np.zeros((6, 6)), np.zeros(6)
         turn = Rotation.from_rotvec(-delay_s[:, None] * rate)
         place = turn.apply(cam_from_ref.apply(place_ref))
@@ -65,8 +68,10 @@ def fit(
         rows = [_place_rows(camera, centroids, place - lever_cam_m, jacobian, turn, rate)]
         if exposure_s is not None and centroids.streak_px is not None:
             rows.append(_streak_rows(camera, centroids, jacobian, rate, exposure_s))
-        for residual, slopes, information in rows:
-            weighted = np.swapaxes(slopes, 1, 2) @ information
+        if n < FREE_STEPS:
+            keep = [inliers(residual, information) for residual, _, information in rows]
+        for (residual, slopes, information), kept in zip(rows, keep, strict=True):
+            weighted = np.swapaxes(slopes, 1, 2) @ information * kept[:, None, None]
             normal += np.sum(weighted @ slopes, axis=0)
             gradient += np.einsum("nij,nj->i", weighted, residual)
         normal[3:, 3:] += prior_information
@@ -91,19 +96,17 @@ def _place_rows(
     delay_s, gain = camera.row_delays_s(centroids.xy_px), error_gain(camera, -jacobian @ rate)
     error_rad2 = gain @ covariance_of(centroids) @ np.swapaxes(gain, 1, 2) / camera.focal_px**2
     slopes = np.concatenate([jacobian @ turn.as_matrix(), -delay_s[:, None, None] * jacobian], axis=2)
-    residual, information = camera.tangents(centroids.xy_px) - ray[:, :2] / ray[:, 2:], inverses(error_rad2)
-    return _Rows(residual, slopes, information * inliers(residual, information)[:, None, None])
+    return _Rows(camera.tangents(centroids.xy_px) - ray[:, :2] / ray[:, 2:], slopes, inverses(error_rad2))
 
 
 def _streak_rows(camera: Camera, centroids: Centroids, jacobian: Floats, rate: Floats, exposure_s: float) -> _Rows:
-    """Residuals of the streaks' chords, each with the sign nearer to the rate; outliers have no weight."""
+    """Residuals of the streaks' chords, each with the sign nearer to the rate."""
     assert centroids.streak_px is not None
     seen = np.isfinite(centroids.streak_px[:, 0])
     chord, information = chords(camera, centroids.take(seen))
     jacobian = jacobian[seen]
     by_rate = -exposure_s * streak_factor(camera, -jacobian @ rate)[:, None, None] * jacobian
     residual = aligned(chord, information, by_rate @ rate) - by_rate @ rate
-    information = information * inliers(residual, information)[:, None, None]
     return _Rows(residual, np.concatenate([0 * by_rate, by_rate], axis=2), information)
 
 

@@ -35,7 +35,7 @@ class Optics:
     """Lens and image geometry of a camera, in camera axes +x right, +y down, +z boresight.
 
     camera        : focal length, principal point, distortion, point-spread function
-    collecting_m2 : entrance pupil's area times transmission
+    collecting_m2 : entrance pupil's area times transmission, where that is one number
     fold_r        : tangent of the field angle at which strong barrel distortion folds back: no image beyond
     field_rad     : greatest field angle (from the boresight) on the chip
     blur_px       : standard deviation of a Gaussian blur before the lens (seeing)
@@ -51,7 +51,7 @@ class Optics:
     def from_camera(cls, camera: CameraConfig) -> Optics:
         """The optics of a scene's camera."""
         area_m2, fold = np.pi / 4 * camera.pupil_m**2, fold_r(camera.distortion)
-        return cls(camera, float(area_m2 * camera.transmission), fold, field_rad(camera, fold))
+        return cls(camera, float(area_m2 * camera.gray_transmission), fold, field_rad(camera, fold))
 
     def project(self, vectors_cam: Floats) -> Floats:
         """(..., 3) vectors in camera axes to (..., 2) pixels; NaN behind the camera and beyond the fold.

@@ -118,7 +118,15 @@ def render(
     disks = led_images(candidates, optics, Poses(*(samples[middle] for samples in all_poses)), emitter)
     is_led = candidates.place[:, 3] > 0
     kernels = source_kernels(
-        optics.camera, mid_px, candidates.radius_m, is_led, distance_m, cos_in, disks, optics.blur_px
+        optics.camera,
+        mid_px,
+        candidates.radius_m,
+        is_led,
+        distance_m,
+        cos_in,
+        disks,
+        optics.blur_px,
+        candidates.chromatic,
     )
     table = draw(image, tracks, kernels, STEP * kernels.sharp_px, window)
     # Only sources that gave light to the chip are reported.
@@ -182,7 +190,7 @@ NOW = np.zeros(1)
 def project(
     sources: Sources, optics: Optics, poses: Poses, after_s: Floats = NOW
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Project N sources at each of K poses, (K,) seconds after mid-exposure.
+    """Project N sources at each of K poses, (K,) seconds after mid-exposure, each in its color.
 
     Returns (K, N, 2) pixels, (K, N) distances in m (1 for stars), (K, N) cosines at the emitter and at the aperture.
     """
@@ -191,7 +199,11 @@ def project(
     offset /= distance[:, :, None]
     cos_out = -np.einsum("knj,nj->kn", offset, sources.normal)
     direction_cam = offset @ poses.cam_from_lab.transpose(0, 2, 1)
-    return optics.project(direction_cam), distance, cos_out, direction_cam[:, :, 2]
+    xy_px = optics.project(direction_cam)
+    if sources.chromatic is not None:
+        camera = optics.camera
+        xy_px += (xy_px - camera.center_px) * (sources.chromatic[:, 2:3] / camera.corner_px)
+    return xy_px, distance, cos_out, direction_cam[:, :, 2]
 
 
 def led_images(sources: Sources, optics: Optics, pose: Poses, emitter: Emitter) -> DiskImages | None:

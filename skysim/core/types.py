@@ -137,6 +137,8 @@ class Sources:
     clock      : (N,) number of that clock, from 0; LEDs of one controller share it; 0 for a star
     magnitude  : (N,) V magnitude of a star; NaN for an LED
     motion     : (N, 2, 3) velocity s^-1 and acceleration s^-2 of `place` at mid-exposure; None where nothing moves
+    chromatic  : (N, 4) mean and standard deviation, over the light's photo-electrons, of the lens's shift of focus in m
+                 and of its shift at the chip's corner in px; None for a lens without chromatic aberration
     """
 
     id: NDArray[np.int64]
@@ -150,6 +152,7 @@ class Sources:
     clock: NDArray[np.int64]
     magnitude: Floats
     motion: Floats | None = None
+    chromatic: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.id)
@@ -184,8 +187,8 @@ class StarSources(Sources):
 
 def with_sources(parts: Sequence[Sources]) -> Sources:
     """All sources of several sets of which none moves, in their order."""
-    names = [name for name in Sources.__slots__ if name != "motion"]
-    return Sources(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    columns = {name: [getattr(part, name) for part in parts] for name in Sources.__slots__}
+    return Sources(**{name: np.concatenate(own) for name, own in columns.items() if own[0] is not None})
 
 
 @dataclass(frozen=True, slots=True)

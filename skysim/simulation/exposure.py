@@ -1,8 +1,8 @@
 """Render one frame with its truth.
 
-The order is that of the light: background and display glow, the sources integrated along their paths
-(camera/render.py), ghosts and glare of the lens (camera/stray), charge smear of the shutter, then the detector
-(camera/detector).
+The order is that of the light: background, stray light past the baffle and display glow, the sources integrated along
+their paths (camera/render.py), ghosts and glare of the lens (camera/stray), charge smear of the shutter, then the
+detector (camera/detector).
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from skysim.camera.discs.bodies import FEW, behind, concatenated, render_bodies
 from skysim.camera.discs.disc_image import Exposed
 from skysim.camera.glow import background, display_glow
 from skysim.camera.glow.air_glow import sky_light
+from skysim.camera.glow.baffle import stray_of_bodies_e_s_m2, stray_of_earth_e_s_m2
 from skysim.camera.glow.earth_glow import earth_light
 from skysim.camera.optics import Optics
 from skysim.camera.render import OcclusionTest, Poses, Window, in_view, poses, project, render
@@ -30,6 +31,7 @@ from skysim.camera.stray import ghosts, glare, wall
 from skysim.core.random_streams import DETECTOR, SCINTILLATION, random_stream
 from skysim.core.types import Floats, Frame, Sources, SourceTruth, Truth, with_sources
 from skysim.dynamics import multibody
+from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.testbed import (
     Testbed,
     bodies_during,
@@ -41,7 +43,7 @@ from skysim.simulation.testbed import (
     time_tag_error_s,
 )
 from skysim.sources.air.air import Sky
-from skysim.sources.dome.led import Emitter
+from skysim.sources.dome.led import Emitter, warm_up_factor
 from skysim.sources.orbit.earth import sun_m
 from skysim.sources.orbit.satellites import MovingLight, View, as_sources
 from skysim.sources.photometry import SUN
@@ -65,16 +67,18 @@ def render_frame(
     camera_m = lab_from_body.apply(testbed.mount.camera_body_m)
     sky, light_e = sky_during(testbed, middle_s), testbed.canvas
     # The canvas is reused for every frame: the background overwrites it, all else is added to it.
-    fill_background(light_e, testbed, sky, cam_from_lab, camera_m, middle_s, window.exposure_s)
+    bodies = bodies_during(testbed, middle_s)
+    stray_e_s = sum(stray_light_e_s(testbed, bodies, cam_from_lab, middle_s).values())
+    fill_background(light_e, testbed, sky, cam_from_lab, camera_m, middle_s, window.exposure_s, stray_e_s)
     view = view_of(testbed, window, cam_from_lab, middle_s)
     satellites = satellites_during(testbed, view, middle_s, index)
-    stars = lights_during(testbed, view, middle_s)
+    stars = lights_during(testbed, view, middle_s, window.exposure_s)
     if testbed.codes:
         stars = testbed.codes.shown(stars, window.open_s, window.exposure_s, index)
     if sky:
         stars = seen_stars(testbed, stars, sky, window, index)
     streaks = satellite_sources(testbed, sky, satellites)
-    lights = Lights(with_images(testbed, stars, cam_from_lab, camera_m), bodies_during(testbed, middle_s), streaks)
+    lights = Lights(with_images(testbed, stars, cam_from_lab, camera_m), bodies, streaks)
     occludes = occlusion_test(testbed, lab_from_body, sky)
     optics = seeing_optics(testbed, sky, cam_from_lab) if sky else testbed.optics
     exposed = Exposed(optics, testbed.trajectory, testbed.mount, window)
@@ -103,17 +107,42 @@ def fill_background(
     camera_m: Floats,
     t_s: float,
     exposure_s: float,
+    stray_e_s: float,
 ) -> None:
-    """Set the image to all extended light: background and air, the dome's wall, the Earth, a display's black level."""
-    optics, band = testbed.optics, testbed.band
-    glow = background.glow_map(testbed.scene.background, optics, cam_from_lab, band, sky_light(sky))
+    """Set the image to all extended light: background and air, the dome's wall, the Earth, a display's black level.
+
+    stray_e_s : of `stray_light_e_s`
+    """
+    optics, band, left = testbed.optics, testbed.band, light_left(testbed, t_s)
+    glow = background.glow_map(testbed.scene.background, optics, cam_from_lab, band, sky_light(sky)) + stray_e_s
     if testbed.reflecting:
-        glow = glow + wall.wall_glow(testbed.reflecting, optics, cam_from_lab, camera_m, band)
+        glow = glow + left * wall.wall_glow(testbed.reflecting, optics, cam_from_lab, camera_m, band)
     background.fill(light_e, glow, exposure_s)
     add_earth(light_e, testbed, cam_from_lab, t_s, exposure_s)
     black_level = display_glow.black_glow(testbed.scene.light, optics, cam_from_lab, camera_m, band)
     if black_level is not None:
-        light_e += black_level * exposure_s
+        light_e += black_level * (left * exposure_s)
+
+
+def stray_light_e_s(
+    testbed: Testbed, bodies: Sequence[BodyLight], cam_from_lab: Rotation, t_s: float
+) -> dict[str, float]:
+    """Electrons s^-1 px^-1 that each body, and the Earth, sends past the baffle; empty without a baffle.
+
+    bodies : of `bodies_during`; those below the skyline give nothing
+    """
+    scene = testbed.scene
+    baffle, sky = scene.camera.baffle, sky_during(testbed, t_s)
+    if baffle is None:
+        return {}
+    boresight = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
+    up = [body for body in bodies if not (sky and sky.below_horizon(body.place.direction[None])[0])]
+    found = stray_of_bodies_e_s_m2(baffle, up, boresight)
+    if scene.orbit and scene.orbit.earth:
+        here = observer_during(testbed, t_s)
+        position_m, sun = here.from_earth.position_m, sun_m(here.tt_jd)
+        found["earth"] = stray_of_earth_e_s_m2(baffle, scene.orbit.earth, position_m, sun, boresight, testbed.band)
+    return {name: light * scene.camera.pixel_m**2 for name, light in found.items()}
 
 
 def satellite_sources(testbed: Testbed, sky: Sky | None, satellites: Sequence[MovingLight]) -> Sources | None:
@@ -165,8 +194,20 @@ def view_of(testbed: Testbed, window: Window, cam_from_lab: Rotation, middle_s: 
     return View(cam_from_lab.inv().apply([0.0, 0.0, 1.0]), testbed.optics.field_rad, turn_rad, duration_s)
 
 
+def light_left(testbed: Testbed, t_s: float) -> float:
+    """Light of the dome's LEDs at that time, over that when they were switched on."""
+    light = testbed.scene.light
+    return warm_up_factor(light.led.warm_up, t_s) if isinstance(light, DomeConfig) else 1.0
+
+
 def at_time(testbed: Testbed, t_s: float) -> Testbed:
-    """The test bed with LEDs, mount and lens where the temperature of that time has moved them."""
+    """The test bed with LEDs as bright as they are at that time, and LEDs, mount and lens where the temperature has
+    moved them.
+    """
+    left = light_left(testbed, t_s)
+    if left < 1:
+        dimmed = replace(testbed.sources, strength=left * testbed.sources.strength)
+        testbed = replace(testbed, sources=dimmed)
     if testbed.scene.thermal is None:
         return testbed
     hardware = thermal.Hardware(testbed.sources, testbed.mount, testbed.optics)

@@ -190,7 +190,7 @@ def build_testbed(
     catalog.require_catalog("tracker.catalog", scene.tracker.catalog)
     EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # raises for a bad PSF file
     vehicle = multibody.build(scene.vehicle)
-    band = Band.from_efficiency(scene.camera.detector.quantum_efficiency)
+    band = Band.from_camera(scene.camera)
     dtype = np.float32 if scene.camera.detector.noise else np.float64
     mount = multibody.camera_mount(vehicle)
     profiles = load_profiles(scene, mount, profile)
@@ -336,14 +336,14 @@ def satellites_during(testbed: Testbed, view: View, t_s: float, index: int) -> l
     return found
 
 
-def lights_during(testbed: Testbed, view: View, t_s: float) -> Sources:
+def lights_during(testbed: Testbed, view: View, t_s: float, exposure_s: float) -> Sources:
     """The light sources as they are in a frame: LEDs with their clocks' pulses, stars by the velocity in the orbit.
 
     In a low orbit the velocity turns by a degree in 15 s, so the aberration is each frame's own. It is that of
     mid-exposure: in a second a star moves by 0.006".
     """
     if testbed.clocks:
-        return testbed.clocks.pulses_at(testbed.sources, t_s)
+        return testbed.clocks.lights_at(testbed.sources, t_s, exposure_s)
     if testbed.orbit is None or not isinstance(testbed.sources, StarSources):
         return testbed.sources
     reach_rad = 1.25 * view.field_rad + 0.02 + view.turn_rad

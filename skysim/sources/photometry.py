@@ -1,26 +1,27 @@
-"""Photometry: magnitudes and candelas to photo-electrons, by integrating spectra with the chip's quantum efficiency.
+"""Photometry: magnitudes and candelas to photo-electrons, by integrating spectra with the camera's response.
 
 A star is a black body of its effective temperature, which follows from its colors along the measured sequence of
-dwarfs, scaled to its V magnitude. An LED has a tabulated white spectrum or a single line. In both cases
-    electrons = integral of photons(lambda) QE(lambda) d lambda,
-with `Band` as the quantum efficiency QE.
+dwarfs, scaled to its V magnitude. An LED has a tabulated spectrum, a Gaussian one or a single line. In all cases
+    electrons = integral of photons(lambda) R(lambda) d lambda,
+with `Band` as the response R: the chip's quantum efficiency, times the lens's transmission where that is a curve.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.types import Floats
-from skysim.scene.sections.camera import EfficiencyConfig, curve_file
+from skysim.scene.sections.camera import CameraConfig, ChromaticConfig, EfficiencyConfig, curve_file
+from skysim.scene.sections.leds import spectrum_file
 
 HC_J_M = 6.62607015e-34 * 299792458.0  # energy of a photon times its wavelength
 HC_K_M = HC_J_M / 1.380649e-23
@@ -33,21 +34,36 @@ FLAT_M = (
 )  # the silicon camera's bandpass, where one number stands for a curve (reference §2)
 
 STEP_M = 1e-9
+LONGEST_NM = 10_000.0  # of a curve: beyond, its integral has too many steps
 ARCSEC2_SR = math.radians(1 / 3600) ** 2
 SUN = (0.650, 0.713)  # B-V and V-I of a G2 star, the zero point of every instrumental magnitude
-Spectrum = Literal["white"] | float
+Spectrum = str | float  # of an LED: "white" or a file, or the peak wavelength in m
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Band:
-    """Quantum efficiency of a chip: photo-electrons per photon against wavelength.
+    """Response of a camera: photo-electrons per photon against wavelength.
 
     wavelength_m : (K,) ascending; the response is zero beyond its ends
     response     : (K,) electrons per photon, linear in between
+    chromatic    : the lens's chromatic aberration, which weighs its wavelengths by this response
     """
 
     wavelength_m: Floats
     response: Floats
+    chromatic: ChromaticConfig | None = None
+
+    @classmethod
+    def from_camera(cls, camera: CameraConfig) -> Band:
+        """The quantum efficiency of a camera's chip, times its lens's transmission where that is a curve; cached.
+
+        Raises as `from_efficiency`.
+        """
+        band = cls.from_efficiency(camera.detector.quantum_efficiency)
+        if isinstance(camera.transmission, str):
+            path = Path(camera.transmission)
+            band = _product(band, _read_curve(path, path.stat().st_mtime_ns))
+        return _through(band, camera.chromatic) if camera.chromatic else band
 
     @classmethod
     def from_efficiency(cls, quantum_efficiency: float | str | EfficiencyConfig) -> Band:
@@ -68,15 +84,18 @@ class Band:
         """The response at any wavelengths, linearly interpolated."""
         return np.asarray(np.interp(wavelength_m, self.wavelength_m, self.response, left=0.0, right=0.0))
 
+    def grid_m(self) -> Floats:
+        """Wavelengths in steps of a nanometer, and the curve's own samples, because it has kinks there."""
+        first, last = self.wavelength_m[[0, -1]]
+        even = np.arange(math.ceil(first / STEP_M), math.floor(last / STEP_M) + 1) * STEP_M
+        return np.union1d(even[(even > first) & (even < last)], self.wavelength_m)
+
     def integral(self, spectrum: Callable[[Floats], Floats]) -> Floats:
-        """Integral of a spectrum times the response over wavelength: trapezoidal rule in steps of a nanometer.
+        """Integral of a spectrum times the response over wavelength: trapezoidal rule on `grid_m`.
 
         spectrum : function of (M,) wavelengths in m, per meter of wavelength, that returns (..., M). Returns (...).
         """
-        first, last = self.wavelength_m[[0, -1]]
-        even = np.arange(math.ceil(first / STEP_M), math.floor(last / STEP_M) + 1) * STEP_M
-        # The curve's own samples are grid points too, because it has kinks there.
-        grid = np.union1d(even[(even > first) & (even < last)], self.wavelength_m)
+        grid = self.grid_m()
         return np.asarray(np.trapezoid(spectrum(grid) * self.response_at(grid), grid, axis=-1))
 
 
@@ -91,8 +110,24 @@ def _scaled(band: Band, peak: float) -> Band:
 
 
 @lru_cache(maxsize=64)
-def _read_curve(path: Path, _changed_ns: int = 0) -> Band:
-    """Read a curve: comments (#), a line of names, then lines of wavelength in nm and response, 0 to 1.
+def _through(band: Band, chromatic: ChromaticConfig) -> Band:
+    return replace(band, chromatic=chromatic)
+
+
+@lru_cache(maxsize=64)
+def _product(first: Band, second: Band) -> Band:
+    """The product of two curves where both reach, sampled every nanometer and at the samples of both."""
+    low_m, high_m = (choose(first.wavelength_m[end], second.wavelength_m[end]) for choose, end in ((max, 0), (min, -1)))
+    if not low_m < high_m:
+        raise InputError("camera.transmission: lets nothing through where the chip has a response; allowed: an overlap")
+    grid = np.union1d(first.grid_m(), second.grid_m())
+    grid = grid[(grid >= low_m) & (grid <= high_m)]
+    return Band(grid, first.response_at(grid) * second.response_at(grid))
+
+
+@lru_cache(maxsize=64)
+def _read_curve(path: Path, _changed_ns: int = 0, largest: float = 1.0) -> Band:
+    """Read a curve: comments (#), a line of names, then lines of wavelength in nm and response, 0 to `largest`.
 
     _changed_ns is the file's modification time: a changed file has another key in the cache.
     """
@@ -105,9 +140,13 @@ def _read_curve(path: Path, _changed_ns: int = 0) -> Band:
         raise InputError(
             f"{path}: not a response curve ({error}); allowed: two columns, wavelength_nm and response"
         ) from None
-    rising = np.all(np.diff(wavelength_nm, prepend=0.0) > 0)
-    if not rising or not np.all((response >= 0) & (response <= 1)):
-        raise InputError(f"{path}: not a response curve; allowed: ascending wavelength_nm, response within 0 and 1")
+    rising = np.all(np.diff(wavelength_nm, prepend=0.0) > 0) and wavelength_nm[-1] <= LONGEST_NM
+    within = np.all((response >= 0) & (response <= largest) & np.isfinite(response))
+    if not (rising and within and np.any(response)):
+        raise InputError(
+            f"{path}: not a response curve; allowed: ascending wavelength_nm to {LONGEST_NM:.0f}, response within 0 and"
+            f" {largest:g}, not always 0"
+        )
     return Band(wavelength_nm * 1e-9, response)
 
 
@@ -204,6 +243,59 @@ def star_flux_e_s_m2(v_mag: float | Floats, b_v: float | Floats, v_i: float | Fl
     return np.asarray(10.0 ** (log_v0 - 0.4 * np.asarray(v_mag, dtype=float)))
 
 
+@lru_cache(maxsize=64)
+def _black_body_moments(band: Band) -> tuple[Floats, Floats]:
+    """(256,) inverse temperatures and (256, 4) `chromatic_moments`."""
+    inverse_k, _ = _black_bodies(band)
+    return inverse_k, chromatic_moments(band, lambda wavelength_m: black_body_v0(wavelength_m, 1 / inverse_k))
+
+
+def star_chromatic(b_v: float | Floats, v_i: float | Floats, band: Band) -> Floats | None:
+    """(..., 4) `chromatic_moments` of stars of these colors; None for a lens without chromatic aberration."""
+    if band.chromatic is None:
+        return None
+    inverse_k, moments = _black_body_moments(band)
+    own_k = 1 / temperature_k(b_v, v_i)
+    return np.stack([np.interp(own_k, inverse_k, column) for column in moments.T], axis=-1)
+
+
+def led_chromatic(spectrum: Spectrum, band: Band, fwhm_m: float | None = None) -> Floats:
+    """(4,) `chromatic_moments` of an LED; arguments as in `led_strength_e_s_sr`."""
+    if not isinstance(spectrum, str) and fwhm_m is None:
+        focus_m, corner_px = chromatic_shifts(band, np.array([spectrum]))[:, 0]
+        return np.array([focus_m, 0.0, corner_px, 0.0])
+    power = measured(spectrum).response_at if isinstance(spectrum, str) else colored(spectrum, fwhm_m or 0.0)
+    return chromatic_moments(band, lambda wavelength_m: power(wavelength_m) * wavelength_m)
+
+
+def chromatic_moments(band: Band, photons: Callable[[Floats], Floats]) -> Floats:
+    """(..., 4) mean and standard deviation over a light's photo-electrons of the shift of focus, m, and at the corner,
+    px; 0 for a light that the camera does not see.
+
+    photons : spectrum in photons, to any scale, as in `Band.integral`
+    """
+    total = np.maximum(band.integral(photons), np.finfo(float).tiny)
+
+    def mean_of(power: int, column: int, origin: Floats) -> Floats:
+        def weighted(wavelength_m: Floats) -> Floats:
+            return photons(wavelength_m) * (chromatic_shifts(band, wavelength_m)[column] - origin[..., None]) ** power
+
+        return np.asarray(band.integral(weighted) / total)
+
+    means = [mean_of(1, column, np.zeros(())) for column in range(2)]
+    spreads = [np.sqrt(mean_of(2, column, mean)) for column, mean in enumerate(means)]
+    return np.stack([means[0], spreads[0], means[1], spreads[1]], axis=-1)
+
+
+def chromatic_shifts(band: Band, wavelength_m: Floats) -> Floats:
+    """(2, M) shift of the focus, m, and at the chip's corner, px, of light of (M,) wavelengths."""
+    config = band.chromatic
+    assert config is not None
+    none = np.zeros(len(config.wavelength_m))
+    columns = [none if column is None else column for column in (config.focus_m, config.corner_px)]
+    return np.array([np.interp(wavelength_m, config.wavelength_m, column) for column in columns])
+
+
 def synthetic_mag(v_mag: float | Floats, b_v: float | Floats, v_i: float | Floats, band: Band) -> Floats:
     """Instrumental magnitude of a star in this band, equal to V for a G2 star.
 
@@ -228,7 +320,7 @@ def led_strength_e_s_sr(
     """Candela to photo-electrons: luminous intensity / luminous efficacy * electrons per joule.
 
     intensity_cd : any shape, along the LED's normal
-    spectrum     : "white" (data/led/white.csv, 304 lm/W), or the peak wavelength in m of a colored LED
+    spectrum     : "white" (data/led/white.csv, 304 lm/W) or a file, or the peak wavelength in m of a colored LED
     fwhm_m       : width of its spectrum at half maximum; None for a narrow line
     Returns photo-electrons s^-1 sr^-1. Raises InputError for a line outside the visible range, which has no candelas.
     """
@@ -241,15 +333,23 @@ def radiant_strength_e_s_sr(
 ) -> Floats:
     """Radiant intensity to photo-electrons s^-1 sr^-1: I_e ∫ S λ/(h c) QE dλ / ∫ S dλ, S the spectrum's shape."""
     if isinstance(spectrum, str):
-        white = _read_curve(DATA / "led" / "white.csv")
-        electrons = band.integral(lambda wavelength_m: white.response_at(wavelength_m) * wavelength_m / HC_J_M)
-        electrons_per_joule = electrons / white.integral(np.ones_like)
+        power = measured(spectrum)
+        electrons = band.integral(lambda wavelength_m: power.response_at(wavelength_m) * wavelength_m / HC_J_M)
+        electrons_per_joule = electrons / power.integral(np.ones_like)
     elif fwhm_m is None:
         electrons_per_joule = band.response_at(spectrum) * spectrum / HC_J_M
     else:
-        power = colored(spectrum, fwhm_m)
-        electrons_per_joule = band.integral(lambda wavelength_m: power(wavelength_m) * wavelength_m / HC_J_M)
+        gaussian = colored(spectrum, fwhm_m)
+        electrons_per_joule = band.integral(lambda wavelength_m: gaussian(wavelength_m) * wavelength_m / HC_J_M)
     return np.asarray(np.asarray(intensity_w_sr, dtype=float) * electrons_per_joule)
+
+
+def measured(spectrum: str) -> Band:
+    """The relative power of an LED per nanometer: that of data/led/white.csv, or a file's. Features narrower than the
+    steps of `Band.integral` are not resolved. Raises InputError for a file that is not a curve.
+    """
+    path = spectrum_file(spectrum)
+    return _read_curve(path, path.stat().st_mtime_ns, math.inf)
 
 
 def colored(peak_m: float, fwhm_m: float) -> Callable[[Floats], Floats]:
@@ -262,12 +362,17 @@ def colored(peak_m: float, fwhm_m: float) -> Callable[[Floats], Floats]:
 def lumens_per_watt(spectrum: Spectrum, fwhm_m: float | None = None) -> float:
     """Luminous efficacy of radiation, lm/W: 683 ∫ S V dλ / ∫ S dλ, V the eye's response.
 
-    Raises InputError for a colored LED whose peak is where V is zero.
+    Raises InputError for a colored LED whose peak is where V is zero, and for a measured spectrum without light there.
     """
     photopic = _read_curve(DATA / "bands" / "photopic.csv")
     if isinstance(spectrum, str):
-        white = _read_curve(DATA / "led" / "white.csv")
-        return float(LUMENS_PER_WATT * photopic.integral(white.response_at) / white.integral(np.ones_like))
+        power = measured(spectrum)
+        seen = float(photopic.integral(power.response_at))
+        if not seen:
+            raise InputError(
+                f"light.led.spectrum: {spectrum} is invisible and has no candelas; allowed: radiant_intensity"
+            )
+        return LUMENS_PER_WATT * seen / float(power.integral(np.ones_like))
     if not photopic.response_at(spectrum):
         allowed = "{:g} to {:g} nm".format(*(photopic.wavelength_m[[0, -1]] * 1e9))
         raise InputError(

@@ -14,7 +14,7 @@ from skysim.core.quantities.utc import in_utc
 from skysim.core.random_streams import VARIABLE_STARS, random_stream
 from skysim.core.types import Floats, Sources, StarSources
 from skysim.sources.catalog import Catalog
-from skysim.sources.photometry import Band, star_flux_e_s_m2
+from skysim.sources.photometry import Band, star_chromatic, star_flux_e_s_m2
 
 J2000_TT = datetime.datetime(2000, 1, 1, 12)
 # TAI - UTC has been 37 s since 2017. An error of half a minute at earlier dates moves a star by 0.1 mas, so a table of
@@ -113,11 +113,17 @@ def sources(
     if len(selected):
         direction = lab_from_icrs.apply(apparent(selected, time, observer_velocity_m_s))
     flux = star_flux_e_s_m2(selected.v_mag, selected.b_v, selected.v_i, band)
-    return steady_points(selected.hip, direction, flux, selected.v_mag)
+    colors = star_chromatic(selected.b_v, selected.v_i, band)
+    return steady_points(selected.hip, direction, flux, selected.v_mag, colors)
 
 
-def steady_points(ids: NDArray[np.int64], direction: Floats, flux_e_s_m2: Floats, magnitude: Floats) -> StarSources:
-    """Steady points of light at infinity: (N, 3) unit vectors, (N,) photo-electrons s^-1 m^-2 and V magnitudes."""
+def steady_points(
+    ids: NDArray[np.int64], direction: Floats, flux_e_s_m2: Floats, magnitude: Floats, chromatic: Floats | None = None
+) -> StarSources:
+    """Steady points of light at infinity: (N, 3) unit vectors, (N,) photo-electrons s^-1 m^-2 and V magnitudes.
+
+    chromatic : (N, 4) as in `Sources`
+    """
     count = len(ids)
     zeros, ones = np.zeros(count), np.ones(count)
     return StarSources(
@@ -131,6 +137,7 @@ def steady_points(ids: NDArray[np.int64], direction: Floats, flux_e_s_m2: Floats
         on_s=ones,
         clock=np.zeros(count, dtype=np.int64),
         magnitude=magnitude,
+        chromatic=chromatic,
     )
 
 

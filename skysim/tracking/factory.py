@@ -21,7 +21,6 @@ from skysim.core.types import Frame, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.sources.dome import display
-from skysim.sources.orbit.camera_orbit import build_orbit, state_at
 from skysim.tracking.external import adapter
 from skysim.tracking.external.adapter import ExternalTracker
 from skysim.tracking.external.function import FunctionTracker
@@ -35,7 +34,7 @@ from skysim.tracking.onboard_model import (
     onboard_catalog,
     surveyed_dome,
 )
-from skysim.tracking.orbit_velocity import OrbitStarTracker, in_orbit
+from skysim.tracking.orbit_velocity import OrbitStarTracker, assumed_observer, assumed_orbit
 from skysim.tracking.settings import assumed_settings
 
 UserTracker = ExternalTracker | FunctionTracker  # each frame must reach it once, in order
@@ -67,17 +66,13 @@ def build_tracker(scene: Scene, mount: Mount, sources: Sources, programs: Mappin
         except ImageError as error:
             raise InputError(f"light: the star tracker cannot use this dome: {error}") from None
     stars = catalog.brighter_than(onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag)
-    orbit = build_orbit(scene.orbit, scene.start_time) if scene.tracker.orbit_velocity else None
-    observer = catalog.on_earth(scene.start_time)
-    if orbit:
-        observer = in_orbit(observer, state_at(orbit, 0.0).velocity_m_s)
-    directions = catalog.apparent(stars, observer)
+    directions = catalog.apparent(stars, assumed_observer(scene))
     if isinstance(scene.light, CollimatedDisplayConfig):
         # The display's mounting defines where the stars are in the lab frame.
         directions = display.lab_from_icrs(scene.light).apply(directions)
     if scene.tracker.name != OWN:
         return ExternalTracker.start(scene, camera, settings, adapter.star_map(stars, directions), programs)
-    if orbit:
+    if orbit := assumed_orbit(scene):
         return OrbitStarTracker(camera, stars, directions, settings, orbit)
     return StarTracker(camera, stars, directions, settings, air=assumed_air(scene))
 

@@ -61,7 +61,7 @@ def assumed_air(scene: Scene) -> SiteAir | None:
     light, site = scene.light, scene.site
     if not (scene.tracker.refraction and isinstance(light, StarsConfig) and light.air) or site.longitude_deg is None:
         return None
-    band = Band.from_efficiency(scene.camera.detector.quantum_efficiency)
+    band = Band.from_camera(scene.camera)
     weather = weather_of(light.air, site, band)
     air = weather.pressure_hpa, weather.temperature_c, weather.wavelength_m
     return SiteAir(site.latitude_deg, site.longitude_deg, scene.start_time, *air)

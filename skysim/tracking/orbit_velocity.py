@@ -15,7 +15,8 @@ from estimator.core.types import Attitude, RateEstimate
 from estimator.trackers.pipeline import Report, Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.types import Floats
-from skysim.sources.orbit.camera_orbit import CameraOrbit, state_at
+from skysim.scene.scene import Scene
+from skysim.sources.orbit.camera_orbit import CameraOrbit, build_orbit, state_at
 
 
 class OrbitStarTracker(StarTracker):
@@ -56,6 +57,14 @@ class OrbitStarTracker(StarTracker):
         return replace(attitude, cam_from_ref=attitude.cam_from_ref * now_from_start.inv())
 
 
-def in_orbit(observer: catalog.Observer, velocity_m_s: Floats) -> catalog.Observer:
-    """The observer with a velocity relative to the Earth."""
-    return replace(observer, velocity_m_s=observer.velocity_m_s + velocity_m_s)
+def assumed_orbit(scene: Scene) -> CameraOrbit | None:
+    """The orbit whose velocity the tracker knows; None on the ground, or if it does not know it."""
+    return build_orbit(scene.orbit, scene.start_time) if scene.tracker.orbit_velocity else None
+
+
+def assumed_observer(scene: Scene) -> catalog.Observer:
+    """The observer of the tracker's catalog at the scene's start: at the Earth's center, with the orbit's velocity."""
+    observer, orbit = catalog.on_earth(scene.start_time), assumed_orbit(scene)
+    if orbit is None:
+        return observer
+    return replace(observer, velocity_m_s=observer.velocity_m_s + state_at(orbit, 0.0).velocity_m_s)

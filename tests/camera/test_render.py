@@ -17,7 +17,7 @@ from skysim.camera.detector.detector import Detector, expose
 from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
+from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory, with_sources
 from skysim.dynamics.jitter import Vibration
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
@@ -170,7 +170,7 @@ def test_a_star_on_the_border_leaves_half_of_itself_outside() -> None:
 
 def test_lights_add() -> None:
     near, far = star_at(20.2, 20.9, 1e3), star_at(22.0, 21.0, 2e3)
-    both = Sources(*(np.concatenate([getattr(near, f), getattr(far, f)]) for f in Sources.__slots__ if f != "motion"))
+    both = with_sources([near, far])
     np.testing.assert_allclose(shot(both)[0], shot(near)[0] + shot(far)[0], rtol=0, atol=1e-9)
 
 
@@ -378,7 +378,7 @@ def test_stars_that_cross_the_field_between_two_looks_are_not_missed() -> None:
     """A whole turn in a second, looked at nine times: every star of the equator gives the same."""
     around = np.radians(np.arange(0, 360, 7.5))
     stars = [light(place=[[np.sin(a), 0, np.cos(a), 0]]) for a in around]
-    ring = Sources(*(np.concatenate([getattr(s, f) for s in stars]) for f in Sources.__slots__ if f != "motion"))
+    ring = with_sources(stars)
     t = np.linspace(0, 3, 3001)
     spin = Trajectory(t, Rotation.from_rotvec(np.outer(t, [0, 2 * np.pi, 0])), np.tile([0, 2 * np.pi, 0], (len(t), 1)))
     lens = lens_of(pixel="250 um", psf={"kind": "gaussian", "sigma_px": 0.7})
@@ -754,7 +754,7 @@ def test_work_is_shared_in_goes_without_a_seam(monkeypatch: pytest.MonkeyPatch) 
     """Patches of many sources do not fit in a frame at once; the outcome does not tell."""
     rng = np.random.default_rng(2)
     many = [star_at(*xy, 1e3) for xy in rng.uniform((5, 5), (58, 42), (40, 2))]
-    stars = Sources(*(np.concatenate([getattr(s, f) for s in many]) for f in Sources.__slots__ if f != "motion"))
+    stars = with_sources(many)
     whole, seen = shot(stars)
     monkeypatch.setattr(rendering, "MAX_PATCH_PIXELS", 500)
     parts, again = shot(stars)

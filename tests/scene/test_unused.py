@@ -92,6 +92,13 @@ CASES = [
         "5 nm",
         {},
     ),
+    Case(
+        DOME,
+        FLAT | DIRECT | {"light.layout": PANEL, "light.led.aging": "{hours: 9000, life_hours: 30000}"},
+        "light.led.aging.scatter",
+        "0.2",
+        {},
+    ),
     Case(DOME, DIRECT, "light.led.clock.offset_ppm", "7", {"light.led.drive": "{kind: pwm}"}),
     Case(DOME, {"light.layout": BOARDS}, "light.layout.lit", "[1, 2]", {"light.layout": SPREAD}),
     Case(
@@ -115,6 +122,7 @@ CASES = [
         "0.5",
         {"light.reflection": f"{{diffuse: 0.5, floor: {FLOOR}}}"},
     ),
+    Case(SKY, {}, "camera.baffle", "{angle_deg: [20, 90], pst: [1e-6, 1e-9]}", MOON),
     Case(SKY, {"camera.detector.dark_e_s": "0"}, "camera.detector.dsnu", "0.5", {"camera.detector.dark_e_s": "20"}),
     Case(SKY, {"camera.detector.hot_e_s": "0"}, "camera.detector.hot_pixels", "0.01", {"camera.detector.hot_e_s": "9"}),
     Case(SKY, {"camera.detector.hot_pixels": "0"}, "camera.detector.hot_e_s", "9", {"camera.detector.hot_pixels": "1"}),

@@ -13,6 +13,7 @@ from skysim.core.types import Truth
 from skysim.scene.loader import load
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker, sky_during
+from skysim.sources.air import scintillation
 from skysim.tracking.factory import solve_frame
 
 TIME = "2012-06-24T23:00:00"
@@ -103,7 +104,8 @@ def test_stars_twinkle_by_frame_and_star() -> None:
         ratios.append(seen.electrons[a] / still.electrons[b])
     ratio = np.concatenate(ratios)
     camera, exposure_s = testbed.scene.camera, testbed.scene.exposure.time_s
-    variance = 10e-6 * 1.56**2 * camera.pupil_m ** (-4 / 3) / exposure_s / np.sin(np.radians(60)) ** 3
+    mass = np.array([1 / np.sin(np.radians(60))])
+    variance = scintillation.variance(mass, camera.pupil_m, exposure_s, testbed.scene.site.height_m, 660e-9)[0]
     assert ratio.mean() == pytest.approx(1, abs=4 * np.sqrt(variance / len(ratio)))
     assert ratio.var() == pytest.approx(variance, rel=0.25)
 

@@ -1,4 +1,4 @@
-"""Refraction, extinction and scintillation against other implementations and published numbers."""
+"""Refraction and extinction against other implementations and published numbers."""
 
 from __future__ import annotations
 
@@ -161,22 +161,6 @@ def _identity() -> Any:
     from scipy.spatial.transform import Rotation
 
     return Rotation.identity()
-
-
-def test_scintillation_is_young_s() -> None:
-    """Young (1967): sigma = 0.09 D^(-2/3) X^1.75 exp(-h / 8000 m) / sqrt(2 t), D in cm; C_Y is 1 in it, X^3 near it."""
-    for aperture_m, exposure_s, height_m in [(0.1, 1.0, 0.0), (0.5, 10.0, 2400.0)]:
-        variance = starlight.scintillation_variance(np.ones(1), aperture_m, exposure_s, height_m)[0] / starlight.C_Y**2
-        young = 0.09 * (aperture_m * 100) ** (-2 / 3) * np.exp(-height_m / 8000) / np.sqrt(2 * exposure_s)
-        assert np.sqrt(variance) == pytest.approx(young, rel=0.1)
-    assert starlight.scintillation_variance(np.array([2.0]), 0.1, 1.0, 0.0)[0] == pytest.approx(
-        8 * starlight.scintillation_variance(np.array([1.0]), 0.1, 1.0, 0.0)[0]
-    )
-    for variance in (1e-4, 0.3):
-        factor = starlight.scintillation(np.full(200_000, variance), np.random.default_rng(5))
-        assert factor.mean() == pytest.approx(1, abs=5 * np.sqrt(variance / 200_000))
-        assert factor.var() == pytest.approx(variance, rel=0.05)
-        assert factor.min() > 0
 
 
 def test_a_skyline_goes_around_the_circle() -> None:

@@ -16,7 +16,7 @@ from skysim.simulation import exposure
 from skysim.simulation.closed_loop import ClosedLoop
 from skysim.simulation.testbed import build_testbed, exposure_window, time_tag_error_s
 from skysim.sources.dome.led import lit_moments_s
-from skysim.sources.dome.timing.clocks import Clocks
+from skysim.sources.dome.timing.clocks import Clocks, filtered_share
 
 AT_REST = {"motion.maneuver": "[{kind: hold, duration: 60 s}]", "exposure.time": "10.5 ms"}
 
@@ -61,6 +61,51 @@ def test_an_led_is_lit_when_its_controller_s_own_time_says_so() -> None:
             > 5e-10
         )
         assert np.mean(states == lit[::97, n]) > 0.98  # the others lie at an edge
+
+
+@pytest.mark.parametrize("filter_s", [2e-4, 1e-3, 5e-3])
+def test_a_filtered_led_has_the_mean_of_its_filter_s_voltage(filter_s: float) -> None:
+    """Against RC V' = u - V, each edge solved on its own, from a voltage of the mean on for forty time constants."""
+    leds = pulsed_sources(6)
+    exposures = [(0.5, 0.5031), (0.51, 0.5104), (0.52, 0.52001)]
+    for n in range(len(leds)):
+        on_s, duty = leds.on_s[n], leds.on_s[n] * 1e3
+        edges_s = leds.start_s[n] + np.arange(0, 530)[:, None] * 1e-3 + np.array([0, on_s])
+        t_s = np.unique(np.concatenate([edges_s.ravel(), *exposures]))
+        lit = np.mod(t_s[:-1] + 1e-9 - leds.start_s[n], 1e-3) < on_s
+        voltage, integral = [duty], [0.0]
+        for step_s, u in zip(np.diff(t_s), lit, strict=True):
+            voltage.append(u + (voltage[-1] - u) * np.exp(-step_s / filter_s))
+            # The integral of u - (u - V0) exp(-t / RC)
+            integral.append(integral[-1] + u * step_s - (u - voltage[-2]) * filter_s * -np.expm1(-step_s / filter_s))
+        for begin_s, end_s in exposures:
+            expected = (np.interp(end_s, t_s, integral) - np.interp(begin_s, t_s, integral)) / (end_s - begin_s)
+            share = filtered_share(leds, np.full(6, filter_s), begin_s, end_s)[n]
+            assert share == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+def test_a_slow_filter_s_ripple_is_that_of_the_data_books() -> None:
+    """Peak to peak D (1 - D) T / RC, for RC >> T."""
+    leds, filter_s = pulsed_sources(20), np.full(20, 0.05)
+    voltage = np.array([filtered_share(leds, filter_s, t, t + 1e-7) for t in 3 + np.arange(0, 1e-3, 2e-6)])
+    duty = leds.on_s * 1e3
+    assert voltage.mean(axis=0) == pytest.approx(duty, rel=1e-4)
+    assert np.ptp(voltage, axis=0) == pytest.approx(duty * (1 - duty) * 1e-3 / 0.05, rel=1e-2)
+
+
+@pytest.mark.slow
+def test_filtered_leds_do_not_flicker() -> None:
+    """A tenth of full light, exposed for one and a half pulses: frames differ by a third, filtered by a hundredth."""
+    scatter = []
+    for low_pass in ("", ", filter: {time_constant: 20 ms, error: {tolerance: 0.1}}"):
+        layout = "{kind: poisson_disk, spacing: 60 mm, cap_deg: 20, levels: [0.1], hardware_seed: 5}"
+        drive = {"light.led.drive": f"{{kind: pwm{low_pass}}}", "light.layout": layout, "exposure.time": "1.5 ms"}
+        testbed = build_testbed(loader.load("afit_simsat_ideal", AT_REST | drive | {"camera.detector.noise": "false"}))
+        resting = testbed.at_rest(Rotation.identity(), 5)
+        electrons = np.array([exposure.render_frame(resting, k)[1].sources.electrons for k in range(6)])
+        scatter.append((electrons.std(axis=0) / electrons.mean(axis=0)).mean())
+    assert 0.2 < scatter[0] < 0.5
+    assert 0 < scatter[1] < 0.02
 
 
 def test_offsets_are_hardware_and_phases_are_of_the_run() -> None:

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from typing import get_args
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
-from skysim.scene.sections.leds import CosineLobeConfig, LedConfig, LobeTableConfig
-from skysim.sources.dome.led import FALLOFF, LOBES, Emitter, irradiance_e_s_m2
+from skysim.camera.glow.display_glow import black_glow
+from skysim.core.types import Floats, Sources
+from skysim.scene import loader
+from skysim.scene.sections.leds import AgingConfig, CosineLobeConfig, LedConfig, LobeTableConfig, WarmUpConfig
+from skysim.simulation.exposure import render_frame
+from skysim.simulation.testbed import build_testbed, exposure_window
+from skysim.sources.dome import sources
+from skysim.sources.dome.led import FALLOFF, LOBES, Emitter, aging_factors, irradiance_e_s_m2, warm_up_factor
 from skysim.sources.photometry import Band, led_strength_e_s_sr
 
 ONE = np.ones(1)
@@ -127,3 +136,100 @@ def test_reference_electrons_of_a_bright_led() -> None:
 
 def test_every_falloff_law_can_be_named_in_a_scene() -> None:
     assert set(get_args(LedConfig.model_fields["falloff"].annotation)) == set(FALLOFF)
+
+
+# Aging and warm-up
+
+
+def aging(hours: float, scatter: object = 0.0) -> AgingConfig:
+    return AgingConfig.model_validate({"hours": hours, "life_hours": 36_000.0, "scatter": scatter})
+
+
+def test_the_procedure_of_tm_21_finds_the_life_that_a_scene_states() -> None:
+    """A line fitted to the logarithms of the light measured every thousand hours, and where it crosses 70 %."""
+    hours = np.arange(1000.0, 10_001.0, 1000.0)
+    light = [float(aging_factors(aging(each), np.zeros(1))[0]) for each in hours]
+    slope, intercept = np.polyfit(hours, np.log(light), 1)
+    assert math.exp(intercept) == pytest.approx(1, rel=1e-9)
+    assert math.log(math.exp(intercept) / 0.7) / -slope == pytest.approx(36_000, rel=1e-9)
+
+
+@pytest.mark.parametrize("scatter", [0.2, {"tolerance": 0.3}])
+def test_leds_age_at_rates_of_their_own(scatter: object) -> None:
+    config = aging(12_000.0, scatter)
+    rates = -np.log(aging_factors(config, np.random.default_rng(3).standard_normal(20_000))) / 12_000
+    nominal = math.log(1 / 0.7) / 36_000
+    if isinstance(scatter, float):
+        assert np.log(rates / nominal).std() == pytest.approx(scatter, rel=0.02)
+        assert np.log(rates / nominal).mean() == pytest.approx(0, abs=0.006)
+    else:
+        assert np.abs(rates / nominal - 1).max() < 0.3
+        assert (rates / nominal).std() == pytest.approx(0.3 / math.sqrt(3), rel=0.02)
+
+
+def test_a_dome_ages_and_nothing_else_of_it_changes() -> None:
+    """Each LED by its own factor, the same in every run of the same hardware."""
+    band = Band.from_efficiency(0.3)
+
+    def leds(keys: str) -> Sources:
+        told = {"light.led.aging": keys} if keys else {}
+        return sources(loader.load("afit_simsat", told).light, band)
+
+    new, even, own = (leds(keys) for keys in ("", "{hours: 9000, life_hours: 18000}", UNEVEN))
+    np.testing.assert_allclose(even.strength / new.strength, math.sqrt(0.7), rtol=1e-12)
+    left = own.strength / new.strength
+    assert np.log(np.log(left) / math.log(0.7) * 2).std() == pytest.approx(0.2, rel=0.1)
+    np.testing.assert_array_equal(own.strength, leds(UNEVEN).strength)
+    for column in ("place", "period_s", "start_s", "on_s", "radius_m"):
+        np.testing.assert_array_equal(getattr(own, column), getattr(new, column))
+
+
+UNEVEN = "{hours: 9000, life_hours: 18000, scatter: 0.2}"
+
+
+def test_panels_age_as_one() -> None:
+    """Their pixels, and the glow of the black ones."""
+    keys = {"light.layout.contrast": "500"}
+    testbeds = [
+        build_testbed(loader.load("nps_tas2", keys | more))
+        for more in ({}, {"light.led.aging": "{hours: 9000, life_hours: 18000}"})
+    ]
+    new, old = (testbed.sources.strength for testbed in testbeds)
+    np.testing.assert_allclose(old / new, math.sqrt(0.7), rtol=1e-12)
+    glows = [black_glow(one.scene.light, one.optics, Rotation.identity(), np.zeros(3), one.band) for one in testbeds]
+    assert glows[0] is not None
+    assert glows[0].max() > 0
+    np.testing.assert_allclose(glows[1], math.sqrt(0.7) * glows[0], rtol=1e-12)
+
+
+def test_warm_up_is_the_cooling_law_of_newton() -> None:
+    """The light follows d g / d t = (steady - g) / time from 1."""
+    config = WarmUpConfig.model_validate({"steady": 0.88, "time": "7 min"})
+    times = np.array([10.0, 60.0, 420.0, 3000.0])
+    solved = solve_ivp(lambda _, g: (0.88 - g) / 420, (0, 3000), [1.0], t_eval=times, rtol=1e-10, atol=1e-12).y[0]
+    np.testing.assert_allclose([warm_up_factor(config, t_s) for t_s in times], solved, rtol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "keys"),
+    [
+        ("apl_dome", {"light.reflection": "{diffuse: 0.5, specular: 0.1}"}),
+        ("nps_tas2", {"light.layout.contrast": "500"}),
+    ],
+)
+def test_all_light_of_the_leds_falls_while_they_warm_up(scene: str, keys: dict[str, str]) -> None:
+    """LEDs, their images in the wall, its glow, and that of black pixels; by the law at mid-exposure of each frame."""
+    keys = keys | {"background": "[]", "camera.detector.noise": "false", "exposure.rate_hz": "0.5"}
+    dark = keys | {"light.led.intensity": "1e-20 cd"}
+    warm = keys | {"light.led.warm_up": "{steady: 0.8, time: 2 s}"}
+    for index in (0, 1):
+        dark_dn, cold_dn, warm_dn = (still(scene, told, index) for told in (dark, keys, warm))
+        t_s = exposure_window(loader.load(scene, keys), index).middle_s(len(dark_dn))
+        left = 0.8 + 0.2 * math.exp(-t_s / 2)
+        np.testing.assert_allclose(warm_dn - dark_dn, left * (cold_dn - dark_dn), rtol=0, atol=1e-9 * cold_dn.max())
+
+
+def still(scene: str, keys: dict[str, str], index: int) -> Floats:
+    testbed = build_testbed(loader.load(scene, keys))
+    return render_frame(testbed.at_rest(testbed.trajectory.lab_from_body[0], index), index)[0].image_dn

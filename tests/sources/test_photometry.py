@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,8 +15,13 @@ from scipy.integrate import quad
 
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
-from skysim.scene.sections.camera import curve_file
+from skysim.core.types import Floats
+from skysim.scene import loader
+from skysim.scene.scene import Scene
+from skysim.scene.sections.camera import CameraConfig, curve_file
 from skysim.scene.sections.leds import LedConfig
+from skysim.simulation.exposure import render_frame
+from skysim.simulation.testbed import build_testbed
 from skysim.sources import catalog
 from skysim.sources.dome.led import color_factors, full_strength_e_s_sr
 from skysim.sources.photometry import (
@@ -372,6 +378,8 @@ def test_a_user_s_own_curve_is_read_and_read_anew_when_it_changes(tmp_path: Path
         "a,b\n600,.1\n500,.1\n",
         "a,b\n400,.5\n500,1.5\n",
         "a\n1\n2\n",
+        "a,b\n400,.5\n1e15,.5\n",
+        "a,b\n400,0\n500,0\n",
     ],
 )
 def test_a_file_that_is_no_curve_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
@@ -379,6 +387,124 @@ def test_a_file_that_is_no_curve_is_refused_in_one_line(tmp_path: Path, text: st
     path.write_text(text)
     with pytest.raises(InputError, match=r"^.*bad\.csv: not a response curve.*$"):
         Band.from_efficiency(str(path))
+
+
+@pytest.fixture
+def lens(tmp_path: Path) -> Path:
+    """Transmission of a lens whose coating is good for green and red."""
+    path = tmp_path / "lens.csv"
+    path.write_text("wavelength_nm,transmission\n420,0.15\n470,0.8\n650,0.93\n900,0.4\n")
+    return path
+
+
+def camera_with(transmission: Path | float) -> CameraConfig:
+    return loader.load(
+        "shefex2", {"camera.transmission": str(transmission), "camera.detector.quantum_efficiency": "cmos"}
+    ).camera
+
+
+def test_the_response_is_the_efficiency_times_the_transmission(lens: Path) -> None:
+    """Stars, glow, white and colored LEDs, against adaptive quadrature of the two curves."""
+    band, chip = Band.from_camera(camera_with(lens)), Band.from_efficiency("cmos")
+
+    def response(nm: float) -> float:
+        return float(chip.response_at(nm * 1e-9)) * float(
+            np.interp(nm, [420, 470, 650, 900], [0.15, 0.8, 0.93, 0.4], left=0, right=0)
+        )
+
+    def electrons(photons: Callable[[float], float]) -> float:
+        knots = [420, 425, 450, 470, *range(475, 901, 25)]
+        return sum(quad(lambda nm: photons(nm) * response(nm) * 1e-9, *ends)[0] for ends in itertools.pairwise(knots))
+
+    for color in (A0, SUN, M1):
+        kelvin = temperature_k(*color)
+        wanted = electrons(lambda nm, kelvin=kelvin: float(black_body_v0(np.array([nm * 1e-9]), kelvin)[0]))
+        assert star_flux_e_s_m2(0.0, *color, band) == pytest.approx(wanted, rel=2e-5)
+    sun = float(star_flux_e_s_m2(20.0, *SUN, band))
+    assert float(sky_radiance_e_s_m2_sr(20.0, band)) * math.radians(1 / 3600) ** 2 == pytest.approx(sun, rel=1e-12)
+    assert radiant_strength_e_s_sr(1.0, 470e-9, band) == pytest.approx(470e-9 / HC_J_M * response(470), rel=1e-12)
+    sigma = 20 / math.sqrt(8 * math.log(2))
+
+    def line(nm: float) -> float:
+        return math.exp(-0.5 * ((nm - 460) / sigma) ** 2) / (math.sqrt(2 * math.pi) * sigma) * nm / HC_J_M
+
+    assert radiant_strength_e_s_sr(1.0, 460e-9, band, 20e-9) == pytest.approx(electrons(line), rel=2e-4)
+    assert Band.from_camera(camera_with(lens)) is band
+
+
+ORION = {"background": "[{kind: sky, mag_arcsec2: 19}]", "motion.start": "{ra_deg: 84, dec_deg: -1.2}"}
+
+
+@pytest.mark.parametrize(("scene", "keys"), [("shefex2", ORION), ("afit_simsat", {"camera.pixel": "32 um"})])
+def test_a_gray_curve_gives_the_frame_of_its_number(scene: str, keys: dict[str, str], tmp_path: Path) -> None:
+    """Every light, the sky's glow included, passes the lens once."""
+    path = tmp_path / "gray.csv"
+    path.write_text("wavelength_nm,transmission\n300,0.6\n1200,0.6\n")
+    keys = {"camera.width_px": "200", "camera.height_px": "150", "camera.detector.noise": "false"} | keys
+    number, curve = (
+        still_frame(loader.load(scene, keys | {"camera.transmission": given})) for given in ("0.6", str(path))
+    )
+    assert np.ptp(number) > 10
+    np.testing.assert_allclose(curve, number, rtol=1e-9, atol=1e-9)
+
+
+def still_frame(scene: Scene) -> Floats:
+    testbed = build_testbed(scene)
+    return render_frame(testbed.at_rest(testbed.trajectory.lab_from_body[0]), 0)[0].image_dn
+
+
+def test_a_lens_that_lets_nothing_to_the_chip_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "infrared.csv"
+    path.write_text("wavelength_nm,transmission\n1300,0.6\n1400,0.6\n")
+    with pytest.raises(InputError, match=r"^camera\.transmission: lets nothing through .*; allowed: an overlap$"):
+        Band.from_camera(camera_with(path))
+
+
+@pytest.mark.parametrize(("value", "message"), [("gone.csv", "no file 'gone.csv'; allowed: "), ("1.5", "less than")])
+def test_a_transmission_is_a_number_or_a_file(value: str, message: str) -> None:
+    with pytest.raises(InputError, match=f"^camera.transmission: .*{message}"):
+        loader.load("shefex2", {"camera.transmission": value})
+
+
+def test_a_measured_spectrum(tmp_path: Path) -> None:
+    """A table of a Gaussian is a colored LED, in any unit of power; that of the white LED is the white LED."""
+    band, path = Band.from_efficiency("cmos"), tmp_path / "led.csv"
+    rows = [f"{nm},{7.3 * math.exp(-0.5 * ((nm - 520) / 15) ** 2)!r}" for nm in range(430, 611)]
+    path.write_text("\n".join(["wavelength_nm,power", *rows]))
+    gaussian = 520e-9, band, 15e-9 * math.sqrt(8 * math.log(2))
+    assert led_strength_e_s_sr(0.3, str(path), band) == pytest.approx(led_strength_e_s_sr(0.3, *gaussian), rel=1e-4)
+    watts = radiant_strength_e_s_sr(0.3, str(path), band)
+    assert watts == pytest.approx(radiant_strength_e_s_sr(0.3, *gaussian), rel=1e-4)
+    white = str(DATA / "led" / "white.csv")
+    assert led_strength_e_s_sr(0.3, white, band) == led_strength_e_s_sr(0.3, "white", band)
+
+
+def test_a_power_without_bound_is_no_spectrum(tmp_path: Path) -> None:
+    path = tmp_path / "bad.csv"
+    path.write_text("wavelength_nm,power\n400,1\n500,inf\n")
+    with pytest.raises(InputError, match=r"not a response curve; allowed: .* within 0 and inf"):
+        led_strength_e_s_sr(0.3, str(path), ALL)
+
+
+def test_an_invisible_spectrum_has_no_candelas(tmp_path: Path) -> None:
+    path = tmp_path / "infrared.csv"
+    path.write_text("wavelength_nm,power\n900,0\n940,1\n980,0\n")
+    with pytest.raises(InputError, match=r"^light\.led\.spectrum: .*invisible.*; allowed: radiant_intensity$"):
+        led_strength_e_s_sr(0.3, str(path), ALL)
+    assert radiant_strength_e_s_sr(1.0, str(path), ALL) == pytest.approx(940e-9 / HC_J_M, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"spectrum": "gone.csv"}, "no file 'gone.csv'; allowed: white, a CSV file"),
+        ({"spectrum": "blue"}, "'blue' is not a wavelength; allowed: a wavelength such as \"630 nm\", or white"),
+        ({"fwhm": "20 nm"}, "fwhm: white is a whole spectrum; allowed: a wavelength as spectrum"),
+    ],
+)
+def test_a_spectrum_is_white_a_file_or_a_wavelength(keys: dict[str, str], message: str) -> None:
+    with pytest.raises(InputError, match=re.escape(message)):
+        loader.load("afit_simsat", {f"light.led.{key}": value for key, value in keys.items()})
 
 
 @pytest.mark.parametrize(("peak_nm", "fwhm_nm"), [(470, 25), (525, 35), (630, 18), (590, 3)])

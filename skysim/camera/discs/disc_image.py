@@ -69,7 +69,8 @@ def points_of(body: BodyLight, xy: Floats, share: Floats | None = None) -> Any:
     """Points (M, 2) of a body's disc as Sources with (M,) shares of its light, all of it each if left out."""
     share = np.ones(len(xy)) if share is None else share
     ids, magnitude = np.full(len(xy), body.id, np.int64), np.full(len(xy), body.magnitude)
-    return steady_points(ids, body.directions(xy), share * body.flux_e_s_m2, magnitude)
+    colors = None if body.chromatic is None else np.tile(body.chromatic, (len(xy), 1))
+    return steady_points(ids, body.directions(xy), share * body.flux_e_s_m2, magnitude, colors)
 
 
 class StarImages(NamedTuple):
@@ -92,14 +93,16 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> StarImag
     optics, camera = exposed.optics, exposed.optics.camera
     t_s = sample_times(exposed.window.open_s, exposed.window.close_s(camera.height_px), exposed.trajectory)
     all_poses = poses(exposed.trajectory, exposed.mount, t_s)
-    star = star_kernel(optics, disc.center_px)
+    star = star_kernel(optics, disc.center_px, body.chromatic)
     steps = math.ceil(1 / (LATTICE * float(star.sharp_px[0])))
     phase_px = np.stack(np.meshgrid(*2 * (np.arange(steps) / steps,)), axis=-1).reshape(-1, 2)  # x fastest
     points = points_of(body, phase_px @ np.linalg.inv(disc.px_from_radius).T)
     tracks, distance_m, cos_in = image_tracks(points, optics, all_poses, t_s, Emitter())
     xy_px, middle = tracks.xy_px, len(t_s) // 2
     is_led, blur_px = np.zeros(len(points), bool), optics.blur_px
-    kernels = source_kernels(camera, xy_px[middle], points.radius_m, is_led, distance_m, cos_in, blur_px=blur_px)
+    kernels = source_kernels(
+        camera, xy_px[middle], points.radius_m, is_led, distance_m, cos_in, None, blur_px, points.chromatic
+    )
     reach_px = kernels.reach_px.max() + 2
     low = np.floor(np.nanmin(xy_px, axis=(0, 1)) - reach_px).astype(np.int64)
     width, height = (np.ceil(np.nanmax(xy_px, axis=(0, 1)) + reach_px).astype(np.int64) - low + 1).tolist()
@@ -113,11 +116,12 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> StarImag
     return StarImages(patches, low, speed, float(drawn[0, 5]))
 
 
-def star_kernel(optics: Optics, xy_px: Floats) -> Kernels:
-    """The kernel of a star at a place on the chip."""
+def star_kernel(optics: Optics, xy_px: Floats, chromatic: Floats | None) -> Kernels:
+    """The kernel of a point at a place on the chip; chromatic: (4,) of its light."""
     one = np.ones(1)
     is_led = np.zeros(1, bool)
-    return source_kernels(optics.camera, xy_px[None], 0 * one, is_led, one, one, blur_px=optics.blur_px)
+    colors = None if chromatic is None else chromatic[None]
+    return source_kernels(optics.camera, xy_px[None], 0 * one, is_led, one, one, None, optics.blur_px, colors)
 
 
 class DiscImage(NamedTuple):

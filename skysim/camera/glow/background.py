@@ -153,13 +153,13 @@ def stray_light(config: StrayLightConfig, view: ViewingGeometry) -> Floats:
     """
     angle_deg = float(angular_separation_deg(view.boresight_lab[None, :], direction(config.ra_deg, config.dec_deg))[0])
     irradiance = float(star_flux_e_s_m2(config.v_mag, *SUN, view.band))
-    point_source_transmittance = transmittance(angle_deg, config.angle_deg, config.pst)
+    point_source_transmittance = float(transmittance(angle_deg, config.angle_deg, config.pst))
     return np.full(len(view.field_rad), irradiance * point_source_transmittance * view.optics.camera.pixel_m**2)
 
 
-def transmittance(angle_deg: float, table_deg: Sequence[float], pst: Sequence[float]) -> float:
-    """Interpolate the logarithm of a table linearly; constant beyond its ends."""
-    return float(np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, MIN_PST)))))
+def transmittance(angle_deg: float | Floats, table_deg: Sequence[float], pst: Sequence[float]) -> Floats:
+    """Interpolate the logarithm of a table linearly; constant beyond its ends. Shape of angle_deg."""
+    return np.asarray(np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, MIN_PST)))))
 
 
 def faint_star_glow(config: FaintStarsGlowConfig, view: ViewingGeometry) -> Floats:

@@ -11,8 +11,8 @@ from skysim.camera.glow.background import pixel_directions, viewing_geometry
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats
 from skysim.scene.sections import layouts, leds, light
-from skysim.sources.dome.display import black_transmission, panel_surface
-from skysim.sources.dome.led import LOBES, full_strength_e_s_sr
+from skysim.sources.dome.display import black_transmission, panel_strength_e_s_sr, panel_surface
+from skysim.sources.dome.led import LOBES
 from skysim.sources.dome.shell.surface import build_surface
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
@@ -61,7 +61,7 @@ def panel_radiance_e_s_m2_sr(config: light.DomeConfig, toward_lab: Floats, camer
     cos_emission = np.where(hits_panel, -toward_lab @ panel.inward(panel.center_m[None])[0], 1.0)
     emitted = LOBES[config.led.lobe.kind](config.led.lobe, cos_emission) / cos_emission
     duty = config.led.drive.duty if isinstance(config.led.drive, leds.RefreshConfig) else 1.0
-    return np.asarray(hits_panel * emitted * duty * full_strength_e_s_sr(config.led, band) / config.layout.pitch_m**2)
+    return np.asarray(hits_panel * emitted * duty * panel_strength_e_s_sr(config.led, band) / config.layout.pitch_m**2)
 
 
 def collimated_radiance_e_s_m2_sr(config: light.CollimatedDisplayConfig, toward_lab: Floats, band: Band) -> Floats:

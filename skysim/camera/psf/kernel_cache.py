@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from skysim.camera.psf import ellipse
 from skysim.camera.psf.kernel import QUANTUM_PX, Kernel, build_kernel
 from skysim.camera.psf.led_disk import DiskImages
-from skysim.camera.psf.otf import NOT_ROUND, WINGED, blur_radius_px, field_sigma_px
+from skysim.camera.psf.otf import NOT_ROUND, WINGED, blur_radius_px, chromatic_sigma_px, field_sigma_px
 from skysim.camera.psf.splat import PER_PX, Singles
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
@@ -74,6 +74,7 @@ def source_kernels(
     cos_field: Floats,
     disks: DiskImages | None = None,
     blur_px: float = 0.0,
+    chromatic: Floats | None = None,
 ) -> Kernels:
     """The kernels of N sources.
 
@@ -84,14 +85,19 @@ def source_kernels(
     cos_field  : (N,) of the angle from the boresight
     disks      : their geometric images, NaN for stars; None draws all disks round
     blur_px    : standard deviation of a blur of all of them
+    chromatic  : (N, 4) as in `Sources`
     Raises InputError for a source too far out of focus.
     """
     position = np.where(np.isnan(xy_px), camera.center_px, xy_px)
     extra = field_sigma_px(camera.psf, camera, position)
     if blur_px:
         extra = np.hypot(extra, blur_px)
+    shift_m: Floats | float = 0.0
+    if chromatic is not None:
+        extra = np.hypot(extra, chromatic_sigma_px(camera, chromatic, position))
+        shift_m = chromatic[:, 0]
     emitter = np.where(is_led, radius_m / distance_m, 0.0) * camera.focal_px
-    blur = blur_radius_px(camera, np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf))
+    blur = blur_radius_px(camera, np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf), shift_m)
     size = np.array([camera.width_px, camera.height_px])
     outside_px = np.maximum(np.maximum(-position, position - size), 0).max(axis=1)
     # Sources far outside the frame have no image.
@@ -125,7 +131,7 @@ def source_kernels(
     # Contiguous: columns of a table would be another array type, for which the renderer is compiled once more.
     kind, sigma, reach, sharp = np.ascontiguousarray(np.array(cache.kernels).reshape(-1, 4)[rows].T)
     spans = np.array(cache.spans, dtype=np.int64).reshape(-1, 4)[rows]
-    if gaussian and (blur_px or camera.psf.corner_sigma_px):
+    if gaussian and (blur_px or camera.psf.corner_sigma_px or chromatic is not None):
         point = kind == GAUSS
         widening = np.hypot(sigma, extra) / np.where(point, sigma, 1)
         sigma, sharp = (np.where(point, a * widening, a) for a in (sigma, sharp))

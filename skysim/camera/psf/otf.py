@@ -8,6 +8,7 @@ to Fourier Optics, ch. 6). Those of the lens are here; `skysim.camera.psf.kernel
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -34,15 +35,17 @@ Otf = NDArray[Any]  # real, or complex where the PSF is not symmetric
 WING_LEVEL = 1e-5  # power-law wings are cut where they fall below this fraction of the peak
 
 
-def blur_radius_px(camera: CameraConfig, distance_m: Any) -> Any:
+def blur_radius_px(camera: CameraConfig, distance_m: Any, focus_shift_m: Any = 0.0) -> Any:
     """Radius of the defocus disk of a point, in pixels, by the thin lens.
 
     The cone from a pupil A to the image at v(u) meets the chip at v0 in a disk of diameter A |v - v0| / v =
     A v0 |1/u - 1/u0|, u0 the distance in focus. This form has no pole and holds for stars (u infinite) as well.
-    distance_m: scalar or array of axial distances, infinity allowed.
+    distance_m    : scalar or array of axial distances, infinity allowed
+    focus_shift_m : of the focal length d for the light's color, which adds d / f^2 to 1/u - 1/u0
     """
     distance = np.asarray(distance_m, dtype=float)
-    diameter_m = camera.pupil_m * camera.image_distance_m * np.abs(1 / distance - 1 / camera.focus_m)
+    color = focus_shift_m / camera.focal_length_m**2
+    diameter_m = camera.pupil_m * camera.image_distance_m * np.abs(1 / distance - 1 / camera.focus_m + color)
     return diameter_m / (2 * camera.pixel_m)
 
 
@@ -50,6 +53,18 @@ def field_sigma_px(psf: Psf, camera: CameraConfig, xy_px: Floats) -> Floats:
     """(...,) extra blur at pixels (..., 2): proportional to the field radius, corner_sigma_px at the far corner."""
     radius_px = np.linalg.norm(xy_px - np.array(camera.center_px), axis=-1)
     return np.asarray(psf.corner_sigma_px * radius_px / camera.corner_px)
+
+
+def chromatic_sigma_px(camera: CameraConfig, chromatic: Floats, xy_px: Floats) -> Floats:
+    """(N,) blur at (N, 2) pixels by the colors within each light, (N, 4) `Sources.chromatic`; as Gaussians.
+
+    The defocus disks of its wavelengths have radii k d, d the shift of focus, and a variance k^2 d^2 / 4 along each
+    axis; that of the mean d is drawn as a disk, and what is missing is k^2 var(d) / 4. Lateral color smears along the
+    radius of the field; half of its variance goes to each axis.
+    """
+    scale_px_m = camera.pupil_m * camera.image_distance_m / (2 * camera.pixel_m * camera.focal_length_m**2)
+    radius = np.linalg.norm(xy_px - np.array(camera.center_px), axis=-1) / camera.corner_px
+    return np.hypot(scale_px_m * chromatic[:, 1] / 2, radius * chromatic[:, 3] / math.sqrt(2))
 
 
 def blur(sigma_px: float, fx: Floats, fy: Floats) -> Floats:

@@ -131,6 +131,7 @@ RULES = (
             *("camera.f_number", "camera.psf", "camera.shutter", *DETECTOR, "tracker.detector", "tracker.centroider"),
             *("tracker.threshold_sigma", "tracker.min_area_px", "light.led.intensity", "light.led.radiant_intensity"),
             *("light.led.pwm_period", "light.led.clock", "light.reflection", "camera.ghosts", "camera.glare"),
+            "camera.chromatic.focus",
         ),
         lambda scene, trial: isinstance(trial, CentroidTrial),
         "a trial of kind centroids has no image: trial.noise_px is the centroids' error",

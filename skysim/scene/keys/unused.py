@@ -95,14 +95,11 @@ def listed_boards(scene: Scene) -> bool:
 
 def dome_draws_nothing(scene: Scene) -> bool:
     """Whether LEDs, their brightness and their pulses are all without anything random."""
-    if (
-        not isinstance(scene.light, DomeConfig)
-        or not steady(scene)
-        or scene.light.led.scatter
-        or scene.light.led.color_scatter_m
-    ):
+    if not isinstance(scene.light, DomeConfig) or not steady(scene):
         return False
-    layout = scene.light.layout
+    led, layout = scene.light.led, scene.light.layout
+    if led.scatter or led.color_scatter_m or (led.aging and led.aging.scatter):
+        return False
     if isinstance(layout, FibersConfig) and layout.radius_variation:
         return False
     points = layout.points if isinstance(layout, FibersConfig | LcdConfig) else layout
@@ -150,6 +147,12 @@ def has_air(scene: Scene) -> bool:
 def seen_from_ground(scene: Scene) -> bool:
     """Whether what is seen depends on the place on the Earth."""
     return has_air(scene) or (seen_from_earth(scene) and scene.site.longitude_deg is not None)
+
+
+def nothing_beside_the_field(scene: Scene) -> bool:
+    """Whether no body and no lit Earth throws stray light."""
+    lit_earth = scene.orbit is not None and scene.orbit.earth is not None
+    return getattr(scene.light, "bodies", None) is None and not lit_earth
 
 
 def seeing_is_narrow(scene: Scene) -> bool:
@@ -237,7 +240,7 @@ RULES = (
         "light.led.drive: {kind: pwm}",
     ),
     Rule(
-        ("light.led.color_scatter",),
+        ("light.led.color_scatter", "light.led.aging.scatter"),
         lambda scene: isinstance(getattr(scene.light, "layout", None), LcdConfig),
         "the pixels of a panel share their light",
         "another light.layout",
@@ -271,6 +274,12 @@ RULES = (
         dome_draws_nothing,
         "nothing of this dome is random",
         "light.led.scatter, pulsed LEDs or a random layout",
+    ),
+    Rule(
+        ("camera.baffle",),
+        nothing_beside_the_field,
+        "neither a body nor the lit Earth is in the scene",
+        "light.bodies or orbit.earth",
     ),
     Rule(
         ("camera.detector.dsnu",),

@@ -51,7 +51,7 @@ class AirConfig(ConfigModel):
     wavelength       : of refraction; the mean of a G2 star's photo-electrons if left out
     extinction_mag   : k' at the zenith in the camera's band;  color_extinction_mag : k''. A star loses
         (k' + k'' (B-V)) mag for each air mass
-    scintillation    : whether stars twinkle, by Young's law
+    scintillation    : whether stars twinkle
     seeing_arcsec    : full width of a star's image at the zenith, half maximum, at a long exposure
     horizon          : the skyline; altitude 0 all around if left out
     glow             : sky, twilight and moonlight; none if left out

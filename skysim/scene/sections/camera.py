@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, field_validator, model_validator
 
 from skysim.core.errors import unknown_name
 from skysim.core.paths import DATA
@@ -114,6 +114,29 @@ class VignettingTableConfig(ConfigModel):
         return self
 
 
+class ChromaticConfig(ConfigModel):
+    """Chromatic aberration: where light of other wavelengths is imaged, linear between them, constant beyond them.
+
+    focus     : axial color: the image distance minus that of the lens's focal length, for a light at infinity
+    corner_px : lateral color: shift away from the principal point at the farthest corner of the chip, proportional to
+        the distance from it
+    """
+
+    wavelength_m: Annotated[tuple[Annotated[Length, Field(ge=200e-9, le=2e-6)], ...], Field(min_length=2)]
+    focus_m: Annotated[tuple[Annotated[Length, Field(ge=-1e-3, le=1e-3)], ...], Field(min_length=2)] | None = None
+    corner_px: Annotated[tuple[Annotated[Number, Field(ge=-100, le=100)], ...], Field(min_length=2)] | None = None
+
+    @model_validator(mode="after")
+    def check_columns(self) -> ChromaticConfig:
+        columns = {"focus": self.focus_m, "corner_px": self.corner_px}
+        for name, column in columns.items():
+            if column is not None:
+                check_table(self.wavelength_m, column, name, "wavelength")
+        if not any(column and any(column) for column in columns.values()):
+            raise ValueError("nothing depends on the wavelength; allowed: focus or corner_px other than 0")
+        return self
+
+
 class GhostConfig(ConfigModel):
     """A ghost of every light: light that a pair of the lens's surfaces reflects back to the chip.
 
@@ -143,6 +166,24 @@ class GlareConfig(ConfigModel):
     share: Annotated[Fraction, Field(gt=0, lt=1)]
     exponent: Annotated[Number, Field(gt=2, le=10)]
     core_px: Annotated[Number, Field(ge=2, le=1000)]
+
+
+class BaffleConfig(ConfigModel):
+    """Point source transmittance (PST) of baffle and lens, by which bodies outside the field light the chip.
+
+    angle_deg, pst : irradiance on the chip over irradiance before the lens, against the angle from the boresight. Its
+        logarithm is linear between the rows; beyond them it is constant. A curve of `transmission` counts in addition
+    """
+
+    angle_deg: Ascending
+    pst: Annotated[tuple[Fraction, ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def check_columns(self) -> BaffleConfig:
+        check_table(self.angle_deg, self.pst, "pst")
+        if not 0 <= self.angle_deg[0] < self.angle_deg[-1] <= 180:
+            raise ValueError("angle_deg: outside of half a circle; allowed: 0 to 180")
+        return self
 
 
 class GlobalShutterConfig(ConfigModel):
@@ -226,6 +267,24 @@ Efficiency = Annotated[
 ]
 
 
+def transmission_tag(value: Any) -> str:
+    """Tag of the kind of transmission: a text that ends in .csv is a curve, all else a number."""
+    return "curve" if isinstance(value, str) and value.endswith(".csv") else "number"
+
+
+def curve_exists(value: str) -> str:
+    if not Path(value).is_file():
+        raise ValueError(f"no file {value!r}; allowed: a CSV file of wavelength_nm and response, or a number to 1")
+    return value
+
+
+Transmission = Annotated[
+    Annotated[Annotated[Number, Field(gt=0, le=1)], Tag("number")]
+    | Annotated[Annotated[str, AfterValidator(curve_exists)], Tag("curve")],
+    Discriminator(transmission_tag),
+]
+
+
 class DetectorConfig(ConfigModel):
     """The chip and its electronics, in the order of the signal path. Each effect's parameter can switch it off.
 
@@ -302,7 +361,10 @@ class DetectorConfig(ConfigModel):
 class CameraConfig(ConfigModel):
     """Lens and chip as the hardware is. What the tracker assumes about them is in `tracker`.
 
-    ghosts, glare : stray light of what is in the field; light from outside is `background` of kind stray
+    transmission  : of the lens: one number for all wavelengths, or a CSV file of wavelength_nm and transmission, 0
+        beyond its ends
+    ghosts, glare : stray light of what is in the field
+    baffle        : stray light of the bodies and of the Earth, where they are at the time; none if left out
     """
 
     width_px: Annotated[int, Field(ge=16, le=20000)]
@@ -311,13 +373,15 @@ class CameraConfig(ConfigModel):
     focal_length_m: Annotated[Length, Field(ge=1e-5, le=1e3)]
     f_number: Annotated[Number, Field(ge=0.3, le=1e6)]
     focus_m: Annotated[float, BeforeValidator(focus_distance, json_schema_input_type=FocusText), Field(gt=0)] = math.inf
-    transmission: Annotated[Number, Field(gt=0, le=1)] = 1.0
+    transmission: Transmission = 1.0
     vignetting: Annotated[TwoStopsConfig | VignettingTableConfig, Field(discriminator="kind")] | None = None
     distortion: tuple[Radial, Radial, Tangential, Tangential, Radial] = (0.0, 0.0, 0.0, 0.0, 0.0)
     principal_point_px: tuple[Number, Number] | None = None
     psf: Psf = GaussianPsfConfig()
+    chromatic: ChromaticConfig | None = None
     ghosts: tuple[GhostConfig, ...] = ()
     glare: GlareConfig | None = None
+    baffle: BaffleConfig | None = None
     shutter: Shutter = GlobalShutterConfig()
     detector: DetectorConfig
 
@@ -331,6 +395,11 @@ class CameraConfig(ConfigModel):
     def pupil_m(self) -> float:
         """Diameter of the entrance pupil."""
         return self.focal_length_m / self.f_number
+
+    @property
+    def gray_transmission(self) -> float:
+        """Transmission of the lens at all wavelengths; 1 where it has a curve, which is in the band (`Band`)."""
+        return 1.0 if isinstance(self.transmission, str) else self.transmission
 
     @property
     def image_distance_m(self) -> float:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
 
+from skysim.core.paths import DATA
 from skysim.core.quantities.tolerance import LengthError, NumberError, Tolerance
 from skysim.core.quantities.units import (
     Ascending,
@@ -17,6 +19,7 @@ from skysim.core.quantities.units import (
     RadiantIntensity,
     Time,
     check_table,
+    with_unit,
 )
 
 
@@ -51,10 +54,25 @@ class DirectConfig(ConfigModel):
     kind: Literal["direct"]
 
 
+class LowPassConfig(ConfigModel):
+    """An RC low-pass filter for each LED, whose light follows the filter's voltage.
+
+    time_constant : R C
+    error         : relative standard deviation of R C from LED to LED, or its tolerance (both parts' together)
+    """
+
+    time_constant_s: Annotated[Time, Field(gt=0)]
+    error: Annotated[NumberError, Field(lt=0.5)] = 0.0
+
+
 class PwmConfig(ConfigModel):
-    """Hardware PWM: lit for its level of every led.pwm_period, each LED with a random phase."""
+    """Hardware PWM: lit for its level of every led.pwm_period, each LED with a random phase.
+
+    filter : turns the pulses into nearly steady light; none if left out
+    """
 
     kind: Literal["pwm"] = "pwm"
+    filter: LowPassConfig | None = None
 
 
 class SequentialConfig(ConfigModel):
@@ -133,15 +151,81 @@ class CyclicCodeConfig(CodeConfig):
 Code = Annotated[PlainCodeConfig | BchCodeConfig | CyclicCodeConfig, Field(discriminator="kind")]
 
 
+class AgingConfig(ConfigModel):
+    """Light lost over the hours of operation: each LED has exp(-a hours) of its light left, a = ln(1 / 0.7) / life
+    (IES TM-21).
+
+    hours      : of operation so far
+    life_hours : L70 of the data sheet, after which 70 % of the light is left
+    scatter    : of a from LED to LED: standard deviation of its logarithm, or its tolerance as a fraction; from the
+        layout's hardware_seed
+    """
+
+    hours: Annotated[Number, Field(gt=0, le=1e6)]
+    life_hours: Annotated[Number, Field(gt=0, le=1e7)]
+    scatter: Annotated[NumberError, Field(lt=1)] = 0.0
+
+    @field_validator("scatter")
+    @classmethod
+    def check_scatter(cls, value: float) -> float:
+        if isinstance(value, Tolerance) and value.half_width >= 1:
+            raise ValueError(f"a tolerance of {value.half_width:g} makes light; allowed: below 1")
+        return value
+
+
+class WarmUpConfig(ConfigModel):
+    """Light lost while the LEDs warm up from the scene's start, when they are switched on.
+
+    steady + (1 - steady) exp(-t / time) is left of the light of cold LEDs, which is that of a pulsed data sheet.
+
+    steady : share that is left when they are warm;  time : in which 63 % of the loss are reached
+    """
+
+    steady: Annotated[Number, Field(gt=0, lt=1)]
+    time_s: Annotated[Time, Field(gt=0)]
+
+
+def spectrum_file(spectrum: str) -> Path:
+    """The file of an LED's spectrum: data/led/white.csv, or a path. Raises ValueError if there is none."""
+    path = DATA / "led" / "white.csv" if spectrum == "white" else Path(spectrum)
+    if not path.is_file():
+        raise ValueError(
+            f"no file {spectrum!r}; allowed: white, a CSV file of wavelength_nm and power, or a wavelength"
+        )
+    return path
+
+
+def spectrum_exists(spectrum: str) -> str:
+    spectrum_file(spectrum)
+    return spectrum
+
+
+def spectrum_tag(value: Any) -> str:
+    """Tag of the kind of spectrum: white or a text that ends in .csv is measured, all else a wavelength."""
+    return "measured" if isinstance(value, str) and (value == "white" or value.endswith(".csv")) else "wavelength"
+
+
+Wavelength = Annotated[
+    Number, with_unit("m", "wavelength", '"630 nm", or white, or a CSV file'), Field(ge=300e-9, le=1100e-9)
+]
+LedSpectrum = Annotated[
+    Annotated[Annotated[str, AfterValidator(spectrum_exists)], Tag("measured")]
+    | Annotated[Wavelength, Tag("wavelength")],
+    Discriminator(spectrum_tag),
+]
+
+
 class LedConfig(ConfigModel):
     """The one LED type of the dome: intensity along its normal, in candela or in watts per steradian.
 
-    spectrum : white (data/led/white.csv), or the peak wavelength of a colored LED
+    spectrum : white (data/led/white.csv) or a CSV file of wavelength_nm and relative power, or the peak wavelength of a
+        colored LED
     fwhm     : width of a colored LED's spectrum at half maximum, a Gaussian in power; a narrow line if left out
     color_scatter : of the peak wavelength from LED to LED, at the same intensity: standard deviation or tolerance (a
         bin); from the layout's hardware_seed
     scatter : of the intensity from LED to LED: standard deviation of its logarithm, or its tolerance as a fraction
         (a bin of ±10 %: {tolerance: 0.1})
+    aging, warm_up : how much light is left of it
     drive : how its level is made; pwm_period belongs to the kind pwm
     clock : the oscillators that time the pulses; every run starts with phases of its own
     code : of the light over frames, by which the tracker knows an LED (`tracker.decoder`); steady if left out
@@ -152,10 +236,12 @@ class LedConfig(ConfigModel):
     disk_diameter_m: Annotated[Length, Field(gt=0, le=0.1)]
     falloff: Literal["inverse_square"] = "inverse_square"
     lobe: Lobe = CosineLobeConfig()
-    spectrum: Literal["white"] | Annotated[Length, Field(ge=300e-9, le=1100e-9)] = "white"
+    spectrum: LedSpectrum = "white"
     fwhm_m: Annotated[Length, Field(ge=3e-9, le=200e-9)] | None = None
     color_scatter_m: Annotated[LengthError, Field(le=30e-9)] = 0.0
     scatter: Annotated[NumberError, Field(lt=0.5)] = 0.0
+    aging: AgingConfig | None = None
+    warm_up: WarmUpConfig | None = None
     drive: Drive = PwmConfig()
     clock: ClockConfig = ClockConfig()
     code: Code | None = None
@@ -169,9 +255,9 @@ class LedConfig(ConfigModel):
 
     @model_validator(mode="after")
     def check_color(self) -> LedConfig:
-        if self.spectrum == "white" and (self.fwhm_m is not None or self.color_scatter_m):
+        if isinstance(self.spectrum, str) and (self.fwhm_m is not None or self.color_scatter_m):
             key = "color_scatter" if self.fwhm_m is None else "fwhm"
-            raise ValueError(f"{key}: a white LED has a spectrum of its own; allowed: a wavelength as spectrum")
+            raise ValueError(f"{key}: {self.spectrum} is a whole spectrum; allowed: a wavelength as spectrum")
         return self
 
     @model_validator(mode="after")

@@ -6,8 +6,11 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from skysim.camera import thermal
 from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.types import Floats
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig, TwoStopsConfig
 from skysim.scene.sections.layouts import FibersConfig, Layout, LcdConfig
@@ -15,12 +18,14 @@ from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import (
     Context,
+    centroid_variance,
     detected_area_px,
     full_scale_e,
     threshold_e,
 )
-from skysim.simulation.checks.expected_error import mismatch
+from skysim.simulation.checks.expected_error import Independent, believed_sigma_px, gains, mismatch
 from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, Samples, cap_margin, fill, short
+from skysim.simulation.checks.views import View
 
 MAX_SATURATED = 0.25  # fraction of saturated lights that gives no warning: a bright star or LED now and then
 TARGET_FILL = 0.7  # of full well, for the light that a fraction MAX_SATURATED exceeds
@@ -52,8 +57,8 @@ def saturation(context: Context, samples: Samples) -> str:
     cures = dimmer(context, factor)
     first, value = next(iter(cures.items()))
     others = "".join(f", or {key} to {other}" for key, other in cures.items() if key != first)
-    if factor < FILTER_BELOW:
-        others += f", or camera.transmission to {short(factor * scene.camera.transmission, 2)}, a gray filter"
+    if factor < FILTER_BELOW and isinstance(transmission := scene.camera.transmission, float):
+        others += f", or camera.transmission to {short(factor * transmission, 2)}, a gray filter"
     return f"{first}: {text} {value}{others}"
 
 
@@ -328,6 +333,42 @@ def unknown_tag_error(context: Context, samples: Samples) -> str:
     )
 
 
+def thermal_drift(context: Context, samples: Samples) -> str:
+    """Warn where dome, mount and lens drift so far that solutions err by more than expected."""
+    thermal_config, frames = context.testbed.scene.thermal, samples.frames
+    if thermal_config is None:
+        return ""
+    at = frames.attitudes
+    turns = [drift_rad(*row, context) for row in zip(frames.used, at.lab_from_body, at.t_s.tolist(), strict=True)]
+    cross_rad = np.hypot(*np.array(turns)[:, :2].T)
+    expected_rad = np.sqrt(frames.error.total("cross"))
+    if not (cross_rad > expected_rad).any():
+        return ""
+    n = int(np.nanargmax(cross_rad))
+    warm_c = thermal.temperature_c(thermal_config, float(at.t_s[n]))
+    return (
+        f"thermal.reference_c: dome, mount and lens turn the solution by {short(cross_rad[n] / ARCSEC_RAD)}″ (cross) at"
+        f" {warm_c:.1f} °C, t = {at.t_s[n]:.1f} s, beside an expected error of"
+        f" {short(float(expected_rad[n]) / ARCSEC_RAD)}″; survey and calibrate nearer to that temperature, or change"
+        " thermal.mount_arcsec_k"
+    )
+
+
+def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context) -> Floats:
+    """(3,) rotation in camera axes by which a solution errs, to first order, after the hardware's drift with the
+    temperature; NaN with too few lights."""
+    testbed, config = context.testbed, context.testbed.scene.thermal
+    assert config is not None
+    hardware = thermal.Hardware(context.beliefs.lights.take(view.row), testbed.mount, context.camera.optics)
+    sources, mount, optics = thermal.at_time(config, hardware, t_s)
+    if len(view) < MIN_LIGHTS:
+        return np.full(3, np.nan)
+    sigma_px = believed_sigma_px(view, Independent(centroid_variance(view, context)), context)
+    camera_m = lab_from_body.apply(mount.camera_body_m)
+    offset_m = (mount.cam_from_body * lab_from_body.inv()).apply(sources.place[:, :3] - sources.place[:, 3:] * camera_m)
+    return np.asarray(np.einsum("nij,nj->i", gains(view, sigma_px), optics.project(offset_m) - view.xy_px))
+
+
 FINDINGS: tuple[Callable[[Context, Samples], str], ...] = (
     bright_background,
     saturation,
@@ -339,4 +380,5 @@ FINDINGS: tuple[Callable[[Context, Samples], str], ...] = (
     long_smear,
     not_where_expected,
     unknown_tag_error,
+    thermal_drift,
 )

@@ -13,16 +13,16 @@ from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, context_of, usable
-from skysim.simulation.checks.dome import assumptions, lookalike
+from skysim.simulation.checks.dome import assumptions, lookalike, reflections
 from skysim.simulation.checks.expected_error import expected
 from skysim.simulation.checks.facts import FACTS, Fact, Sampled, Samples
 from skysim.simulation.checks.findings import FINDINGS
-from skysim.simulation.checks.sky import bodies, claims, depth
+from skysim.simulation.checks.sky import air, bodies, claims, depth, stray
 from skysim.simulation.checks.views import views
 from skysim.simulation.reference_limits import check_reference
 from skysim.simulation.testbed import Testbed
 
-SKY_FINDINGS = (depth.sky_too_shallow, depth.tracker_too_shallow, claims.floor_too_small)
+SKY_FINDINGS = (depth.sky_too_shallow, depth.tracker_too_shallow, claims.floor_too_small, air.refraction)
 
 
 class Check(NamedTuple):
@@ -60,8 +60,11 @@ def check(testbed: Testbed, tilt_deg: float | None = None, rate_body_rad_s: Floa
     facts = [
         fact for build in (*FACTS, depth.faintest_star, claims.fact) if (fact := build(context, samples)) is not None
     ]
-    findings = [line for find in (*FINDINGS, *SKY_FINDINGS) if (line := find(context, samples))]
-    findings += bodies.bodies_near(context, samples)
+    findings = [
+        line for find in (*FINDINGS, *SKY_FINDINGS, reflections.mirror_images) if (line := find(context, samples))
+    ]
+    for finder in (bodies.bodies_near, stray.stray_light, stray.exclusion):
+        findings += finder(context, samples)
     alike = lookalike.of(context, samples)
     if alike is not None and isinstance(scene.light, DomeConfig):
         facts.insert(2, lookalike.fact(alike))

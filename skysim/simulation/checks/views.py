@@ -28,12 +28,13 @@ from skysim.camera.glow import background
 from skysim.camera.glow.air_glow import sky_light
 from skysim.camera.optics import Optics
 from skysim.camera.psf.kernel import build_kernel
-from skysim.camera.psf.otf import blur_radius_px, field_sigma_px
+from skysim.camera.psf.otf import blur_radius_px, chromatic_sigma_px, field_sigma_px
 from skysim.camera.render import Poses, project
 from skysim.core.types import Floats, Sources
 from skysim.dynamics import multibody
 from skysim.simulation.checks.attitudes import Attitudes
-from skysim.simulation.testbed import Testbed, sky_during
+from skysim.simulation.exposure import stray_light_e_s
+from skysim.simulation.testbed import Testbed, bodies_during, sky_during
 from skysim.sources.dome.led import irradiance_e_s_m2
 
 STEP = 1e-6  # relative displacement of a light, for the numerical derivative of its image
@@ -103,6 +104,7 @@ class CameraModel(NamedTuple):
     optics       : lens and chip geometry
     lens_px      : standard deviation of the Gaussian that has the peak of the lens's image, pixel included
     background_e : mean electrons in a pixel, of extended light and dark current
+    stray_e      : of them those that come past the baffle
     noise_e      : standard deviation of a pixel without light: of that charge, of the read-out, of the converter, and
                    of the fixed pattern (without hot pixels)
     exposure_s   : exposure time
@@ -111,6 +113,7 @@ class CameraModel(NamedTuple):
     optics: Optics
     lens_px: float
     background_e: float
+    stray_e: float
     noise_e: float
     exposure_s: float
 
@@ -119,15 +122,18 @@ class CameraModel(NamedTuple):
         """The camera of a test bed, with the background at its initial attitude."""
         camera, detector = testbed.scene.camera, testbed.scene.camera.detector
         cam_from_lab = testbed.mount.cam_from_body * testbed.trajectory.lab_from_body[0].inv()
-        glows, lit = testbed.scene.background, sky_light(sky_during(testbed, testbed.scene.exposure.first_s))
-        glow_e_s = float(background.glow_map(glows, testbed.optics, cam_from_lab, testbed.band, lit).mean())
+        first_s, glows = testbed.scene.exposure.first_s, testbed.scene.background
+        lit = sky_light(sky_during(testbed, first_s))
+        stray_e_s = sum(stray_light_e_s(testbed, bodies_during(testbed, first_s), cam_from_lab, first_s).values())
+        glow_e_s = float(background.glow_map(glows, testbed.optics, cam_from_lab, testbed.band, lit).mean()) + stray_e_s
         dark_e_s = detector.dark_e_s * 2.0**detector.doublings
         background_e = (glow_e_s + dark_e_s) * testbed.scene.exposure.time_s
         pattern_e2 = (detector.dsnu * dark_e_s * testbed.scene.exposure.time_s) ** 2 + detector.column_offset_e**2
         read_e2 = detector.read_noise_e**2 + detector.reset_noise_e**2 + detector.gain_e_dn**2 / 12 + pattern_e2
         lens_px = float(1 / np.sqrt(2 * np.pi * build_kernel(camera.psf, camera).peak))
         noise_e = float(np.sqrt(background_e + read_e2))
-        return cls(testbed.optics, lens_px, background_e, noise_e, testbed.scene.exposure.time_s)
+        exposure_s = testbed.scene.exposure.time_s
+        return cls(testbed.optics, lens_px, background_e, stray_e_s * exposure_s, noise_e, exposure_s)
 
 
 def views(testbed: Testbed, lights: Sources, attitudes: Attitudes, camera: CameraModel) -> list[View]:
@@ -180,8 +186,12 @@ def view(
     )
     depth_m = np.where(is_led, offset_m[:, 2], np.inf)
     disk_px = np.where(is_led, optics.camera.focal_px * chosen.radius_m / distance_m, 0.0)
-    defocus_px = blur_radius_px(optics.camera, depth_m)
     lens2_px2 = camera.lens_px**2 + field_sigma_px(optics.camera.psf, optics.camera, xy_px) ** 2
+    shift_m: Floats | float = 0.0
+    if chosen.chromatic is not None:
+        shift_m = chosen.chromatic[:, 0]
+        lens2_px2 = lens2_px2 + chromatic_sigma_px(optics.camera, chosen.chromatic, xy_px) ** 2
+    defocus_px = blur_radius_px(optics.camera, depth_m, shift_m)
     share = peak_share(lens2_px2, disk_px, defocus_px, np.linalg.norm(streak_px, axis=1))
     sigma_px = np.sqrt(lens2_px2 + (disk_px**2 + defocus_px**2) / 4)
     return View(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.air import AirConfig, HorizonConfig
 from skysim.scene.sections.vehicle import SiteConfig
-from skysim.sources.air import starlight
+from skysim.sources.air import scintillation, starlight
 from skysim.sources.air.refraction import Refraction, Weather, standard_pressure_hpa, standard_temperature_c
 from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import SUN, Band, black_body_v0, complete_colors, temperature_k
@@ -29,6 +29,7 @@ class Air:
     site       : with a longitude
     refraction : for its weather and the camera's band
     star_id, b_v : (N,) ascending numbers of the catalog's stars, and their colors
+    wavelength_m : of scintillation: the mean of a G2 star's photo-electrons
     """
 
     config: AirConfig
@@ -36,13 +37,15 @@ class Air:
     refraction: Refraction
     star_id: NDArray[np.int64]
     b_v: Floats
+    wavelength_m: float
 
     @classmethod
     def from_config(cls, config: AirConfig, site: SiteConfig, stars: Catalog, band: Band) -> Air:
         """The air over a site for a catalog's stars and a chip's band."""
         order = np.argsort(stars.hip)
         b_v = complete_colors(stars.b_v, stars.v_i)[0][order]
-        return cls(config, site, Refraction(weather_of(config, site, band)), stars.hip[order], b_v)
+        refraction = Refraction(weather_of(config, site, band))
+        return cls(config, site, refraction, stars.hip[order], b_v, mean_wavelength_m(band))
 
     def at(self, time: datetime.datetime) -> Sky:
         """The sky at a time."""
@@ -96,9 +99,10 @@ class Sky:
 
     def twinkling(self, seen: Sources, aperture_m: float, exposure_s: float, rng: np.random.Generator) -> Sources:
         """The stars of `stars_seen` with the scintillation of one exposure through an aperture of this diameter."""
-        air_masses, height_m = self.air_mass(seen.place[:, :3]), self.air.site.height_m
-        variance = starlight.scintillation_variance(air_masses, aperture_m, exposure_s, height_m)
-        return replace(seen, strength=seen.strength * starlight.scintillation(variance, rng))
+        air_masses = self.air_mass(seen.place[:, :3])
+        optics = aperture_m, exposure_s, self.air.site.height_m, self.air.wavelength_m
+        variances = scintillation.variance(air_masses, *optics)
+        return replace(seen, strength=seen.strength * scintillation.factors(variances, rng))
 
     def body_seen(self, body: BodyLight) -> BodyLight:
         """A body raised and dimmed; its disc stays round, and does not twinkle."""

@@ -20,9 +20,16 @@ from skysim.core.types import Floats, Sources
 from skysim.scene.sections import layouts, leds, light
 from skysim.sources import stars as star_sources
 from skysim.sources.catalog import Catalog
-from skysim.sources.dome.led import DRIVES, DriveInput, full_strength_e_s_sr, strength_factors
+from skysim.sources.dome.led import (
+    DRIVES,
+    DriveInput,
+    aging_factors,
+    chromatic_of,
+    full_strength_e_s_sr,
+    strength_factors,
+)
 from skysim.sources.dome.shell.surface import Plane
-from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
+from skysim.sources.photometry import SUN, Band, star_chromatic, star_flux_e_s_m2
 
 SHELL_STREAM = 2  # spawn key of the shell's own random stream, which leaves the fibers' places unchanged
 
@@ -116,8 +123,14 @@ def panel_surface(config: layouts.LcdConfig, surface: Any) -> Plane:
 
 
 def ideal_led(led: leds.LedConfig) -> leds.LedConfig:
-    """The LED on direct current without scatter: its strength is the level that a layout assigns to a star."""
-    return led.model_copy(update={"drive": leds.DirectConfig(kind="direct"), "scatter": 0.0})
+    """The LED as new, on direct current, without scatter: its strength is the level that a layout assigns to a star."""
+    ideal = {"drive": leds.DirectConfig(kind="direct"), "scatter": 0.0, "color_scatter_m": 0.0, "aging": None}
+    return led.model_copy(update=ideal)
+
+
+def panel_strength_e_s_sr(led: leds.LedConfig, band: Band) -> float:
+    """Strength of a white pixel of a panel, whose backlight ages as one."""
+    return full_strength_e_s_sr(led, band) * float(aging_factors(led.aging, np.zeros(1))[0])
 
 
 def panel_sources(config: layouts.LcdConfig, panel: Plane, led: leds.LedConfig, band: Band, stars: Sources) -> Sources:
@@ -150,12 +163,13 @@ def panel_sources(config: layouts.LcdConfig, panel: Plane, led: leds.LedConfig, 
         place=np.column_stack([place_m, np.ones(count)]),
         normal=panel.inward(place_m),
         radius_m=np.full(count, config.block * led.disk_diameter_m / 2),
-        strength=full_strength_e_s_sr(led, band) * config.block**2 * scatter * pulses.strength,
+        strength=panel_strength_e_s_sr(led, band) * config.block**2 * scatter * pulses.strength,
         period_s=pulses.period_s,
         start_s=pulses.start_s,
         on_s=pulses.on_s,
         clock=pulses.clock,
         magnitude=stars.magnitude[blocks.star],
+        chromatic=chromatic_of(led, band, np.zeros(count)),
     )
 
 
@@ -197,7 +211,9 @@ def display_sources(
         )
     beam = np.column_stack([blocks.center_px * config.pitch_m, np.full(len(blocks.star), config.focal_length_m)])
     white_e_s_m2 = float(star_flux_e_s_m2(config.brightest_mag, *SUN, band))
-    return beam_sources(config, beam, white_e_s_m2 * blocks.level, stars.take(blocks.star))
+    beams = beam_sources(config, beam, white_e_s_m2 * blocks.level, stars.take(blocks.star))
+    b_v, v_i = (np.full(len(beam), color) for color in SUN)
+    return dataclasses.replace(beams, chromatic=star_chromatic(b_v, v_i, band))
 
 
 def beam_sources(config: light.CollimatedDisplayConfig, beam: Floats, flux_e_s_m2: Floats, stars: Catalog) -> Sources:

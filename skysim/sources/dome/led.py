@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import ceil, floor, sqrt
+from math import ceil, exp, floor, log, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,15 +18,18 @@ from skysim.core.jit import jit
 from skysim.core.quantities.tolerance import Tolerance, scaled_errors
 from skysim.core.types import Floats
 from skysim.scene.sections.leds import (
+    AgingConfig,
     CosineLobeConfig,
     LedConfig,
     Lobe,
     LobeTableConfig,
     RefreshConfig,
     SequentialConfig,
+    WarmUpConfig,
 )
-from skysim.sources.photometry import Band, led_strength_e_s_sr, radiant_strength_e_s_sr
+from skysim.sources.photometry import Band, led_chromatic, led_strength_e_s_sr, radiant_strength_e_s_sr
 
+LIFE_SHARE = 0.7  # of its light that is left of an LED at the end of its life, L70
 COLORS = 129  # wavelengths at which a colored LED's strength is computed
 Falloff = Callable[[Floats], Floats]
 
@@ -102,11 +105,27 @@ def color_factors(led: LedConfig, band: Band, normal: Floats) -> Floats:
 
     They are interpolated between COLORS wavelengths.
     """
-    assert not isinstance(led.spectrum, str)
-    peak_m = led.spectrum + scaled_errors(led.color_scatter_m, normal)
-    grid_m = np.linspace(peak_m.min(), peak_m.max(), COLORS)
+    peak_m, grid_m = peaks_m(led, normal)
     strengths = [full_strength_e_s_sr(led.model_copy(update={"spectrum": one}), band) for one in grid_m.tolist()]
     return np.interp(peak_m, grid_m, strengths) / full_strength_e_s_sr(led, band)
+
+
+def peaks_m(led: LedConfig, normal: Floats) -> tuple[Floats, Floats]:
+    """(N,) peak wavelengths of LEDs, from standard normal numbers, and COLORS ones from the least to the greatest."""
+    assert not isinstance(led.spectrum, str)
+    peak_m = led.spectrum + scaled_errors(led.color_scatter_m, normal)
+    return peak_m, np.linspace(peak_m.min(), peak_m.max(), COLORS)
+
+
+def chromatic_of(led: LedConfig, band: Band, normal: Floats) -> Floats | None:
+    """(N, 4) `Sources.chromatic` of LEDs, from the numbers of `color_factors`; None for a lens without aberration."""
+    if band.chromatic is None:
+        return None
+    if not led.color_scatter_m:
+        return np.tile(led_chromatic(led.spectrum, band, led.fwhm_m), (len(normal), 1))
+    peak_m, grid_m = peaks_m(led, normal)
+    table = np.array([led_chromatic(one, band, led.fwhm_m) for one in grid_m.tolist()])
+    return np.column_stack([np.interp(peak_m, grid_m, column) for column in table.T])
 
 
 def strength_factors(scatter: float, normal: Floats) -> Floats:
@@ -116,6 +135,24 @@ def strength_factors(scatter: float, normal: Floats) -> Floats:
     tolerance, 1 plus an error as the tolerance says.
     """
     return 1 + scaled_errors(scatter, normal) if isinstance(scatter, Tolerance) else np.exp(scatter * normal)
+
+
+def aging_factors(aging: AgingConfig | None, normal: Floats) -> Floats:
+    """Light left of LEDs after their hours of operation, from standard normal numbers: exp(-a t) (IES TM-21, eq. 1).
+
+    a = ln(1 / 0.7) / L70, times the scatter of the rates; the projection's constant B is 1.
+    """
+    if aging is None:
+        return np.ones(len(normal))
+    nominal = aging.hours / aging.life_hours * log(1 / LIFE_SHARE)
+    return np.exp(-nominal * strength_factors(aging.scatter, normal))
+
+
+def warm_up_factor(warm_up: WarmUpConfig | None, t_s: float) -> float:
+    """Light left of all LEDs t_s after they were switched on, over that of the cold ones."""
+    if warm_up is None:
+        return 1.0
+    return warm_up.steady + (1 - warm_up.steady) * exp(-t_s / warm_up.time_s)
 
 
 class DriveInput(NamedTuple):

@@ -17,7 +17,7 @@ from skysim.scene.sections.orbit import RandomSatellitesConfig
 from skysim.sources.orbit.earth import hidden_by_earth, sun_m, sunlit_fraction, to_astronomical
 from skysim.sources.orbit.elements import Elements, gcrs_states
 from skysim.sources.photometry import Band
-from skysim.sources.solar_system.colors import WHITE, reflected_flux_e_s_m2
+from skysim.sources.solar_system.colors import WHITE, reflected_chromatic, reflected_flux_e_s_m2
 from skysim.sources.solar_system.observer import GcrsState, tt_jd
 from skysim.sources.stars import steady_points
 
@@ -170,5 +170,7 @@ def as_sources(lights: Sequence[MovingLight], band: Band) -> Sources:
     v_mag = np.array([light.truth.v_mag for light in lights])
     flux = np.array([reflected_flux_e_s_m2(one, WHITE, band) for one in v_mag])
     ids: NDArray[np.int64] = np.array([light.truth.id for light in lights], np.int64)
-    points = steady_points(ids, np.array([light.place for light in lights]), flux, v_mag)
+    colors = reflected_chromatic(WHITE, band)
+    chromatic = None if colors is None else np.tile(colors, (len(lights), 1))
+    points = steady_points(ids, np.array([light.place for light in lights]), flux, v_mag, chromatic)
     return replace(points, motion=np.array([light.motion for light in lights]))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from skysim.core.types import BodyTruth, Floats
 from skysim.scene.sections.light import BodiesConfig
 from skysim.sources.photometry import Band
-from skysim.sources.solar_system.colors import ALBEDO, reflected_flux_e_s_m2
+from skysim.sources.solar_system.colors import ALBEDO, reflected_chromatic, reflected_flux_e_s_m2
 from skysim.sources.solar_system.discs import LAMBERT, LIMB_DARKENED, LOMMEL_SEELIGER, Surface
 from skysim.sources.solar_system.magnitudes import earthshine_fraction, magnitude
 from skysim.sources.solar_system.observer import Observer
@@ -54,6 +54,7 @@ class BodyLight:
     """One body in the sky, in the lab's axes (the ICRS).
 
     radius_rad : of its disc;  flux_e_s_m2 : photo-electrons at the aperture;  earthshine : see `Surface`
+    chromatic  : (4,) a row of `Sources.chromatic`
     """
 
     name: str
@@ -62,6 +63,7 @@ class BodyLight:
     radius_rad: float
     flux_e_s_m2: float
     earthshine: float = 0.0
+    chromatic: Floats | None = None
 
     @property
     def id(self) -> int:
@@ -114,4 +116,5 @@ def body_light(name: str, at: Place, tt_jd: float, band: Band) -> BodyLight:
     earthshine = earthshine_fraction(at) if name == "moon" else 0.0
     flux = reflected_flux_e_s_m2(v_mag, ALBEDO[name], band)
     radius_rad = float(np.arcsin(body.radius_km / at.distance_km))
-    return BodyLight(name, at, v_mag, radius_rad, flux * (1 + earthshine), earthshine)
+    colors = reflected_chromatic(ALBEDO[name], band)
+    return BodyLight(name, at, v_mag, radius_rad, flux * (1 + earthshine), earthshine, colors)

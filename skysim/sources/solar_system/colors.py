@@ -9,7 +9,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from skysim.sources.photometry import SUN, Band, black_body_v0, temperature_k
+from skysim.core.types import Floats
+from skysim.sources.photometry import SUN, Band, black_body_v0, chromatic_moments, temperature_k
 
 Albedo = tuple[float, float, float, float]
 
@@ -47,9 +48,18 @@ def reflected_flux_e_s_m2(v_mag: float, albedo: Albedo, band: Band) -> float:
 
 @lru_cache(maxsize=64)
 def _flux_v0_e_s_m2(albedo: Albedo, band: Band) -> float:
-    sun_k, relative = temperature_k(*SUN), np.array(albedo) / albedo[1]
-    return float(
-        band.integral(
-            lambda wavelength_m: black_body_v0(wavelength_m, sun_k) * np.interp(wavelength_m, BANDS_M, relative)
-        )
-    )
+    return float(band.integral(lambda wavelength_m: reflected_v0(wavelength_m, albedo)))
+
+
+def reflected_v0(wavelength_m: Floats, albedo: Albedo) -> Floats:
+    """Spectral photon flux of a body of V = 0, as `black_body_v0`."""
+    relative = np.array(albedo) / albedo[1]
+    return np.asarray(black_body_v0(wavelength_m, temperature_k(*SUN)) * np.interp(wavelength_m, BANDS_M, relative))
+
+
+@lru_cache(maxsize=64)
+def reflected_chromatic(albedo: Albedo, band: Band) -> Floats | None:
+    """(4,) `chromatic_moments` of a body; None for a lens without chromatic aberration."""
+    if band.chromatic is None:
+        return None
+    return chromatic_moments(band, lambda wavelength_m: reflected_v0(wavelength_m, albedo))

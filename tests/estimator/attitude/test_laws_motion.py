@@ -145,6 +145,18 @@ def test_attitude_and_rate_are_found_together(rng: np.random.Generator) -> None:
     assert answered(lambda: rolling.fit(CAMERA, few[0], few[1], lever, (start, np.zeros(3)), ANYTHING)) is None
 
 
+@pytest.mark.parametrize("seed", range(230, 240))
+def test_a_light_at_the_limit_of_the_outliers_does_not_keep_the_fit_from_its_end(seed: int) -> None:
+    """Errors with long tails: in 234 a light is an outlier with every second step, for ever."""
+    rng = np.random.default_rng([23, seed])
+    seen = moving(rng, np.radians(rng.normal(0, 1, 3)), 12)
+    found = seen.centroids(rng)
+    found = replace(found, xy_px=found.xy_px + 1.5 * found.sigma_px[:, None] * rng.standard_t(2, (12, 2)))
+    start = seen.cam_from_ref, seen.rate_rad_s
+    fit = rolling.fit(CAMERA, found, seen.place_ref, np.zeros(3), start, ANYTHING)
+    assert (fit.cam_from_ref * seen.cam_from_ref.inv()).magnitude() < 100 * found.sigma_px.max() / CAMERA.focal_px
+
+
 @law(rolling.rate_covariance_rad2)
 @given(rng=SEEDS)
 def test_an_error_of_the_rate_turns_the_attitude(rng: np.random.Generator) -> None:

@@ -141,6 +141,12 @@ def test_an_option_that_has_an_effect_at_another_factor_s_level_is_allowed(order
             {"motion.jitter": [{"kind": "line", "frequency_hz": 9, "rms_arcsec": [9, 9, 9]}]},
         ),
         ("shefex2", "{kind: centroids}", {}, {"camera.detector.read_noise_e": 90, "exposure.time": "3 ms"}),
+        (
+            "shefex2",
+            "{kind: centroids}",
+            {"camera.chromatic": {"wavelength": ["500 nm", "600 nm"], "corner_px": [0, 1]}},
+            {"camera.chromatic.focus": ["0 um", "9 um"]},
+        ),
         ("afit_simsat", CENTROIDS, {}, {"light.led.intensity": "1 mcd", "camera.psf": {"kind": "gaussian"}}),
     ],
 )

@@ -44,7 +44,7 @@ def shell_scene(radius_variation: float, seed: int) -> Scene:
 def fibers(scene: Scene, testbed: Testbed) -> tuple[Sources, Floats]:
     """The true fibers of a shell, and their (N, 3) positions on a perfect sphere."""
     assert isinstance(scene.light, DomeConfig)
-    true = dome.sources(scene.light, Band.from_efficiency(scene.camera.detector.quantum_efficiency))
+    true = dome.sources(scene.light, Band.from_camera(scene.camera))
     perfect_light = with_config(scene.light, "layout", radius_variation=0.0)
     return true, dome.sources(perfect_light, testbed.band).place[:, :3]
 

@@ -39,7 +39,12 @@ ROWS, ANGLES = ("1", "2", "3", "4"), ("ra", "dec", "roll")
 ATTEMPTS = 18
 # Table 2: right ascension, declination, roll, deg.
 TABLE_2 = published_values("ptase-table-2", *(f"{angle}_{row}" for row in ROWS for angle in ANGLES)).reshape(-1, 3)
-DARK_SKY = {"background": "[{kind: sky, mag_arcsec2: 21}]"}  # "very clear and dark"
+# "Very clear and dark": the air of the place and the Moon of the date, at its first quarter, 62 to 66 degrees high.
+NIGHT = {
+    "background": "[]",
+    "site": f"{{latitude_deg: {SITE_DEG[0]}, longitude_deg: {SITE_DEG[1]}, height: 600 m}}",
+    "light.air": "{glow: {dark_mag_arcsec2: 21}}",
+}
 FITTED_DECENTERING = 0.0018  # sqrt(p1^2 + p2^2), uncalibrated: about 0.4 px at the detector's corner
 FITTED_JITTER = "[{kind: line, frequency_hz: 1, rms_arcsec: [22, 22, 22]}]"  # a vibrating floor
 
@@ -102,13 +107,13 @@ def uncalibrated_overrides(direction_rad: float) -> dict[str, str]:
 
 def photograph_and_solve(overrides: dict[str, str], local: list[datetime.datetime], seed: int) -> FrameSolutions:
     """Render and solve a frame at each time from the Earth-fixed camera."""
-    testbed = build_testbed(loader.load("ptase_2003", DARK_SKY | overrides))
+    testbed = build_testbed(loader.load("ptase_2003", NIGHT | overrides))
     tracker, tripod = build_tracker(testbed), cam_from_itrs()
     estimated_deg, true_deg = np.full((len(local), 3), np.nan), np.empty((len(local), 3))
     error_rad = np.full(len(local), np.nan)
     for n, time in enumerate(local):
         cam_from_icrs = tripod * itrs_from_icrs(time)
-        testbed_at_time = earth_fixed(testbed.in_run(seed + n), cam_from_icrs)
+        testbed_at_time = earth_fixed(at_time(testbed.in_run(seed + n), time), cam_from_icrs)
         frame, _ = exposure.render_frame(testbed_at_time, 0)
         solution = factory.solve_frame(tracker, frame).attitude
         true_deg[n] = paper_angles_deg(cam_from_icrs)
@@ -116,6 +121,11 @@ def photograph_and_solve(overrides: dict[str, str], local: list[datetime.datetim
             estimated_deg[n] = paper_angles_deg(solution.cam_from_ref)
             error_rad[n] = (solution.cam_from_ref * cam_from_icrs.inv()).magnitude()
     return FrameSolutions(local, estimated_deg, true_deg, error_rad)
+
+
+def at_time(testbed: Testbed, local: datetime.datetime) -> Testbed:
+    """The test bed under the air and the Moon of a local time."""
+    return replace(testbed, scene=testbed.scene.model_copy(update={"start_time": local + UTC_LESS_LOCAL}))
 
 
 def earth_fixed(testbed: Testbed, cam_from_icrs: Rotation) -> Testbed:

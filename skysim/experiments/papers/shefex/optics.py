@@ -62,7 +62,7 @@ def field_deg(camera: Camera) -> tuple[float, float, float]:
 @cache
 def ground_testbed() -> Testbed:
     """The camera below an atmosphere that absorbs 30 %."""
-    transmission = 0.7 * shefex_testbed().scene.camera.transmission
+    transmission = 0.7 * shefex_testbed().scene.camera.gray_transmission
     return build_testbed(load("shefex2", {"camera.transmission": str(transmission)}))
 
 

@@ -35,8 +35,8 @@ def bodies_near(context: Context, samples: Samples) -> Iterator[str]:
         far = f"{math.degrees(off_rad):.1f}° from the boresight at {where}"
         if in_field(cam_from_lab[n].apply(body.place.direction), body.radius_rad, testbed.scene.camera):
             yield f"{what} is in the field, {far}: {short(peak_fill(context, body), 2)} times saturation"
-        elif off_rad < math.radians(NEAR_DEG.get(name, 0.0)):
-            yield f"{what} is {far}; its stray light is not drawn: add a background of kind stray"
+        elif testbed.scene.camera.baffle is None and off_rad < math.radians(NEAR_DEG.get(name, 0.0)):
+            yield f"{what} is {far}; its stray light is not drawn: add camera.baffle, or a background of kind stray"
 
 
 def in_field(direction_cam: Floats, radius_rad: float, camera: CameraConfig) -> bool:

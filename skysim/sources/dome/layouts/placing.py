@@ -14,7 +14,15 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import HOLES, LitConfig
 from skysim.scene.sections.leds import LedConfig
-from skysim.sources.dome.led import DRIVES, DriveInput, color_factors, full_strength_e_s_sr, strength_factors
+from skysim.sources.dome.led import (
+    DRIVES,
+    DriveInput,
+    aging_factors,
+    chromatic_of,
+    color_factors,
+    full_strength_e_s_sr,
+    strength_factors,
+)
 from skysim.sources.dome.shell.surface import Surface
 from skysim.sources.photometry import Band
 
@@ -49,8 +57,12 @@ def led_sources(placed: PlacedLeds, led: LedConfig, band: Band, rng: np.random.G
     scatter = strength_factors(led.scatter, rng.standard_normal(count))
     strength = full_strength_e_s_sr(led, band) * scatter
     pulses = DRIVES[led.drive.kind](led, DriveInput(placed.level, placed.id // HOLES), rng)
+    color = np.zeros(count)
     if led.color_scatter_m:  # drawn last, so that all else is the same without it
-        strength = strength * color_factors(led, band, rng.standard_normal(count))
+        color = rng.standard_normal(count)
+        strength = strength * color_factors(led, band, color)
+    if led.aging:
+        strength = strength * aging_factors(led.aging, rng.standard_normal(count))
     return Sources(
         id=placed.id,
         place=np.column_stack([placed.place_m, np.ones(count)]),
@@ -62,6 +74,7 @@ def led_sources(placed: PlacedLeds, led: LedConfig, band: Band, rng: np.random.G
         on_s=pulses.on_s,
         clock=pulses.clock,
         magnitude=placed.magnitude,
+        chromatic=chromatic_of(led, band, color),
     )
 
 

@@ -7,6 +7,11 @@ and flicker averages out over frames as in a laboratory. A controller's time is
 
 with its frequency offset y (of the hardware), its drift d and the time tau_0 since it was switched on (of the run);
 this is the usual model of an oscillator over minutes (Riley 2008, NIST SP 1065, section 3.1), without its noise.
+
+A low-pass filter (`filter` of the drive pwm) smooths the pulses u(t), 0 or 1: its voltage has RC V' = u - V, so that
+its mean over an exposure is the pulses' minus RC (V(end) - V(begin)) / (end - begin). In the steady state, at the time
+s after a pulse's beginning, V = 1 - (1 - V0) exp(-s / RC) while it lasts, for `on` of the period T, and decays by
+exp(-(s - on) / RC) afterwards, with V0 = (exp(-(T - on) / RC) - exp(-T / RC)) / (1 - exp(-T / RC)).
 """
 
 from __future__ import annotations
@@ -19,11 +24,12 @@ from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import LED_CLOCKS, random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import FibersConfig, Layout, LcdConfig
-from skysim.scene.sections.leds import ClockConfig, DirectConfig
+from skysim.scene.sections.leds import ClockConfig, DirectConfig, PwmConfig
 from skysim.scene.sections.light import DomeConfig, Light
 
 LONGEST_ON_S = 3600.0  # a controller was switched on up to so long before the run; many times any period
 PPM = 1e-6
+FILTER_STREAM = 4  # spawn key, under the hardware's seed, of the filters' errors
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +39,13 @@ class Clocks:
     on_s    : tau_0, controller's time at t = 0
     offset  : y, relative frequency offset at t = 0
     drift_s : d, change of the relative frequency per second
+    filter_s : (N,) time constants of the LEDs' low-pass filters; None without them
     """
 
     on_s: Floats
     offset: Floats
     drift_s: Floats
+    filter_s: Floats | None = None
 
     @classmethod
     def draw(cls, config: ClockConfig, count: int, hardware_seed: int, seed: int, stream: int = LED_CLOCKS) -> Clocks:
@@ -47,6 +55,17 @@ class Clocks:
         on_s = rng.uniform(0, LONGEST_ON_S, count)
         drift_ppm_h = scaled_errors(config.drift_ppm_h, rng.standard_normal(count))
         return cls(on_s, PPM * offset_ppm, PPM / 3600 * drift_ppm_h)
+
+    def lights_at(self, sources: Sources, t_s: float, exposure_s: float) -> Sources:
+        """The sources with their pulse trains about t_s, or as their filters smooth them over an exposure about it.
+
+        In a rolling shutter the ripple that a filter leaves is that of the middle row's exposure.
+        """
+        pulses = self.pulses_at(sources, t_s)
+        if self.filter_s is None:
+            return pulses
+        share = filtered_share(pulses, self.filter_s, t_s - exposure_s / 2, t_s + exposure_s / 2)
+        return replace(pulses, strength=share * pulses.strength, on_s=pulses.period_s)
 
     def pulses_at(self, sources: Sources, t_s: float) -> Sources:
         """The sources with their pulse trains in the run's time, about t_s.
@@ -64,11 +83,33 @@ class Clocks:
         )
 
 
+def filtered_share(pulses: Sources, filter_s: Floats, begin_s: float, end_s: float) -> Floats:
+    """(N,) mean of the filters' voltages, 1 if always on, from begin to end."""
+    period_s, on_s = pulses.period_s, np.minimum(pulses.on_s, pulses.period_s)
+    rise = np.exp(-(period_s - on_s) / filter_s)
+    first = (rise - np.exp(-period_s / filter_s)) / -np.expm1(-period_s / filter_s)
+
+    def lit_s_and_voltage(t_s: float) -> tuple[Floats, Floats]:
+        cycles, since_s = np.divmod(t_s - pulses.start_s, period_s)
+        lit_s = np.minimum(since_s, on_s)
+        voltage = (1 - (1 - first) * np.exp(-lit_s / filter_s)) * np.exp((lit_s - since_s) / filter_s)
+        return cycles * on_s + lit_s, voltage
+
+    (lit0_s, voltage0), (lit1_s, voltage1) = lit_s_and_voltage(begin_s), lit_s_and_voltage(end_s)
+    return np.asarray((lit1_s - lit0_s - filter_s * (voltage1 - voltage0)) / (end_s - begin_s))
+
+
 def build_clocks(light: Light, sources: Sources, seed: int) -> Clocks | None:
     """The clocks of a dome's controllers in the run of that seed; None where all light is steady."""
     if not isinstance(light, DomeConfig) or isinstance(light.led.drive, DirectConfig) or not len(sources):
         return None
-    return Clocks.draw(light.led.clock, int(sources.clock.max()) + 1, hardware_seed(light.layout), seed)
+    hardware = hardware_seed(light.layout)
+    clocks = Clocks.draw(light.led.clock, int(sources.clock.max()) + 1, hardware, seed)
+    low_pass = light.led.drive.filter if isinstance(light.led.drive, PwmConfig) else None
+    if low_pass is None:
+        return clocks
+    normal = random_stream(hardware, FILTER_STREAM).standard_normal(len(sources))
+    return replace(clocks, filter_s=low_pass.time_constant_s * (1 + scaled_errors(low_pass.error, normal)))
 
 
 def hardware_seed(layout: Layout) -> int:
