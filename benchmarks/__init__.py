@@ -23,6 +23,7 @@ AREAS = (
     "lost_in_space",
     "frames",
     "sky",
+    "codes",
 )
 
 

@@ -204,11 +204,11 @@ class DomeTracker:
         clock.lap("identify")
         if isinstance(match, str):
             return Attitude(match)
-        attitude = self._refine(centroids, match)
+        attitude = self.solve_match(centroids, match)
         clock.lap("solve")
         return attitude
 
-    def _refine(self, centroids: Centroids, match: StarMatch) -> Attitude:
+    def solve_match(self, centroids: Centroids, match: StarMatch) -> Attitude:
         """Match every centroid with the exact geometry, then solve these matches with the solver of the settings.
 
         The matching always uses the exact solver: an approximate one could lose matches. All solvers are therefore

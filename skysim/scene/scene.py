@@ -106,6 +106,19 @@ class Scene(ConfigModel):
         return self
 
     @model_validator(mode="after")
+    def check_code(self) -> Scene:
+        """Check that the decoder has a code, and the code a shutter whose rows show the same bits."""
+        code = self.light.led.code if isinstance(self.light, DomeConfig) else None
+        if self.tracker.decoder and code is None:
+            raise ValueError("tracker.decoder: requires light.led.code")
+        if code and code.bit_time_s != "frame" and self.camera.shutter.kind == "rolling":
+            raise ValueError(
+                "light.led.code.bit_time: the rows of a rolling shutter show different bits; allowed: frame, or another"
+                " camera.shutter"
+            )
+        return self
+
+    @model_validator(mode="after")
     def check_bodies(self) -> Scene:
         """Check that the ephemeris of the bodies holds at the scene's time."""
         first, last = BODIES_YEARS

@@ -73,6 +73,8 @@ def render_frame(
     view = view_of(testbed, window, cam_from_lab, middle_s)
     satellites = satellites_during(testbed, view, middle_s, index)
     stars = lights_during(testbed, view, middle_s, window.exposure_s)
+    if testbed.codes:
+        stars = testbed.codes.shown(stars, window.open_s, window.exposure_s, index)
     if sky:
         stars = seen_stars(testbed, stars, sky, window, index)
     streaks = satellite_sources(testbed, sky, satellites)

@@ -36,11 +36,12 @@ from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
 from skysim.sources.air.air import Air, Sky
 from skysim.sources.dome import display
-from skysim.sources.dome.clocks import Clocks, build_clocks
 from skysim.sources.dome.layouts.led_list import led_list
 from skysim.sources.dome.led import Emitter
 from skysim.sources.dome.reflection.dome import ReflectingDome, reflecting_dome
 from skysim.sources.dome.shell import surface
+from skysim.sources.dome.timing.clocks import Clocks, build_clocks
+from skysim.sources.dome.timing.codes import LedCodes, build_codes
 from skysim.sources.orbit.camera_orbit import CameraOrbit, build_orbit, state_at
 from skysim.sources.orbit.earth import hidden_by_earth
 from skysim.sources.orbit.elements import Elements, read_elements
@@ -85,6 +86,7 @@ class Testbed:
                 is the expectation itself, and float32 otherwise
     trajectory: the simulated motion, jitter included; telemetry: what the vehicle's computers did in it
     clocks    : the LED controllers' oscillators in this run; None where all light is steady
+    codes     : the LEDs' words and the clock of their bits in this run; None without light.led.code
     air       : over the site of a sky scene with `light.air`
     obstacles : occluders of the sources; None where the scene has light.occlusion off
     reflecting : the dome's reflections; None without light.reflection
@@ -111,6 +113,7 @@ class Testbed:
     canvas: NDArray[Any]
     trajectory: Trajectory
     clocks: Clocks | None = None
+    codes: LedCodes | None = None
     air: Air | None = None
     obstacles: multibody.Obstacles | None = None
     reflecting: ReflectingDome | None = None
@@ -149,7 +152,8 @@ class Testbed:
     def in_run(self, seed: int) -> Testbed:
         """The same hardware in the run of another seed: other noise, jitter, timing and phases of the LEDs' clocks."""
         scene = self.scene.model_copy(update={"seed": seed})
-        return replace(self, scene=scene, clocks=build_clocks(scene.light, self.sources, seed))
+        clocks = build_clocks(scene.light, self.sources, seed)
+        return replace(self, scene=scene, clocks=clocks, codes=build_codes(scene.light, self.sources, seed))
 
     def at_rest(self, lab_from_body: Rotation, index: int = 0) -> Testbed:
         """The test bed with the vehicle at rest at this attitude, until after the exposure of a frame."""
@@ -205,6 +209,7 @@ def build_testbed(
         np.empty((scene.camera.height_px, scene.camera.width_px), dtype),
         Trajectory.at_rest(lab_from_body_start(scene, mount, profiles), 1.0),
         build_clocks(scene.light, sources, scene.seed),
+        build_codes(scene.light, sources, scene.seed),
         build_air(scene, band, stars),
         build_obstacles(scene, vehicle),
         reflecting_dome(scene.light, sources),

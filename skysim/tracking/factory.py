@@ -1,8 +1,8 @@
 """Build the star tracker of a scene, and solve frames with it.
 
-`build_tracker` chooses the class by scene: DomeTracker under LEDs, StarTracker under stars, ExternalTracker for another
-program. All get the camera, map and settings that the tracker assumes (onboard_model.py, settings.py), which may
-differ from the simulated hardware.
+`build_tracker` chooses the class by scene: DomeTracker under LEDs, CodedTracker if it reads their codes, StarTracker
+under stars, ExternalTracker for another program. All get the camera, map and settings that the tracker assumes
+(onboard_model.py, settings.py), which may differ from the simulated hardware.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from estimator.catalog import catalog
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate
+from estimator.trackers.coded_tracker import CodedTracker, DecoderSettings
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
@@ -27,6 +28,7 @@ from skysim.tracking.external.interface import OWN
 from skysim.tracking.onboard_model import (
     assumed_air,
     assumed_camera,
+    assumed_code,
     assumed_dome,
     assumed_lever,
     onboard_catalog,
@@ -36,7 +38,7 @@ from skysim.tracking.orbit_velocity import OrbitStarTracker, assumed_observer, a
 from skysim.tracking.settings import assumed_settings
 
 UserTracker = ExternalTracker | FunctionTracker  # each frame must reach it once, in order
-Estimator = StarTracker | DomeTracker | UserTracker
+Estimator = StarTracker | DomeTracker | CodedTracker | UserTracker
 
 NO_PROGRAMS: Mapping[str, str] = {}
 
@@ -56,7 +58,11 @@ def build_tracker(scene: Scene, mount: Mount, sources: Sources, programs: Mappin
         if scene.tracker.name != OWN:
             return ExternalTracker.start(scene, camera, settings, adapter.led_map(leds, lever), programs)
         try:
-            return DomeTracker(camera, leds, lever, settings)
+            if scene.tracker.decoder is None:
+                return DomeTracker(camera, leds, lever, settings)
+            code = assumed_code(scene.light, sources, leds)
+            decoder = DecoderSettings(**scene.tracker.decoder.model_dump())
+            return CodedTracker(camera, leds, lever, settings, code, decoder)
         except ImageError as error:
             raise InputError(f"light: the star tracker cannot use this dome: {error}") from None
     stars = catalog.brighter_than(onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag)
@@ -87,6 +93,8 @@ def solve_frame(
     try:
         if isinstance(estimator, StarTracker):
             return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s)
+        if isinstance(estimator, CodedTracker):
+            return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s, frame.index)
         return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s)
     except ImageError as error:
         return Report(Attitude(str(error)), Centroids.empty())

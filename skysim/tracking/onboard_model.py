@@ -12,6 +12,7 @@ from estimator.catalog import catalog
 from estimator.catalog.refraction import SiteAir
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
+from estimator.identification.leds.codes import LedCode
 from skysim.core.errors import InputError
 from skysim.core.types import Mount, Sources
 from skysim.scene.scene import Scene
@@ -22,6 +23,7 @@ from skysim.sources.catalog import require_catalog
 from skysim.sources.dome.layouts import registry
 from skysim.sources.dome.shell import surface
 from skysim.sources.dome.survey import survey_errors
+from skysim.sources.dome.timing.codebooks import codebook
 from skysim.sources.photometry import Band
 from skysim.tracking import dome_map_file
 
@@ -30,8 +32,8 @@ def assumed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
     """The dome map that the tracker uses: the true LED positions and surface with the errors of the survey.
 
     The one sigma of LEDs that an instrument measured is the greatest across the line from the bearing. It sets the
-    matching radius of the identification, which must not exceed that of the final match (`DomeTracker._refine`): an LED
-    that only the first one admits makes the tracker refuse the frame.
+    matching radius of the identification, which must not exceed that of the final match (`DomeTracker.solve_match`): an
+    LED that only the first one admits makes the tracker refuse the frame.
     """
     inside, survey = surface.build_surface(light.surface), scene.tracker.survey
     position_m = survey_errors.assumed_leds_m(inside, sources.place[:, :3], survey)
@@ -43,6 +45,15 @@ def assumed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
     if covariance_m2 is not None:
         sigma_m = float(survey_errors.across_sigma_m(position_m, covariance_m2).max())
     return LedMap(sources.id, position_m, *ellipsoid, board, sigma_m, covariance_m2, common_m)
+
+
+def assumed_code(light: DomeConfig, sources: Sources, leds: LedMap) -> LedCode:
+    """The words of the LEDs of the tracker's map, as the dome has them."""
+    assert light.led.code is not None
+    code, row = light.led.code, np.searchsorted(sources.id, leds.id, sorter=np.argsort(sources.id))
+    words = codebook(code, len(sources))[np.argsort(sources.id)[row]]
+    levels = np.where(words > 0, 1.0, 1 - code.depth)
+    return LedCode(levels, None if code.bit_time_s == "frame" else code.bit_time_s)
 
 
 def assumed_air(scene: Scene) -> SiteAir | None:

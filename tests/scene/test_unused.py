@@ -39,7 +39,7 @@ class Case(NamedTuple):
     useful: dict[str, str]
 
 
-DOME, SKY, BENCH = "afit_simsat", "shefex2", "collimated_display"
+DOME, SKY, BENCH, CODED = "afit_simsat", "shefex2", "collimated_display", "coded_spiral"
 DIRECT = {"light.led.drive": "{kind: direct}"}
 FLAT = {"light.surface": "{kind: flat, apex: 48 in}"}
 FLOOR = "{share: 0.5, depth: 1 m, radius: 1 m}"
@@ -57,6 +57,15 @@ CASES = [
     Case(SKY, {}, "tracker.assumed_camera_body", "[1 m, 0 m, 0 m]", {}),
     Case(SKY, {}, "tracker.options", "{a: 1}", {"tracker.name": "tetra3rs"}),
     Case(SKY, {}, "tracker.time_limit", "3 s", {"tracker.name": "tetra3rs"}),
+    Case(CODED, {"tracker.name": "guest"}, "tracker.decoder", "{gate_px: 40}", {"tracker.name": "own"}),
+    Case(CODED, {}, "tracker.identifier", "pyramid", {"tracker.decoder": "null"}),
+    Case(
+        CODED,
+        DIRECT,
+        "light.led.clock.offset_ppm",
+        "7",
+        {"light.led.code": "{kind: cyclic, bit_time: 20 ms}"},
+    ),
     Case(SKY, {"tracker.name": "tetra3rs"}, "tracker.solver", "quest", {"tracker.name": "own"}),
     Case("simsat_bump", {"tracker.name": "tetra3rs"}, "tracker.gyro", "true", {"tracker.name": "own"}),
     Case(

@@ -15,8 +15,8 @@ from skysim.scene.sections.leds import ClockConfig
 from skysim.simulation import exposure
 from skysim.simulation.closed_loop import ClosedLoop
 from skysim.simulation.testbed import build_testbed, exposure_window, time_tag_error_s
-from skysim.sources.dome.clocks import Clocks, filtered_share
 from skysim.sources.dome.led import lit_moments_s
+from skysim.sources.dome.timing.clocks import Clocks, filtered_share
 
 AT_REST = {"motion.maneuver": "[{kind: hold, duration: 60 s}]", "exposure.time": "10.5 ms"}
 

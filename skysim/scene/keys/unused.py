@@ -59,6 +59,12 @@ def steady(scene: Scene) -> bool:
     return isinstance(scene.light, DomeConfig) and isinstance(scene.light.led.drive, DirectConfig)
 
 
+def free_running_code(scene: Scene) -> bool:
+    """Whether the LEDs' bits have a clock of their own."""
+    code = scene.light.led.code if isinstance(scene.light, DomeConfig) else None
+    return code is not None and code.bit_time_s != "frame"
+
+
 def actuators(scene: Scene) -> str:
     """The actuators that the controller uses; empty without a controller."""
     return scene.motion.control.actuators if scene.motion.control else ""
@@ -180,6 +186,18 @@ RULES = (
         "tracker.name: own, or tracker.options",
     ),
     Rule(
+        ("tracker.decoder",),
+        external,
+        "an external tracker has its own algorithms",
+        "tracker.name: own",
+    ),
+    Rule(
+        ("tracker.identifier",),
+        lambda scene: scene.tracker.decoder is not None,
+        "the LEDs are identified by their codes",
+        "no tracker.decoder",
+    ),
+    Rule(
         ("tracker.gyro",),
         external,
         "an external tracker gets no rate",
@@ -229,7 +247,7 @@ RULES = (
     ),
     Rule(
         ("light.led.clock",),
-        steady,
+        lambda scene: steady(scene) and not free_running_code(scene),
         "the drive direct has no pulses to time",
         "another light.led.drive",
     ),

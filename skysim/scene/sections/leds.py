@@ -108,6 +108,49 @@ class ClockConfig(ConfigModel):
     drift_ppm_h: Annotated[NumberError, Field(le=10_000)] = 1.0
 
 
+class CodeConfig(ConfigModel):
+    """A name for each LED in time: its light changes between two levels by a word of bits, over and over.
+
+    The words are given by LED number, in order. A failed bit shows the other level.
+
+    depth    : part of its light that an LED lacks at a bit that is 0; 1 is on and off
+    bit_time : of one bit, by a clock of the dome's own (`clock`) that runs freely; `frame`: the camera's trigger
+        advances the code, one bit a frame
+    dropout  : probability that an LED's bit fails, independent of all others; drawn from the scene's seed
+    """
+
+    depth: Annotated[Number, Field(gt=0, le=1)] = 0.5
+    bit_time_s: Literal["frame"] | Annotated[Time, Field(ge=1e-4)] = "frame"
+    dropout: Annotated[Number, Field(ge=0, lt=0.5)] = 0.0
+
+
+class PlainCodeConfig(CodeConfig):
+    """Codes that need the camera's trigger.
+
+    kind : gray: numbers, distance 1; hamming: extended and shortened, distance 4; gold: all sequences and shifts,
+        distance 12 of 31 bits
+    """
+
+    kind: Literal["gray", "hamming", "gold"]
+
+
+class BchCodeConfig(CodeConfig):
+    """The shortest BCH code for the LEDs with a designed distance; needs the camera's trigger."""
+
+    kind: Literal["bch"]
+    distance: Literal[3, 5, 7, 11] = 5
+
+
+class CyclicCodeConfig(CodeConfig):
+    """Words of a cyclic BCH code that differ at all shifts: they are read without knowing where a word begins."""
+
+    kind: Literal["cyclic"]
+    distance: Literal[3, 5, 7, 11] = 7
+
+
+Code = Annotated[PlainCodeConfig | BchCodeConfig | CyclicCodeConfig, Field(discriminator="kind")]
+
+
 class AgingConfig(ConfigModel):
     """Light lost over the hours of operation: each LED has exp(-a hours) of its light left, a = ln(1 / 0.7) / life
     (IES TM-21).
@@ -185,6 +228,7 @@ class LedConfig(ConfigModel):
     aging, warm_up : how much light is left of it
     drive : how its level is made; pwm_period belongs to the kind pwm
     clock : the oscillators that time the pulses; every run starts with phases of its own
+    code : of the light over frames, by which the tracker knows an LED (`tracker.decoder`); steady if left out
     """
 
     intensity_cd: Annotated[Intensity, Field(gt=0)] | None = None
@@ -200,6 +244,7 @@ class LedConfig(ConfigModel):
     warm_up: WarmUpConfig | None = None
     drive: Drive = PwmConfig()
     clock: ClockConfig = ClockConfig()
+    code: Code | None = None
     pwm_period_s: Annotated[Time, Field(gt=0)] = 1e-3
 
     @model_validator(mode="after")
@@ -213,6 +258,15 @@ class LedConfig(ConfigModel):
         if isinstance(self.spectrum, str) and (self.fwhm_m is not None or self.color_scatter_m):
             key = "color_scatter" if self.fwhm_m is None else "fwhm"
             raise ValueError(f"{key}: {self.spectrum} is a whole spectrum; allowed: a wavelength as spectrum")
+        return self
+
+    @model_validator(mode="after")
+    def check_code(self) -> LedConfig:
+        if self.code and self.code.kind != "cyclic" and self.code.bit_time_s != "frame":
+            raise ValueError(
+                f"code.bit_time: a {self.code.kind} code cannot be read without the camera's trigger;"
+                " allowed: frame, or kind cyclic"
+            )
         return self
 
     @field_validator("scatter")

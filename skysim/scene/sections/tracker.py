@@ -87,6 +87,19 @@ class ExposureControlConfig(ConfigModel):
         return self
 
 
+class DecoderConfig(ConfigModel):
+    """Reading the codes of a dome's LEDs (`light.led.code`) over the frames.
+
+    flux_sigma : relative error of a light's brightness that the decoder assumes beside its photon noise
+    gate_px    : greatest motion of a light between two frames beyond what `tracker.gyro` or the last motion predicts
+    frames     : number of frames whose brightness is used, the last ones; as many as the code has bits if left out
+    """
+
+    flux_sigma: Annotated[Number, Field(ge=1e-6, le=1)] = 0.03
+    gate_px: Annotated[Number, Field(ge=1, le=10_000)] = 60.0
+    frames: Annotated[int, Field(ge=3, le=10_000)] | None = None
+
+
 class TrackerConfig(ConfigModel):
     """Settings of the star tracker and its assumed values of the hardware; `null` for an assumed value is the true one.
 
@@ -104,6 +117,7 @@ class TrackerConfig(ConfigModel):
     brightest : only this many of the brightest detections of a frame are used
     refraction : whether the tracker knows `site`, weather and the time, and undoes the refraction of `light.air`
     exposure_control : every frame is exposed for `exposure.time` if left out
+    decoder : identifies LEDs by their codes over the frames, in order; without it frame by frame, by their places
     """
 
     name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")] = "own"
@@ -128,6 +142,7 @@ class TrackerConfig(ConfigModel):
     assumed_camera_body_m: tuple[Length, Length, Length] | None = None
     survey: SurveyErrorsConfig = SurveyErrorsConfig()
     exposure_control: ExposureControlConfig | None = None
+    decoder: DecoderConfig | None = None
     map: Annotated[str, AfterValidator(existing_file)] | None = None
 
     @model_validator(mode="after")

@@ -108,18 +108,17 @@ def dark_corners(context: Context, samples: Samples) -> str:
 
 
 def few_lights(context: Context, samples: Samples) -> str:
-    """Warn where the tracker has fewer than four lights: at the frames, or in reach."""
+    """Warn where the tracker has too few lights: at the frames, or in reach."""
     scene, mount = context.testbed.scene, context.testbed.mount
+    needed = least_lights(scene)
     if cap_too_small(context, samples) or dark_corners(context, samples):
         return ""  # more LEDs where there are some would not help
-    if scene.tracker.brightest is not None and scene.tracker.brightest < MIN_LIGHTS:
-        return (
-            f"tracker.brightest: the tracker uses {scene.tracker.brightest} lights; change it to {MIN_LIGHTS} or more"
-        )
+    if scene.tracker.brightest is not None and scene.tracker.brightest < needed:
+        return f"tracker.brightest: the tracker uses {scene.tracker.brightest} lights; change it to {needed} or more"
     in_reach = MAX_FEW_SKY if scene.vehicle.mount == "free" else MAX_FEW
     for sampled, allowed in ((samples.frames, 0.0), (samples.reach, in_reach)):
         counts = sampled.counts()
-        few = float((counts < MIN_LIGHTS).mean())
+        few = float((counts < needed).mean())
         if few > allowed:
             break
     else:
@@ -127,10 +126,10 @@ def few_lights(context: Context, samples: Samples) -> str:
     on_chip = np.array([len(view) for view in sampled.seen])
     where = attitudes.describe(sampled.attitudes, int(counts.argmin()), scene, mount)
     text = (
-        f"fewer than {MIN_LIGHTS} lights that the tracker detects at {100 * few:.0f} % of the"
+        f"fewer than {needed} lights that the tracker detects at {100 * few:.0f} % of the"
         f" {'frames' if sampled is samples.frames else 'directions in reach'}, least {counts.min()} at {where}"
     )
-    if (on_chip[counts < MIN_LIGHTS] >= MIN_LIGHTS).mean() > MIN_DETECTED:
+    if (on_chip[counts < needed] >= needed).mean() > MIN_DETECTED:
         return ""  # they are on the chip: `undetected` says why they are not detected
     if isinstance(scene.light, DomeConfig):
         return f"{density_key(scene.light.layout)}: {text}; {denser(scene.light.layout, float(on_chip.mean()))}"
@@ -138,6 +137,11 @@ def few_lights(context: Context, samples: Samples) -> str:
     if sky_mag is not None and sky_mag < scene.tracker.limit_mag:
         return f"light.limit_mag: {text}; change it to {scene.tracker.limit_mag:g}, the tracker's limit"
     return f"tracker.limit_mag: {text}; change it to {fainter:g}, or take a shorter camera.focal_length"
+
+
+def least_lights(scene: Scene) -> int:
+    """Number of lights that an identification needs: two, if their codes name them."""
+    return 2 if scene.tracker.decoder else MIN_LIGHTS
 
 
 def density_key(layout: Layout) -> str:

@@ -171,7 +171,7 @@ class DriveInput(NamedTuple):
 class PulseTrains(NamedTuple):
     """Output of a drive per LED, (N,): lit from start_s for on_s in every period_s; relative strength while lit.
 
-    The times are those of the LED's controller; `clock` is the number of its oscillator (sources/dome/clocks.py).
+    The times are those of the LED's controller; `clock` is the number of its oscillator (timing/clocks.py).
     """
 
     period_s: Floats

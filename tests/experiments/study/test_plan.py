@@ -139,6 +139,16 @@ responses: [identified]
 """
 
 
+def test_codes_of_leds_need_a_flight(tmp_path):
+    """One frame shows one bit."""
+    assert loader.load(written(tmp_path, FLIGHT.format(scene="coded_spiral", start="scene"))).trials == 2
+    single = FLIGHT.format(scene="coded_spiral", start="scene").replace(
+        "{kind: flight, start: scene}", "{kind: frames}"
+    )
+    with pytest.raises(InputError, match=r"trial\.kind: frames with tracker\.decoder, which needs many frames"):
+        loader.load(written(tmp_path, single))
+
+
 @pytest.mark.parametrize(
     ("scene", "start", "complaint"),
     [

@@ -24,8 +24,8 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation import exposure
 from skysim.simulation.testbed import Testbed, build_obstacles, build_testbed, light_sources
-from skysim.sources.dome.clocks import build_clocks
 from skysim.sources.dome.led import Emitter
+from skysim.sources.dome.timing.clocks import build_clocks
 from skysim.tracking import onboard_model
 
 WHITE = 255  # white in the thesis's gray levels

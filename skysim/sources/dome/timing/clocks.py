@@ -48,10 +48,10 @@ class Clocks:
     filter_s: Floats | None = None
 
     @classmethod
-    def draw(cls, config: ClockConfig, count: int, hardware_seed: int, seed: int) -> Clocks:
+    def draw(cls, config: ClockConfig, count: int, hardware_seed: int, seed: int, stream: int = LED_CLOCKS) -> Clocks:
         """Draw the offsets from the hardware's seed, drifts and switch-on times from the run's."""
-        offset_ppm = scaled_errors(config.offset_ppm, random_stream(hardware_seed, LED_CLOCKS).standard_normal(count))
-        rng = random_stream(seed, LED_CLOCKS)
+        offset_ppm = scaled_errors(config.offset_ppm, random_stream(hardware_seed, stream).standard_normal(count))
+        rng = random_stream(seed, stream)
         on_s = rng.uniform(0, LONGEST_ON_S, count)
         drift_ppm_h = scaled_errors(config.drift_ppm_h, rng.standard_normal(count))
         return cls(on_s, PPM * offset_ppm, PPM / 3600 * drift_ppm_h)

@@ -1,0 +1,211 @@
+"""Star tracker for a dome whose LEDs blink their names: lights are tracked over frames, and their codes read.
+
+Each frame is detected and centroided as by `DomeTracker`. Its lights continue the tracks of the frames before
+(`leds.tracks`); the brightness of each in the last frames is compared with the words of all LEDs (`leds.codes`); codes
+and places together give the names and an attitude (`leds.naming`), which `DomeTracker` refines with the exact geometry.
+A frame without enough bits, or whose lights contradict each other, has no attitude.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.dome_map import LedMap, Lever
+from estimator.core import checks
+from estimator.core.arrays import Floats
+from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
+from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
+from estimator.identification.leds import codes, naming
+from estimator.identification.leds.codes import LedCode
+from estimator.identification.leds.tracks import LightTracks
+from estimator.trackers.dome_tracker import MIN_ERROR_PX, DomeTracker
+from estimator.trackers.pipeline import Clock, Report, Settings, direction_sigma_rad, process_frame
+from estimator.trackers.star_tracker import NO_STARS
+
+COLLECTING = "codes: too few lights have been seen long enough"
+MISSED_FRAMES = 2  # successive frames without a light after which its track ends, if LEDs are never dark
+MIN_BITS = 3  # a light measured in fewer frames could be any LED
+MIN_FREE_BITS = 8  # where the code's time is unknown
+PHASE_REACH = 25.0  # phases of the code's clock with a misfit above the best one's by more are left out
+
+
+@dataclass(frozen=True, slots=True)
+class DecoderSettings:
+    """Settings of the decoder.
+
+    flux_sigma : relative error of a light's brightness beside its photon noise: pulses, the chip, detection
+    gate_px    : greatest motion of a light between two frames that is not predicted
+    frames     : whose brightness is used, the last ones; None: as many as the code has bits
+
+    Raises ImageError for a number that cannot be used.
+    """
+
+    flux_sigma: float = 0.03
+    gate_px: float = 60.0
+    frames: int | None = None
+
+    def __post_init__(self) -> None:
+        checks.number("decoder: flux_sigma", self.flux_sigma, 1e-6, 1.0, "1e-6 to 1")
+        checks.number("decoder: gate_px", self.gate_px, 1.0, 1e4, "1 to 10,000 pixels")
+        if self.frames is not None:
+            checks.number("decoder: frames", self.frames, MIN_BITS, 10_000, f"{MIN_BITS} to 10,000", True)
+
+
+class CodedTracker(DomeTracker):
+    """Tracker under a dome of coded LEDs. Stateful: it takes the frames in order, with their times and numbers.
+
+    A frame that is not later than the last one begins anew; so does one without a time, whose lights have no names.
+    code : the words of the LEDs of the map
+    Raises ImageError as DomeTracker does, for a code of other LEDs, and for a rolling shutter with free-running bits.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        leds: LedMap,
+        lever: Lever,
+        settings: Settings,
+        code: LedCode,
+        decoder: DecoderSettings | None = None,
+    ) -> None:
+        super().__init__(camera, leds, lever, settings)
+        checks.of_type("code", code, LedCode)
+        if len(code.levels) != len(leds.position_m):
+            raise ImageError(f"code: {len(code.levels)} words; allowed: {len(leds.position_m)}, one an LED")
+        if camera.row_time_s and code.bit_time_s is not None:
+            raise ImageError("code: the rows of a rolling shutter show different bits; allowed: bit_time_s None")
+        self.code, self.decoder = code, decoder or DecoderSettings()
+        radius_m = np.linalg.norm(leds.position_m, axis=1)
+        pupil_m = lever.cam_from_body.apply(lever.camera_body_m)
+        position_m = np.asarray(leds.position_m, dtype=float)
+        self.sphere = naming.Sphere(position_m, radius_m, position_m / radius_m[:, None], pupil_m)
+        goes_dark = bool(code.levels.min() == 0)
+        self.tracks = LightTracks(
+            camera,
+            pupil_m,
+            float(np.median(radius_m)),
+            self.decoder.frames or code.bits,
+            self.decoder.gate_px,
+            code.bits if goes_dark else MISSED_FRAMES,
+            goes_dark,
+        )
+        self.templates = np.zeros((len(code.phases), len(code.levels), self.tracks.frames))
+        self.spread = np.zeros_like(self.templates)
+        self.phases = np.ones(len(code.phases), bool)  # those of the code's clock that the lights have not excluded
+        self.last_s: float | None = None
+        codes.misfits(*np.ones((4, 1, 1)))  # compiles it, or loads it, before the frames
+
+    def solve(
+        self,
+        image: NDArray,
+        streak_px: tuple[float, float] | None = None,
+        rate: RateEstimate | None = None,
+        exposure_s: float | None = None,
+        t_s: float | None = None,
+        frame: int = 0,
+    ) -> Report:
+        """Solve the frame of number `frame`, exposed about t_s. Raises ImageError for bad input.
+
+        streak_px, rate, exposure_s : as for `DomeTracker.solve`; the rate also predicts the lights' motion
+        """
+        solve = partial(self.solve_centroids, rate=rate, exposure_s=exposure_s, t_s=t_s, frame=frame)
+        return process_frame(image, self.camera, self.settings, solve, streak_px, rate, exposure_s)
+
+    def solve_centroids(
+        self,
+        centroids: Centroids,
+        clock: Clock | None = None,
+        rate: RateEstimate | None = None,
+        exposure_s: float | None = None,
+        t_s: float | None = None,
+        frame: int = 0,
+    ) -> Attitude:
+        """Track, name and solve centroids from any source; the other arguments as in `solve`."""
+        checks.of_type("centroids", centroids, Centroids)
+        centroids.check_values()
+        clock, exposure_s = clock or Clock(), exposure_s or 0.0
+        self._advance(centroids, t_s, rate)
+        middle_s = t_s or 0.0
+        templates, spread = self.code.templates(frame, middle_s - exposure_s / 2, middle_s + exposure_s / 2)
+        self.templates[:, :, self.tracks.column], self.spread[:, :, self.tracks.column] = templates, spread
+        if not len(centroids):
+            return Attitude(NO_STARS)
+        match = self._identify_codes(centroids)
+        clock.lap("identify")
+        if isinstance(match, str):
+            return Attitude(match)
+        attitude = self.solve_match(centroids, match)
+        clock.lap("solve")
+        return attitude
+
+    def _advance(self, centroids: Centroids, t_s: float | None, rate: RateEstimate | None) -> None:
+        """Continue the tracks with a frame's centroids."""
+        if t_s is not None:
+            t_s = checks.number("t_s", t_s, -1e300, 1e300, "a finite time in seconds")
+        elapsed_s = 0.0 if self.last_s is None or t_s is None else t_s - self.last_s
+        if elapsed_s <= 0:
+            self.tracks.clear()
+            self.phases[:] = True
+        self.last_s = t_s
+        turn = None
+        if rate is not None and rate.sign_known:
+            turn = Rotation.from_rotvec(-rate.rate_rad_s * elapsed_s)
+        relative = np.hypot(self.decoder.flux_sigma, 1 / np.sqrt(centroids.flux * self.settings.gain_e_dn))
+        self.tracks.advance(centroids, centroids.flux * relative, elapsed_s, turn)
+
+    def _identify_codes(self, centroids: Centroids) -> StarMatch | str:
+        """The LEDs of the tracks that are seen now, or the reason for a refusal."""
+        tracks = self.tracks
+        measured = np.isfinite(tracks.light).sum(axis=1)
+        usable = np.flatnonzero(
+            (tracks.row >= 0) & (measured >= (MIN_BITS if len(self.phases) == 1 else MIN_FREE_BITS))
+        )
+        if len(usable) < 2:
+            return COLLECTING
+        # An error of the same size in all frames of a light: relative errors of its dim frames would invite noise.
+        greatest = np.nanmax(tracks.sigma[usable], axis=1, keepdims=True)
+        sigma = np.where(np.isfinite(tracks.light[usable]), greatest, 1.0)
+        misfit = self._misfit(tracks.light[usable], sigma)
+        plausible = misfit.min(axis=1) <= codes.expected_misfit(measured[usable])
+        usable, misfit = usable[plausible], misfit[plausible]
+        if len(usable) < 2:
+            self.phases[:] = True
+            return COLLECTING
+        row = tracks.row[usable]
+        lights = naming.NamedLights(*self._tangents(centroids.take(row)), misfit)
+        match = naming.identify(lights, self.sphere)
+        return match if isinstance(match, str) else replace(match, observed=row[match.observed])
+
+    def _misfit(self, light: Floats, sigma: Floats) -> Floats:
+        """(T, N) misfit of each LED's code at the phases of the code's clock that all lights allow.
+
+        The next frame tries these phases and their neighbors.
+        """
+        tried, leds = np.flatnonzero(self.phases), len(self.code.levels)
+        templates, spread = (one[tried].reshape(len(tried) * leds, -1) for one in (self.templates, self.spread))
+        flat = np.full((len(light), len(templates)), np.inf)
+        for one, row, error in zip(flat, light, sigma, strict=True):
+            likely = codes.likely(row, templates) if len(tried) > 1 else np.arange(leds)
+            one[likely] = codes.misfits(row[None], error[None], templates[likely], spread[likely])[0]
+        each = flat.reshape(-1, len(tried), leds)
+        common = each.min(axis=2).sum(axis=0)
+        allowed = common <= common.min() + PHASE_REACH
+        self.phases[:] = False
+        for step in (-1, 0, 1):
+            self.phases[(tried[allowed] + step) % len(self.phases)] = True
+        return each[:, allowed].min(axis=1)
+
+    def _tangents(self, centroids: Centroids) -> tuple[Floats, Floats]:
+        """(K, 3) rays of centroids and (K,) errors of their tangents, of the LED map and the lever too."""
+        rays, focal_px = self.camera.rays(centroids.xy_px), self.camera.focal_px
+        own = np.hypot(direction_sigma_rad(centroids, self.camera, self.settings), MIN_ERROR_PX / focal_px)
+        tangent = np.linalg.norm(rays[:, :2] / rays[:, 2:], axis=1)
+        lever = self.lever.sigma_m / self.sphere.radius_m.min() * tangent
+        leds = float(self.led_sigma_rad.max())
+        return rays, np.sqrt((own**2 + leds**2) / rays[:, 2] ** 4 + lever**2)

@@ -1,0 +1,151 @@
+"""Laws of coded lights: templates, misfits, tracks, and names by codes and places."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as some
+from laws import SEEDS, answered, law, turn, units
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from estimator.attitude.dome_map import Lever, project
+from estimator.core.arrays import Floats
+from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
+from estimator.core.types import Centroids
+from estimator.identification.leds import codes, naming
+from estimator.identification.leds.codes import GROSS, LedCode
+from estimator.identification.leds.tracks import LightTracks
+
+CAMERA = Camera(640, 480, 900.0, (319.5, 239.5))
+LEVER = Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity())
+
+
+@law(LedCode.templates, LedCode.phases, LedCode.bits)
+@given(rng=SEEDS, begin_s=some.floats(-50, 50), length_s=some.floats(1e-4, 3.0))
+def test_a_template_is_the_mean_level_of_an_exposure(rng: np.random.Generator, begin_s: float, length_s: float) -> None:
+    """Against two thousand moments of it; a frame of a triggered code shows its bit."""
+    levels = rng.random((5, 7))
+    free, triggered = LedCode(levels, 0.3), LedCode(levels)
+    time = begin_s + (np.arange(2000) + 0.5) / 2000 * length_s
+    bit = np.floor(time / 0.3 + free.phases[:, None]).astype(int) % free.bits
+    found, spread = free.templates(0, begin_s, begin_s + length_s)
+    assert spread.min() >= 0
+    assert found.shape == (len(free.phases), 5)
+    np.testing.assert_allclose(found, levels[:, bit].mean(axis=2).T, rtol=0, atol=2e-3)
+    np.testing.assert_array_equal(triggered.templates(17, 0.0, 1.0)[0], levels[None, :, 3])
+    assert triggered.templates(17, 0.0, 1.0)[1].max() == 0
+
+
+@law(codes.misfits, codes.expected_misfit, codes.likely)
+@given(rng=SEEDS, gross=some.integers(0, 2))
+def test_a_misfit_is_the_least_over_the_brightness(rng: np.random.Generator, gross: int) -> None:
+    """Of the true template it is that of a fine search of brightnesses; of others at least as much as theirs."""
+    template = rng.integers(0, 2, (6, 20)) * 0.5 + 0.5
+    light = 1e4 * template[:1] * (1 + 0.02 * rng.standard_normal(20))
+    light[0, :gross] = rng.uniform(0.3, 1.2, gross) * 1e4
+    light[0, 5] = np.nan
+    sigma = np.full((1, 20), 200.0)
+    found = codes.misfits(light, sigma, template, np.zeros_like(template))
+
+    def misfit(brightness: float, row: Floats) -> float:
+        each = ((light[0] - brightness * row) / sigma[0]) ** 2 / 2
+        return float(np.nansum(np.minimum(each, GROSS)))
+
+    for n, row in enumerate(template):
+        start = min(np.linspace(3e3, 2e4, 2000), key=lambda one: misfit(one, row))
+        best = minimize_scalar(misfit, args=(row,), bounds=(start - 20, start + 20), method="bounded").fun
+        assert found[0, n] >= best - 1e-6
+        if n == 0:
+            assert found[0, n] == pytest.approx(best, abs=0.02)
+    assert 0 in codes.likely(light[0], template)
+    assert found[0, 0] <= codes.expected_misfit(np.array([19]))[0] + GROSS * gross
+
+
+def test_a_true_word_is_seldom_suspicious() -> None:
+    """Half of a chi-square exceeds the limit without its allowance for gross errors in 1 of 50 cases or fewer."""
+    for measured in (3, 9, 19, 31):
+        limit = codes.expected_misfit(np.array([measured]))[0] - GROSS * max(1, measured / 6)
+        assert chi2.sf(2 * limit, measured) < 0.02
+
+
+def dome(count: int) -> naming.Sphere:
+    """LEDs on a golden spiral of radius 1.2 m, where every field looks like its neighbors."""
+    z = 1 - (np.arange(count) + 0.5) / count * 0.4
+    azimuth = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    ring = np.sqrt(1 - z**2)
+    along = np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
+    return naming.Sphere(1.2 * along, np.full(count, 1.2), along, LEVER.camera_body_m)
+
+
+def field(sphere: naming.Sphere, body_from_lab: Rotation) -> tuple[Floats, Floats]:
+    """The LEDs in the field and their pixels."""
+    xy_px = np.nan_to_num(project(body_from_lab, sphere.position_m, LEVER, CAMERA), nan=-1e9)
+    seen = np.flatnonzero(CAMERA.contains(xy_px, 3))
+    return seen, xy_px[seen]
+
+
+@law(naming.identify)
+@given(rng=SEEDS, known=some.floats(0, 40), lied=some.integers(0, 1))
+def test_names_are_right_or_refused(rng: np.random.Generator, known: float, lied: int) -> None:
+    """Codes that know each LED by `known`, and in some cases one that claims another: then no attitude is wrong."""
+    sphere, truth = dome(100), turn(rng, 0.3)
+    seen, xy_px = field(sphere, truth)
+    misfit = known * (np.arange(100) != seen[:, None]).astype(float)
+    if lied:
+        misfit[0] = 40.0 * (np.arange(100) != rng.integers(100))
+    rays = CAMERA.rays(xy_px + rng.normal(0, 0.1, xy_px.shape))
+    found = naming.identify(naming.NamedLights(rays, np.full(len(seen), 3e-4), misfit), sphere)
+    if isinstance(found, str):
+        assert known < 25 or lied
+        return
+    np.testing.assert_array_equal(found.star, seen[found.observed])
+    assert (found.cam_from_ref * truth.inv()).magnitude() < 0.02
+
+
+@law(LightTracks.advance, LightTracks.clear)
+@given(rng=SEEDS, rate_rad_s=some.floats(0, 1.5), gyro=some.booleans(), dark=some.booleans())
+def test_lights_keep_their_tracks_while_the_vehicle_turns(
+    rng: np.random.Generator, rate_rad_s: float, gyro: bool, dark: bool
+) -> None:
+    """Ten frames of 20 ms; light n has the brightness n + 1, or is dark in some frames: no track has two of them."""
+    sphere, start, axis = dome(100), turn(rng, 0.3), units(rng, 1)[0]
+    tracks = LightTracks(CAMERA, LEVER.camera_body_m, 1.2, 10, 40.0, 2, dark)
+    tracks.clear()
+    for frame in range(10):
+        turned = Rotation.from_rotvec(axis * rate_rad_s * 0.02 * frame)
+        seen, xy_px = field(sphere, turned * start)
+        lit = rng.random(len(seen)) > 0.2 * dark * (frame > 2)
+        seen, xy_px = seen[lit], xy_px[lit]
+        centroids = Centroids(xy_px, np.full(len(seen), 0.1), seen + 1.0)
+        step = Rotation.from_rotvec(axis * rate_rad_s * 0.02) if gyro else None
+        tracks.advance(centroids, 0.01 * (seen + 1.0), 0.02, step)
+        np.testing.assert_array_equal(np.sort(tracks.row[tracks.row >= 0]), np.arange(len(seen)))
+    shown = [set(row[row > 0].tolist()) for row in tracks.light]
+    assert all(len(one) <= 1 for one in shown)
+    if not dark:
+        assert len({tuple(one) for one in shown}) == len(shown)
+    tracks.clear()
+    assert len(tracks.row) == 0
+
+
+@pytest.mark.parametrize("levels", [np.ones((3, 4)), np.full((2, 2), 2.0), np.zeros((0, 3)), np.ones(3)])
+def test_codes_that_name_nothing_are_refused(levels: Floats) -> None:
+    assert answered(lambda: LedCode(levels), ImageError) is None
+
+
+@pytest.mark.parametrize(("excess", "decided"), [(2.0, False), (11.0, False), (12.0, True)])
+def test_two_lights_have_names_if_no_other_pair_is_a_hundred_thousandth_as_likely(excess: float, decided: bool) -> None:
+    """Of eight LEDs on a circle all neighbors are as far apart; ln(10^5) is 11.5."""
+    azimuth = np.arange(8) * np.pi / 4
+    ring = np.column_stack([0.1 * np.cos(azimuth), 0.1 * np.sin(azimuth), np.full(8, 0.99499)])
+    sphere = naming.Sphere(1.2 * ring, np.full(8, 1.2), ring, LEVER.camera_body_m)
+    _, xy_px = field(sphere, Rotation.identity())
+    misfit = np.full((2, 8), 100.0)
+    misfit[[0, 1], [0, 1]] = 3.0
+    misfit[[0, 1], [4, 5]] = 3.0 + excess / 2
+    found = naming.identify(naming.NamedLights(CAMERA.rays(xy_px[:2]), np.full(2, 3e-4), misfit), sphere)
+    assert (found == naming.UNDECIDED) if not decided else found.star.tolist() == [0, 1]

@@ -1,0 +1,81 @@
+"""Codebooks: the stated distances by comparing all words, published generators, and refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from skysim.core.errors import InputError
+from skysim.scene.sections.leds import BchCodeConfig, Code, CyclicCodeConfig, PlainCodeConfig
+from skysim.sources.dome.timing import codebooks
+from skysim.sources.dome.timing.codebooks import Words, codebook
+
+
+def distances(words: Words, others: Words) -> np.ndarray:
+    """(N, M) Hamming distances."""
+    return (words[:, None] != others).sum(axis=2)
+
+
+def least_distance(words: Words) -> int:
+    apart = distances(words, words)
+    np.fill_diagonal(apart, words.shape[1])
+    return int(apart.min())
+
+
+@pytest.mark.parametrize(
+    ("code", "bits", "distance"),
+    [
+        (PlainCodeConfig(kind="gray"), 9, 1),
+        (PlainCodeConfig(kind="hamming"), 14, 4),
+        (PlainCodeConfig(kind="gold"), 31, 12),
+        (BchCodeConfig(kind="bch", distance=3), 13, 3),
+        (BchCodeConfig(kind="bch", distance=5), 19, 5),
+        (BchCodeConfig(kind="bch", distance=7), 24, 7),
+        (BchCodeConfig(kind="bch", distance=11), 29, 11),
+        (CyclicCodeConfig(kind="cyclic", distance=5), 31, 5),
+        (CyclicCodeConfig(kind="cyclic", distance=7), 31, 7),
+    ],
+)
+def test_words_are_as_far_apart_as_stated(code: Code, bits: int, distance: int) -> None:
+    """For 400 LEDs; and no word is constant, which a light of unknown brightness would not show."""
+    words = codebook(code, 400)
+    assert words.shape == (400, bits)
+    assert least_distance(words) >= distance
+    assert np.ptp(words, axis=1).min() == 1
+
+
+@pytest.mark.parametrize("distance", [5, 7])
+@pytest.mark.slow
+def test_cyclic_words_are_as_far_apart_at_any_shift(distance: int) -> None:
+    """From each other's shifts, and from their own."""
+    words = codebook(CyclicCodeConfig(kind="cyclic", distance=distance), 400)
+    for shift in range(1, words.shape[1]):
+        assert distances(words, np.roll(words, shift, axis=1)).min() >= distance
+
+
+def test_gray_words_of_successive_numbers_differ_in_one_bit() -> None:
+    """But where the word of ones alone is left out."""
+    words = codebook(PlainCodeConfig(kind="gray"), 400)
+    apart = (words[1:] != words[:-1]).sum(axis=1)
+    assert sorted(set(apart.tolist())) == [1, 2]
+    assert (apart == 2).sum() == 1
+
+
+def test_all_gold_sequences_and_shifts_are_far_apart() -> None:
+    """33 sequences of 31 bits at 31 shifts: correlations of -9, -1 and 7 (Gold 1967), so distances of 12, 16 and 20."""
+    words = codebook(PlainCodeConfig(kind="gold"), 1023)
+    assert set(distances(words, words)[np.triu_indices(1023, 1)].tolist()) == {12, 16, 20}
+
+
+@pytest.mark.parametrize(
+    ("degree", "distance", "octal"),
+    [(4, 5, 0o721), (4, 7, 0o2467), (5, 5, 0o3551), (5, 7, 0o107657), (5, 11, 0o5423325), (6, 7, 0o1701317)],
+)
+def test_generators_are_the_published_ones(degree: int, distance: int, octal: int) -> None:
+    """Lin and Costello 2004, appendix C."""
+    assert codebooks.bch_generator(degree, distance) == octal
+
+
+def test_a_code_with_too_few_words_is_refused() -> None:
+    with pytest.raises(InputError, match=r"light.led.code: 70000 LEDs; allowed: at most the \d+ words of kind gold"):
+        codebook(PlainCodeConfig(kind="gold"), 70_000)
