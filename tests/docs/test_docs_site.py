@@ -70,7 +70,8 @@ def test_a_key_s_row_says_what_it_takes_and_what_stands_for_it() -> None:
     assert "| `surface_seed` | whole number, ≥ 0 or null | `null` |" in survey
 
 
-GENERATED = keys.pages() | {commands.PAGE: commands.page(), responses.PAGE: responses.page()}
+KEYS = keys.pages()
+GENERATED = KEYS | {commands.PAGE: commands.page(), responses.PAGE: responses.page()}
 
 
 @pytest.mark.parametrize("path", GENERATED, ids=lambda path: path.stem)
@@ -79,7 +80,7 @@ def test_a_committed_reference_page_is_that_of_the_code(path: Path) -> None:
     assert path.read_text(encoding="utf-8") == GENERATED[path]
 
 
-@pytest.mark.parametrize("path", keys.pages(), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", KEYS, ids=lambda path: path.stem)
 def test_a_page_of_keys_links_to_its_sections_and_names_what_a_text_may_be(path: Path) -> None:
     page = GENERATED[path]
     linked, headings = set(re.findall(r"\]\(#(\w+)\)", page)), set(re.findall(r"^## (\w+)$", page, re.MULTILINE))
