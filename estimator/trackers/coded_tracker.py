@@ -136,13 +136,7 @@ class CodedTracker(DomeTracker):
         self.templates[:, :, self.tracks.column], self.spread[:, :, self.tracks.column] = templates, spread
         if not len(centroids):
             return Attitude(NO_STARS)
-        match = self._identify_codes(centroids)
-        clock.lap("identify")
-        if isinstance(match, str):
-            return Attitude(match)
-        attitude = self.solve_match(centroids, match)
-        clock.lap("solve")
-        return attitude
+        return self._solve_identified(centroids, self._identify_codes(centroids), clock)
 
     def _advance(self, centroids: Centroids, t_s: float | None, rate: RateEstimate | None) -> None:
         """Continue the tracks with a frame's centroids."""

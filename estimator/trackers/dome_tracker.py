@@ -201,6 +201,10 @@ class DomeTracker:
         rays = self.camera.rays(bright.xy_px)
         focal_rad = focal_error_rad(rays, self.camera)
         match = self.identify(rays, np.hypot(direction_sigma_rad(bright, self.camera, self.settings), focal_rad))
+        return self._solve_identified(centroids, match, clock)
+
+    def _solve_identified(self, centroids: Centroids, match: StarMatch | str, clock: Clock) -> Attitude:
+        """The attitude of a match, or without one for the reason of a refusal."""
         clock.lap("identify")
         if isinstance(match, str):
             return Attitude(match)

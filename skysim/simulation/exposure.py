@@ -131,10 +131,10 @@ def stray_light_e_s(
 
     bodies : of `bodies_during`; those below the skyline give nothing
     """
-    scene = testbed.scene
-    baffle, sky = scene.camera.baffle, sky_during(testbed, t_s)
+    scene, baffle = testbed.scene, testbed.scene.camera.baffle
     if baffle is None:
         return {}
+    sky = sky_during(testbed, t_s)
     boresight = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
     up = [body for body in bodies if not (sky and sky.below_horizon(body.place.direction[None])[0])]
     found = stray_of_bodies_e_s_m2(baffle, up, boresight)

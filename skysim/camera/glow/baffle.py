@@ -17,6 +17,7 @@ from skysim.camera.glow.earth_glow import LAYER, earth_radiance
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import BaffleConfig
 from skysim.scene.sections.orbit import EarthConfig
+from skysim.sources.dome.shell.surface import perpendicular
 from skysim.sources.orbit.earth import RADIUS_M
 from skysim.sources.photometry import Band
 from skysim.sources.solar_system.bodies import BodyLight
@@ -72,6 +73,5 @@ def interval_rule(low: float, high: float, count: int) -> tuple[Floats, Floats]:
 
 def axes_about(z: Floats) -> Floats:
     """(3, 3) rows: two unit vectors across the unit vector z, and z."""
-    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
-    x /= np.linalg.norm(x)
+    x = perpendicular(z[None])[0]
     return np.stack([x, np.cross(z, x), z])

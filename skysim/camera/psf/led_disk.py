@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
+from skysim.sources.dome.shell.surface import perpendicular
 
 
 class DiskImages(NamedTuple):
@@ -75,10 +76,3 @@ def disk_images(
     trace = image[1:].sum(axis=0) - 4 * image[0]
     gradient, tilt = (np.einsum("nij,jn->ni", matrix, part) for part in (slope + 3 * depth, depth))
     return DiskImages(matrix, trace / 8 - 0.75 * tilt, gradient)
-
-
-def perpendicular(unit: Floats) -> Floats:
-    """(N, 3) unit vectors perpendicular to these."""
-    axis = np.eye(3)[np.abs(unit).argmin(axis=1)]
-    across = np.cross(unit, axis)
-    return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))

@@ -29,7 +29,7 @@ from skysim.simulation.testbed import Testbed
 from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
 from skysim.sources.dome.layouts.placing import project_from_bearing
 from skysim.sources.dome.layouts.string import directions
-from skysim.sources.dome.shell.surface import Surface, build_surface
+from skysim.sources.dome.shell.surface import Surface, build_surface, perpendicular
 
 MAX_WIDTH_M = 0.25  # of a gore: at its edge the paper is 0.5 % too long under a dome of 1.2 m
 LEAST_GORES = 6
@@ -197,8 +197,7 @@ def shell_obj(dome: Dome) -> str:
 
 def pyramid_m(place_m: Floats, inward: Floats) -> Floats:
     """(4, 3) three corners about a place on the surface, and a tip outside."""
-    first = np.cross(inward, np.eye(3)[np.abs(inward).argmin()])
-    first /= np.linalg.norm(first)
+    first = perpendicular(inward[None])[0]
     angle = 2 * np.pi / 3 * np.arange(3)
     base = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), np.cross(inward, first))
     return place_m + MARK_M * np.concatenate([base / 2, -inward[None]])

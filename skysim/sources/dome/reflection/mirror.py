@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from skysim.core.jit import jit
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.light import ReflectionConfig
-from skysim.sources.dome.shell.surface import Surface
+from skysim.sources.dome.shell.surface import Surface, perpendicular
 from skysim.sources.false_lights import MIRRORED
 
 STEP_RAD = 1e-5  # of the differences: error 1e-10
@@ -190,7 +190,7 @@ def linearized(wall: Surface, led_m: Floats, camera_m: Floats, toward: Floats) -
     """(K, 2) offsets of LEDs (K, 3) from the reflected rays, across them, (K, 2, 2) their derivatives with respect to
     two angles of the direction, and (K, 2, 3) the axes of these angles.
     """
-    axes = perpendicular(toward)
+    axes = axes_across(toward)
     first, second = STEP_RAD * np.moveaxis(axes, 1, 0)
     shifted = toward + np.stack([0 * toward, first, -first, second, -second])
     shifted /= np.linalg.norm(shifted, axis=2, keepdims=True)
@@ -199,16 +199,14 @@ def linearized(wall: Surface, led_m: Floats, camera_m: Floats, toward: Floats) -
     # The LEDs' offsets from the nearest points of the rays.
     to_led = led_m - wall_m
     offset = to_led - np.sum(to_led * along, axis=2, keepdims=True) * along
-    center, *ends = np.einsum("kij,skj->ski", perpendicular(along[0]), offset)
+    center, *ends = np.einsum("kij,skj->ski", axes_across(along[0]), offset)
     columns = [(ends[0] - ends[1]) / (2 * STEP_RAD), (ends[2] - ends[3]) / (2 * STEP_RAD)]
     return center, np.stack(columns, axis=2), axes
 
 
-def perpendicular(unit: Floats) -> Floats:
+def axes_across(unit: Floats) -> Floats:
     """(K, 2, 3) two unit vectors perpendicular to each of these and to each other."""
-    axis = np.eye(3)[np.abs(unit).argmin(axis=1)]
-    first = np.cross(unit, axis)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    first = perpendicular(unit)
     return np.stack([first, np.cross(unit, first)], axis=1)
 
 

@@ -133,6 +133,12 @@ class Surface(ABC):
         return nearest.center_m, nearest.semi_axes_m
 
 
+def perpendicular(unit: Floats) -> Floats:
+    """(N, 3) a unit vector perpendicular to each of these unit vectors, along the surface if they are normals."""
+    across = np.cross(unit, np.eye(3)[np.abs(unit).argmin(axis=1)])
+    return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))
+
+
 def exit_distance(start: Floats, along: Floats) -> Floats:
     """(N,) the greater root s > 0 of |start + s along| = 1; NaN where there is none.
 
