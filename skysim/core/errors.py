@@ -25,4 +25,7 @@ def unknown_name(kind: str, name: object, allowed: Iterable[object]) -> str:
 
 
 class InputError(ValueError):
-    """The user's input is wrong. The message is one line: what, where, what is allowed."""
+    """The user's input is wrong. The message is one printable line: what, where, what is allowed."""
+
+    def __init__(self, message: object) -> None:
+        super().__init__(printable(message))  # it may quote a file, and a file may hold anything
