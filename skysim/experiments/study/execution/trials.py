@@ -109,7 +109,8 @@ def run_trial(spec: TrialSpec, segment: Segment, trial: int, replicate: int) -> 
 def run_centroid_trial(setup: Setup, seed: int) -> Outcome:
     """Centroid trial: random attitude, noisy true detections and false ones; identified and solved."""
     lab_from_body, xy_px, detections = simulate_centroids(setup, seed)
-    report = Report(setup.estimator.solve_centroids(detections), detections)
+    exposure_s = setup.testbed.scene.exposure.time_s
+    report = Report(factory.solve_centroids(setup.estimator, detections, exposure_s), detections)
     return score(setup.testbed, setup.estimator, report, TrueLights(lab_from_body, xy_px, xy_px, None))
 
 
@@ -275,7 +276,11 @@ def simulate_detections(
     """
     # Draw noise for all sources, also the missing ones, so that the stream does not depend on which are missing.
     detected = np.flatnonzero(rng.random(len(xy_px)) >= trial.missing)
-    flux = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
+    flux = (
+        electrons
+        / scene.camera.detector.gain_e_dn
+        * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
+    )
     xy_px = xy_px + trial.noise_px * rng.standard_normal(xy_px.shape)
     detected = detected[np.argsort(-flux[detected], kind="stable")][: trial.lights]
     false = trial.false_lights + round(len(detected) * trial.false_share / (1 - trial.false_share))
