@@ -1,4 +1,4 @@
-"""Fluxes that the tracker expects of LEDs by their data sheet, against rendered frames; LEDs that differ only in them."""
+"""Fluxes that the tracker expects of LEDs by their data sheet, against rendered frames."""
 
 from __future__ import annotations
 
