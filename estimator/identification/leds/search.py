@@ -15,9 +15,9 @@ from math import log10, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import on_sphere
+from estimator.attitude.solvers import rotation
 from estimator.catalog.pair_index import pair_range
 from estimator.catalog.spatial_grid import cell_of
 from estimator.core import vectors
@@ -78,7 +78,7 @@ def identify(
     if hypothesis.dex < ACCEPT_DEX:
         return NO_MATCH
     return StarMatch(
-        hypothesis.observed, hypothesis.star, Rotation.from_matrix(hypothesis.R_cam_from_lab), -hypothesis.dex
+        hypothesis.observed, hypothesis.star, rotation(hypothesis.R_cam_from_lab), -hypothesis.dex
     )
 
 
