@@ -10,7 +10,7 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.results.files import templates
+from skysim.results.files.builder import templates
 from skysim.scene import loader
 from skysim.simulation.testbed import Testbed, build_testbed
 from skysim.sources.dome.shell.surface import Ellipsoid, Plane
