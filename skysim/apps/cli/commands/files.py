@@ -44,15 +44,17 @@ def scenes_export(
     scene: SceneArg,
     out: Annotated[
         Path | None,
-        typer.Option(help="Output file, .xml, or of a dome .csv (LEDs), .svg (gores), .obj; default: out/SCENE.xml."),
+        typer.Option(
+            help="Output file, .xml; of a dome .csv (LEDs), .svg, .dxf (gores), .obj; default: out/SCENE.xml."
+        ),
     ] = None,
     seed: Seed = None,
     set_: Overrides = None,
 ) -> None:
     """Write a scene as one MJCF file for MuJoCo's viewer, or what a builder of its dome needs.
 
-    The builder gets a list of the LEDs (.csv), a pattern of gores at full scale to print (.svg), or the shell with a
-    mark at each LED as a mesh (.obj).
+    The builder gets a list of the LEDs (.csv), a pattern of gores at full scale to print (.svg) or to cut (.dxf), or
+    the shell with a mark at each LED as a mesh (.obj).
     """
     from skysim.core.io import files
     from skysim.results.files.builder import templates
@@ -64,8 +66,8 @@ def scenes_export(
     if path.suffix.lower() == ".csv":
         text, cap_deg = export_leds(testbed)
         use = f"light.layout: {{kind: listed, cap_deg: {cap_deg}, file: {path}}}"
-    elif kind := {".svg": "gores", ".obj": "shell"}.get(path.suffix.lower()):
-        text, use = templates.template(testbed, kind), {"gores": "print it at 100 %", "shell": "in mm"}[kind]
+    elif (ending := path.suffix.lower()) in templates.TEMPLATES:
+        text, use = templates.template(testbed, ending), "print it at 100 %" if ending == ".svg" else "in mm"
     else:
         text = export_mjcf(testbed)
     files.make_folder(path.parent)
