@@ -21,6 +21,7 @@ from skysim.experiments.study.plan import (
     CentroidTrial,
     Figure,
     FlightTrial,
+    FrameTrial,
     Map,
     Plan,
     Study,
@@ -163,8 +164,8 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
     """Raise InputError where the trial does not fit the scene of a level."""
     if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(trial, FlightTrial):
         raise InputError(f"trial.kind: {trial.kind} with a collimated display; allowed: flight")
-    if scene.tracker.decoder and not isinstance(trial, FlightTrial):
-        raise InputError(f"trial.kind: {trial.kind} with tracker.decoder, which needs many frames; allowed: flight")
+    if scene.tracker.decoder and isinstance(trial, FrameTrial):
+        raise InputError("trial.kind: frames with tracker.decoder, which needs many; allowed: centroids, flight")
     if SURVEY_SEED in plan.spec.hardware and not has_survey_errors(scene):
         raise InputError(
             "hardware: tracker.survey.seed has no effect without errors of the survey; allowed: with"

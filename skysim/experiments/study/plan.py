@@ -100,6 +100,9 @@ RateAxis = Annotated[
 class CentroidTrial(RandomAttitude):
     """Identification and attitude from simulated centroids, without an image.
 
+    With `tracker.decoder` they are those of successive frames at rest, to the first with an attitude, as many as the
+    code has bits at most.
+
     noise_px : standard deviation of a centroid, each axis;  magnitude_sigma : of its brightness, magnitudes
     lights   : maximum number of true sources, the brightest;  missing : fraction of the true sources not detected
     false_lights : number of false detections, uniform over the image
