@@ -84,7 +84,7 @@ def check(plan: Plan, to_run: bool) -> None:
 
     to_run : whether the trackers and controllers must be installed
     """
-    from skysim.experiments.study.analysis import search
+    from skysim.experiments.study.analysis import cost, search
     from skysim.experiments.study.store import COLUMNS
 
     study = plan.study
@@ -106,6 +106,8 @@ def check(plan: Plan, to_run: bool) -> None:
         try:
             scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(settings, 0))
             check_trial(plan, scene, trial, to_run)
+            if study.optimize:
+                cost.check_parts(study.optimize.cost, scene)
         except InputError as error:
             raise InputError(at_factor(study, name, level, error)) from None
         points.append(unused_options.CheckedPoint(name, level, own, settings, scene, trial))
