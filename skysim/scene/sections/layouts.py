@@ -202,8 +202,8 @@ class StringConfig(LitConfig):
 class OptimizedConfig(DimmedConfig):
     """`count` LEDs placed for one camera's best accuracy at its worst attitudes: tilts to tilt_deg, any yaw.
 
-    field_deg : the camera's field of view along body x and y
-    camera    : its entrance pupil on the body; it looks along body z
+    field_deg : the camera's field of view along body x and y; the scene's camera's if left out, its rows along x
+    camera    : its entrance pupil on the body, `vehicle.camera` if left out; it looks along body z
     spacing   : least distance between two LEDs
     coincidence : LEDs of two fields coincide if they are closer than this when one field is laid on the other: a few
         times the survey's error
@@ -214,8 +214,8 @@ class OptimizedConfig(DimmedConfig):
     kind: Literal["optimized"]
     count: Annotated[int, Field(ge=3, le=2000)]
     tilt_deg: Annotated[Number, Field(ge=0, le=60)]
-    field_deg: tuple[FieldOfView, FieldOfView]
-    camera_m: tuple[Length, Length, Length]
+    field_deg: tuple[FieldOfView, FieldOfView] | None = None
+    camera_m: tuple[Length, Length, Length] | None = None
     spacing_m: Annotated[Length, Field(gt=0)]
     coincidence_m: Annotated[Length, Field(gt=0)] = 1e-3
     min_leds: Annotated[int, Field(ge=2, le=50)] = 5
