@@ -7,6 +7,7 @@ reject blended LEDs, and solve.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from functools import partial
 
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude import systematic
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, on_sphere, project
-from estimator.attitude.nearfield import SOLVERS, fitted_sigma_rad
+from estimator.attitude.nearfield import SOLVERS, fit_focal_ratio, fitted_sigma_rad
 from estimator.catalog import pair_index
 from estimator.core import checks
 from estimator.core.arrays import Floats
@@ -42,6 +43,10 @@ from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_strea
 from estimator.trackers.star_tracker import NO_STARS
 
 MIN_ERROR_PX = 0.3  # least centroid error of an LED, for effects outside of survey and calibration
+FOCAL_UNCERTAINTY = 0.12  # greatest relative error of a focal length that is not calibrated
+FOCAL_CHECKS = 10_000_000  # effort of its search: a second at most
+MAX_FOCAL_SIGMA = 0.5  # of a `Camera`
+FITS_FOCAL = ("non_dimensional",)  # identifiers after which the focal length is fitted with the attitude
 SETTINGS = Settings(identifier="led_pairs", solver="rotation_only")
 Identify = Callable[[Floats, Floats], StarMatch | str]
 
@@ -51,6 +56,22 @@ def led_pairs(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) ->
     sight = build_dome_index(leds, lever, camera)
     least_rad = MIN_ERROR_PX / camera.focal_px
     return lambda rays_cam, sigma_rad: search.identify(rays_cam, np.hypot(sigma_rad, least_rad), sight)
+
+
+def non_dimensional(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
+    """LEDs for a focal length that is known to FOCAL_UNCERTAINTY, or to three standard deviations if they are more.
+
+    See `identification.leds.search`. The index holds the pairs of the widest field that the camera may have, and the
+    field of the assumed one, in whose tangents the detections are.
+    """
+    uncertainty = min(max(FOCAL_UNCERTAINTY, 3 * camera.focal_sigma), 0.5)
+    nominal = build_dome_index(leds, lever, camera)
+    sight = build_dome_index(leds, lever, camera.zoomed(1 - uncertainty))
+    sight = sight._replace(field_tan=nominal.field_tan, field_area=nominal.field_area)
+    least_rad = MIN_ERROR_PX / camera.focal_px
+    return lambda rays_cam, sigma_rad: search.identify(
+        rays_cam, np.hypot(sigma_rad, least_rad), sight, FOCAL_CHECKS, uncertainty
+    )
 
 
 def star_identifier(name: str, camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
@@ -86,6 +107,7 @@ def star_identifier(name: str, camera: Camera, leds: LedMap, lever: Lever, setti
 # match, or the reason for a refusal.
 IDENTIFIERS: dict[str, Callable[[Camera, LedMap, Lever, Settings], Identify]] = {
     "led_pairs": led_pairs,
+    "non_dimensional": non_dimensional,
     "pyramid": partial(star_identifier, "pyramid"),
     "saa": partial(star_identifier, "saa"),
 }
@@ -199,8 +221,10 @@ class DomeTracker:
         """Identify and solve centroids of one time."""
         bright = brightest(centroids, self.settings)
         rays = self.camera.rays(bright.xy_px)
-        focal_rad = focal_error_rad(rays, self.camera)
-        match = self.identify(rays, np.hypot(direction_sigma_rad(bright, self.camera, self.settings), focal_rad))
+        sigma_rad = direction_sigma_rad(bright, self.camera, self.settings)
+        if self.settings.identifier not in FITS_FOCAL:
+            sigma_rad = np.hypot(sigma_rad, focal_error_rad(rays, self.camera))
+        match = self.identify(rays, sigma_rad)
         return self._solve_identified(centroids, match, clock)
 
     def _solve_identified(self, centroids: Centroids, match: StarMatch | str, clock: Clock) -> Attitude:
@@ -214,6 +238,38 @@ class DomeTracker:
 
     def solve_match(self, centroids: Centroids, match: StarMatch) -> Attitude:
         """Match every centroid with the exact geometry, then solve these matches with the solver of the settings.
+
+        Where the focal length is uncertain (FITS_FOCAL), it is first fitted with the attitude to the identified LEDs,
+        and once more to all that match, with the distortion at the new scale. The answer's camera has it, with its
+        standard deviation, which counts in the covariance.
+        """
+        if self.settings.identifier not in FITS_FOCAL:
+            return self._solve_calibrated(centroids, match)
+        tracker, attitude = self, Attitude(NO_MATCH)
+        for _ in range(2):
+            try:
+                tracker = tracker._with_fitted_focal(centroids, match)
+            except (ValueError, np.linalg.LinAlgError) as error:
+                return Attitude(f"no attitude: {error}")
+            attitude = tracker._solve_calibrated(centroids, match)
+            if attitude.match is None:
+                break
+            match = attitude.match
+        return attitude
+
+    def _with_fitted_focal(self, centroids: Centroids, match: StarMatch) -> DomeTracker:
+        """This tracker with the focal length that fits the matches, and its error by centroids and map."""
+        rays = self.camera.rays(centroids.xy_px[match.observed])
+        pixel_rad = direction_sigma_rad(centroids, self.camera, self.settings)[match.observed]
+        sigma_rad = np.hypot(pixel_rad, self.led_sigma_rad[match.star])
+        body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
+        ratio, sigma = fit_focal_ratio(rays, sigma_rad, self.leds.position_m[match.star], self.lever, body_from_lab)
+        fitted = copy(self)
+        fitted.camera = replace(self.camera.zoomed(ratio), focal_sigma=min(sigma, MAX_FOCAL_SIGMA))
+        return fitted
+
+    def _solve_calibrated(self, centroids: Centroids, match: StarMatch) -> Attitude:
+        """The attitude for a known focal length.
 
         The matching always uses the exact solver: an approximate one could lose matches. All solvers are therefore
         compared on the same matches.
