@@ -100,7 +100,7 @@ def dome_draws_nothing(scene: Scene) -> bool:
     led, layout = scene.light.led, scene.light.layout
     if led.scatter or led.color_scatter_m or (led.aging and led.aging.scatter):
         return False
-    if isinstance(layout, FibersConfig) and layout.radius_variation:
+    if isinstance(layout, FibersConfig) and (layout.radius_variation or layout.aiming):
         return False
     points = layout.points if isinstance(layout, FibersConfig | LcdConfig) else layout
     if isinstance(points, FibonacciConfig):
