@@ -74,14 +74,13 @@ def rotation_only(
 
 def fit_focal_ratio(
     rays_cam: Floats, sigma_rad: Floats, position_m: Floats, lever: Lever, body_from_lab: Rotation
-) -> tuple[float, float]:
-    """The true focal length over the assumed one, and its relative standard deviation, from N >= 2 rays and their LEDs.
+) -> float:
+    """The true focal length over the assumed one, from N >= 2 rays and their LEDs.
 
     The fit of `rotation_only` with one more unknown, the logarithm of the ratio rho: the tangents are
     rho (q_x / q_z, q_y / q_z), their derivative by it they themselves. Raises ValueError as that does.
     """
-    _, ratio, covariance = _fit_rotation(rays_cam, sigma_rad, position_m, lever, body_from_lab, True)
-    return ratio, float(np.sqrt(covariance[3, 3]))
+    return _fit_rotation(rays_cam, sigma_rad, position_m, lever, body_from_lab, True)[1]
 
 
 def _fit_rotation(

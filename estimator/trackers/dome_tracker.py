@@ -154,6 +154,7 @@ class DomeTracker:
         self.camera, self.leds, self.lever, self.settings = camera, leds, lever, settings
         self.identify = IDENTIFIERS[settings.identifier](camera, leds, lever, settings)
         self.led_sigma_rad = led_sigma_rad(leds, lever)
+        self.focal_fitted = False  # whether the camera's focal length is one that this frame's lights gave
 
     def solve(
         self,
@@ -259,14 +260,24 @@ class DomeTracker:
 
     def _with_fitted_focal(self, centroids: Centroids, match: StarMatch) -> DomeTracker:
         """This tracker with the focal length that fits the matches, and its error by centroids and map."""
-        rays = self.camera.rays(centroids.xy_px[match.observed])
-        pixel_rad = direction_sigma_rad(centroids, self.camera, self.settings)[match.observed]
-        sigma_rad = np.hypot(pixel_rad, self.led_sigma_rad[match.star])
+        observed, star = match.observed, match.star
+        rays = self.camera.rays(centroids.xy_px[observed])
+        pixel_rad = direction_sigma_rad(centroids, self.camera, self.settings)[observed]
+        sigma_rad = np.hypot(pixel_rad, self.led_sigma_rad[star])
         body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
-        ratio, sigma = fit_focal_ratio(rays, sigma_rad, self.leds.position_m[match.star], self.lever, body_from_lab)
+        ratio = fit_focal_ratio(rays, sigma_rad, self.leds.position_m[star], self.lever, body_from_lab)
         fitted = copy(self)
-        fitted.camera = replace(self.camera.zoomed(ratio), focal_sigma=min(sigma, MAX_FOCAL_SIGMA))
+        fitted.camera, fitted.focal_fitted = self.camera.zoomed(ratio), True
+        view, common_rad = fitted._common_rad(match.cam_from_ref, star)
+        view = systematic.with_focal(view)
+        variance = systematic.from_independent(view, sigma_rad, systematic.isotropic(sigma_rad))[3, 3]
+        variance += systematic.from_common(view, sigma_rad, common_rad)[3, 3]
+        fitted.camera = replace(fitted.camera, focal_sigma=min(float(np.sqrt(variance)), MAX_FOCAL_SIGMA))
         return fitted
+
+    def _focal_rad(self, rays: Floats) -> Floats:
+        """(N,) `focal_error_rad` of rays; 0 where the focal length is fitted: its error is then of the fit."""
+        return np.zeros(len(rays)) if self.focal_fitted else focal_error_rad(rays, self.camera)
 
     def _solve_calibrated(self, centroids: Centroids, match: StarMatch) -> Attitude:
         """The attitude for a known focal length.
@@ -277,9 +288,7 @@ class DomeTracker:
         observed, star = match.observed, match.star
         body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
         rays = self.camera.rays(centroids.xy_px)
-        pixel_rad = np.hypot(
-            direction_sigma_rad(centroids, self.camera, self.settings), focal_error_rad(rays, self.camera)
-        )
+        pixel_rad = np.hypot(direction_sigma_rad(centroids, self.camera, self.settings), self._focal_rad(rays))
         radius_px = max(4.0, 4 * self.camera.focal_px * float(np.median(np.hypot(pixel_rad, self.led_sigma_rad.max()))))
         try:
             for factor in (3.0, 1.0):
@@ -331,7 +340,7 @@ class DomeTracker:
         misfit     : factor of `_reject_blends` on all but the common errors
         sigma_rad  : (K,) errors on which it is based, (K, 3) rays and (K,) LEDs
         """
-        led_rad, focal_rad = self.led_sigma_rad[star], focal_error_rad(rays, self.camera)
+        led_rad, focal_rad = self.led_sigma_rad[star], self._focal_rad(rays)
         if self.leds.covariance_m2 is None and self.leds.common_m is None and not self.camera.focal_sigma:
             # The LEDs' share of the error variance of a ray: of the covariance too, if it is the same for all rays.
             return misfit * covariance, float(np.mean(led_rad**2 / sigma_rad**2)) * misfit * covariance
@@ -341,16 +350,18 @@ class DomeTracker:
             by_place = view.gradient @ cam_from_lab.as_matrix()
             own_rad2 = by_place @ self.leds.covariance_m2[star] @ np.moveaxis(by_place, 1, 2)
         noise_rad2 = systematic.isotropic(np.sqrt(np.maximum(sigma_rad**2 - led_rad**2 - focal_rad**2, 0)))
-        return systematic.with_survey(covariance, view, sigma_rad, misfit * noise_rad2, misfit * own_rad2, common_rad)
+        errors = misfit * noise_rad2, misfit * own_rad2, common_rad
+        return systematic.with_survey(covariance, view, sigma_rad, *errors, self.focal_fitted)
 
     def _common_rad(self, cam_from_lab: Rotation, star: NDArray) -> tuple[systematic.Geometry, Floats]:
         """K LEDs as the camera sees them, and the (M, K, 2) change of their tangents by the errors that all share.
 
-        Each is changed by one standard deviation: of the focal length first, then of the map's common errors.
+        Each is changed by one standard deviation: of the focal length first, unless it is fitted, then of the map's
+        common errors.
         """
         place_cam = cam_from_lab.apply(self.leds.position_m[star])
         view = systematic.geometry(place_cam, place_cam - self.lever.cam_from_body.apply(self.lever.camera_body_m))
-        common_rad = self.camera.focal_sigma * view.tangent[None]
+        common_rad = self.camera.focal_sigma * view.tangent[None][int(self.focal_fitted) :]
         if self.leds.common_m is not None:
             by_place = view.gradient @ cam_from_lab.as_matrix()
             moved = np.einsum("kij,mkj->mki", by_place, self.leds.common_m[:, star])
@@ -374,21 +385,24 @@ class DomeTracker:
 
         Two LEDs whose images touch form one blob at neither's position. Residual lengths are divided by their sigmas;
         those above 5 times the median (above 5 if the median is below 1) are rejected. The rest has 2 K - 3 degrees of
-        freedom; its chi-square has that mean, and more by what the attitude cannot absorb of the common errors. If it
-        exceeds its mean by more than 3 standard deviations, their ratio is the factor, else 1.
+        freedom, one less if the focal length is fitted; its chi-square has that mean, and more by what the fit cannot
+        absorb of the common errors. If it exceeds its mean by more than 3 standard deviations, their ratio is the
+        factor, else 1.
         """
         residual = self._residual_px(centroids, observed, star, body_from_lab)
         length = np.linalg.norm(residual, axis=1) / (sigma_rad * self.camera.focal_px)
         inlier = length <= 5 * max(float(np.median(length)), 1.0)
         if inlier.sum() < max(MIN_EVIDENCE_MATCHES, len(inlier) / 2):
             inlier[:] = True
-        dof = 2 * int(inlier.sum()) - 3
+        dof = 2 * int(inlier.sum()) - (4 if self.focal_fitted else 3)
         mean, spread = float(dof), np.sqrt(2 * dof)
         if self.leds.common_m is not None or self.camera.focal_sigma:
             view, common_rad = self._common_rad(self.lever.cam_from_body * body_from_lab, star[inlier])
-            left = systematic.residual_products(view, sigma_rad[inlier], common_rad)
+            fit = systematic.with_focal(view) if self.focal_fitted else view
+            left = systematic.residual_products(fit, sigma_rad[inlier], common_rad)
             # The focal length's error is in the sigmas too, as if it were independent.
-            focal_rad = self.camera.focal_sigma * np.linalg.norm(view.tangent, axis=1) / np.sqrt(2)
+            focal_sigma = 0.0 if self.focal_fitted else self.camera.focal_sigma
+            focal_rad = focal_sigma * np.linalg.norm(view.tangent, axis=1) / np.sqrt(2)
             noise = 1 - float(np.mean(focal_rad**2 / sigma_rad[inlier] ** 2))
             mean = noise * dof + float(np.trace(left))
             spread = np.sqrt(2 * noise**2 * dof + 4 * noise * np.trace(left) + 2 * np.trace(left @ left))
