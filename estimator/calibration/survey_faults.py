@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import gammainccinv
 
 from estimator.attitude.dome_map import LedMap, Lever, on_surface, project
 from estimator.core.arrays import Floats, Ints
@@ -24,7 +24,7 @@ from estimator.core.camera import Camera
 Mask = NDArray[np.bool_]
 FALSE_ALARMS = 1e-3  # mean number of surveys with a false alarm of one kind
 MIN_FRAMES = 3  # that must show a light, or fail to show it
-CHI2_MEDIAN = float(chi2.median(3))
+CHI2_MEDIAN = 2.366  # of three degrees of freedom
 TINY_M2 = 1e-18  # keeps a variance of 0 from a division
 SURFACE_SIGMA_M = 0.005  # of the assumed surface, for the distance of a light seen from one side only
 GATE = 5.0  # standard deviations of a ray that belongs to a light
@@ -108,7 +108,7 @@ def displaced(list_m: Floats, found_m: Floats, covariance_m2: Floats) -> tuple[I
     for _ in range(60):  # bisection: the median falls with s
         middle = (low + high) / 2
         low, high = (middle, high) if np.median(value(middle)) > CHI2_MEDIAN else (low, middle)
-    return rows[value(high) > chi2.isf(FALSE_ALARMS / len(rows), 3)], high
+    return rows[value(high) > 2 * gammainccinv(1.5, FALSE_ALARMS / len(rows))], high
 
 
 def stray_lights(held: HeldFrames, frame: Ints, xy_px: Floats, sigma_px: float, reach_m: float) -> list[StrayLight]:

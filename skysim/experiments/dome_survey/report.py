@@ -179,9 +179,9 @@ def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults | None, furthe
         }
         for name, (numbers, marker, color) in marks.items():
             rows = rows_of(numbers, leds.id)
-            face = color if marker == "x" else "none"
+            colors = {"color": color} if marker == "x" else {"facecolor": "none", "edgecolor": color}
             if len(rows):
-                axes.scatter(x_m[rows], y_m[rows], 70, color=face, edgecolor=color, marker=marker, label=name)
+                axes.scatter(x_m[rows], y_m[rows], 70, marker=marker, label=name, **colors)
             for row in rows:
                 axes.annotate(str(leds.id[row]), (x_m[row], y_m[row]), (6, 6), textcoords="offset points", color=color)
     if further is not None:
