@@ -77,9 +77,7 @@ def identify(
         return AMBIGUOUS
     if hypothesis.dex < ACCEPT_DEX:
         return NO_MATCH
-    return StarMatch(
-        hypothesis.observed, hypothesis.star, rotation(hypothesis.R_cam_from_lab), -hypothesis.dex
-    )
+    return StarMatch(hypothesis.observed, hypothesis.star, rotation(hypothesis.R_cam_from_lab), -hypothesis.dex)
 
 
 def build_detections(
