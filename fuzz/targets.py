@@ -31,6 +31,7 @@ from skysim.dynamics.profiles.spline import fit_spline
 from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study import store
 from skysim.results.files import recording
+from skysim.results.files.builder.prices import read_prices
 from skysim.scene import loader, opencv_calibration
 from skysim.sources import catalog as star_catalog
 from skysim.sources import photometry
@@ -122,7 +123,7 @@ def calibrations(data: bytes) -> None:
 
 
 def tables(data: bytes) -> None:
-    """CSV tables: LEDs, surveyed points of a dome, a curve over wavelength, a point-spread function."""
+    """CSV tables: LEDs, points of a dome, a curve over wavelength, a point-spread function, prices."""
     path = write_file(data, "table.csv")
     rejects(lambda: listed.read_csv(path), InputError)
     rejects(lambda: point_cloud.fit(point_cloud.read(str(path), "m"), 2, str(path)), InputError)
@@ -130,6 +131,7 @@ def tables(data: bytes) -> None:
         # bypass the cache, whose key is the path
         rejects(lambda largest=largest: photometry._read_curve.__wrapped__(path, 0, largest), InputError)
     rejects(lambda: otf.read_cells.__wrapped__(str(path)), InputError)
+    rejects(lambda: read_prices(path), InputError)
 
 
 def vehicles(data: bytes) -> None:

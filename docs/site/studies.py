@@ -9,8 +9,11 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from skysim.apps.cli.study_summary import trial_count
 from skysim.core.paths import STUDIES
+from skysim.core.types import Floats
 from skysim.experiments.study import store
 from skysim.experiments.study.analysis import answer, axes, search, sensitivity, table
 from skysim.experiments.study.analysis.table import PointRow
@@ -22,6 +25,7 @@ from skysim.experiments.study.report import page as study_page
 from skysim.experiments.study.store import STORE, Store
 
 PAGES = Path(__file__).parents[1] / "findings" / "studies"
+BESIDE = {"dome_for_the_money": "dome_without_codes"}  # a search whose front is drawn in another one's figure
 MAX_OPEN_ROWS = 72  # longer tables are folded
 
 
@@ -39,11 +43,11 @@ def main(folder: Path) -> None:
             if trial_store.meta("digest") != plan.digest or unfinished:
                 print(f"{store_path}: not finished, or of another version of the study; page not changed")
                 continue
-            (PAGES / f"{plan.name}.md").write_text("\n".join(page(plan, trial_store)) + "\n", encoding="utf-8")
+            (PAGES / f"{plan.name}.md").write_text("\n".join(page(plan, trial_store, folder)) + "\n", encoding="utf-8")
         print(PAGES / f"{plan.name}.md")
 
 
-def page(plan: Plan, trial_store: Store) -> Iterator[str]:
+def page(plan: Plan, trial_store: Store, folder: Path) -> Iterator[str]:
     """Yield a study's page line by line; write its figures beside it."""
     study, name, counts = plan.study, plan.name, trial_store.counts()
     verb = "optimize" if study.optimize else "run"
@@ -62,7 +66,7 @@ def page(plan: Plan, trial_store: Store) -> Iterator[str]:
     yield from opening(plan, lines)
     lines = table.select_responses(lines, study_page.responses(study))
     if study.optimize:
-        yield from search_section(plan, trial_store, lines)
+        yield from search_section(plan, trial_store, lines, folder)
     elif study.design.kind == "saltelli":
         yield from sobol_section(plan, trial_store)
     for n, figure in enumerate(study.figures):
@@ -156,7 +160,14 @@ def sobol_section(plan: Plan, trial_store: Store) -> Iterator[str]:
         yield ""
 
 
-def search_section(plan: Plan, trial_store: Store, lines: list[PointRow]) -> Iterator[str]:
+def front_of(name: str, folder: Path) -> Floats:
+    """(K, 2) objectives of the front of another search."""
+    with store.open_store(folder / name / STORE) as trial_store:
+        found = search.collect_result(load(name), trial_store).front
+    return np.array([candidate.objectives for candidate in found])
+
+
+def search_section(plan: Plan, trial_store: Store, lines: list[PointRow], folder: Path) -> Iterator[str]:
     """The front of a search, and a picture of it."""
     assert plan.study.optimize is not None
     result = search.collect_result(plan, trial_store)
@@ -165,7 +176,8 @@ def search_section(plan: Plan, trial_store: Store, lines: list[PointRow]) -> Ite
     names = [candidate.response for candidate in plan.study.optimize.objectives]
     picture = f"{plan.name}.png"
     points, front = [line.point for line in lines], [candidate.number for candidate in result.front]
-    png = study_figures.pareto_png(panels[names[0]], panels[names[-1]], points, front)
+    also = {f"front of {other}": front_of(other, folder) for name, other in BESIDE.items() if name == plan.name}
+    png = study_figures.pareto_png(panels[names[0]], panels[names[-1]], points, front, also)
     (PAGES / picture).write_bytes(png)
     yield f"![Pareto front]({picture})\n"
     feasible = sum(candidate.feasible for candidate in result.candidates)

@@ -17,6 +17,7 @@ from skysim.core.quantities.tolerance import TimeError
 from skysim.core.quantities.units import ConfigModel, Number, Time
 from skysim.core.quantities.utc import check_year
 from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, Glow, Light, StarsConfig
 from skysim.scene.sections.motion import MotionConfig, PointingConfig
 from skysim.scene.sections.orbit import Orbit
@@ -104,6 +105,23 @@ class Scene(ConfigModel):
                 f" {1 / self.exposure.rate_hz:g} s"
             )
         return self
+
+    @model_validator(mode="after")
+    def complete_layout(self) -> Scene:
+        """The scene whose optimized layout has a field of view and a camera: those that it leaves out are its own."""
+        layout = self.light.layout if isinstance(self.light, DomeConfig) else None
+        nested = isinstance(layout, OnPoints)
+        points = layout.points if isinstance(layout, OnPoints) else layout
+        if not isinstance(points, OptimizedConfig):
+            return self
+        camera_m, chip = points.camera_m or self.vehicle.camera_m, (self.camera.width_px, self.camera.height_px)
+        if camera_m is None:
+            key = f"light.layout.{'points.' if nested else ''}camera"
+            raise ValueError(f"{key}: missing; allowed: that, or vehicle.camera")
+        field_deg = tuple(math.degrees(2 * math.atan(side_px / 2 / self.camera.focal_px)) for side_px in chip)
+        points = points.model_copy(update={"camera_m": camera_m, "field_deg": points.field_deg or field_deg})
+        layout = layout.model_copy(update={"points": points}) if nested and layout else points
+        return self.model_copy(update={"light": self.light.model_copy(update={"layout": layout})})
 
     @model_validator(mode="after")
     def check_code(self) -> Scene:

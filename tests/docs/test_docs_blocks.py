@@ -40,6 +40,7 @@ ELSEWHERE = {  # pages whose blocks have a test of their own, which knows what i
 LONG = {
     "tutorial.md",
     "findings/validation.md",
+    "howto/build_a_dome.md",
     "howto/camera.md",
     "howto/cluster.md",
     "howto/dome.md",

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from xml.etree import ElementTree
 
+import ezdxf
 import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.results.files import templates
+from skysim.results.files.builder import templates
+from skysim.results.files.builder.drawing import Drawing, Text, to_dxf
 from skysim.scene import loader
 from skysim.simulation.testbed import Testbed, build_testbed
 from skysim.sources.dome.shell.surface import Ellipsoid, Plane
@@ -53,10 +56,10 @@ def test_a_flat_panel_is_its_own_paper() -> None:
 def test_the_printed_leds_are_where_the_scene_has_them(testbed: Testbed) -> None:
     """Each circle, measured from its gore's apex, names its LED's direction from the bearing."""
     place_m = dict(zip(testbed.sources.id.tolist(), testbed.sources.place[:, :3], strict=True))
-    root = ElementTree.fromstring(templates.template(testbed, "gores"))
+    root = ElementTree.fromstring(templates.template(testbed, ".svg"))
     assert root.get("width") == f"{root.get('viewBox', '').split()[2]}mm"
     gores, seen = 0, set()
-    for element, after in zip(root, [*root[2:], None, None], strict=True):
+    for element, after in zip(root, [*root[3:], None, None, None], strict=True):
         if element.tag == SVG + "polygon":
             points = np.array([pair.split(",") for pair in str(element.get("points")).split()], float)
             assert np.ptp(points[:, 0]) <= 1e3 * templates.MAX_WIDTH_M + 1
@@ -77,8 +80,47 @@ def test_the_printed_leds_are_where_the_scene_has_them(testbed: Testbed) -> None
     assert seen == place_m.keys()
 
 
+def test_the_pattern_to_cut_is_that_to_print(testbed: Testbed, tmp_path: Path) -> None:
+    """DXF as ezdxf reads it, whose y points up from the sheet's lower edge, against the SVG of the same gores."""
+    path = tmp_path / "gores.dxf"
+    path.write_text(templates.template(testbed, ".dxf"))
+    document = ezdxf.readfile(path)
+    assert (document.dxfversion, document.header["$INSUNITS"]) == ("AC1009", 4)
+    assert not document.audit().errors
+    root = ElementTree.fromstring(templates.template(testbed, ".svg"))
+    height_mm = float(str(root.get("viewBox")).split()[3])
+    drawn = document.modelspace()
+    circles = [(c.dxf.center.x, height_mm - c.dxf.center.y, c.dxf.radius) for c in drawn.query("CIRCLE[layer=='LEDS']")]
+    printed = [[float(str(c.get(key))) for key in ("cx", "cy", "r")] for c in root.iter(SVG + "circle")]
+    assert len(printed) == 150
+    assert np.array(circles) == pytest.approx(np.array(printed), abs=1e-3)
+    outlines = [
+        np.array([[v.dxf.location.x, height_mm - v.dxf.location.y] for v in one.vertices])
+        for one in drawn.query("POLYLINE[layer=='OUTLINE']")
+        if one.is_closed
+    ]
+    polygons = [
+        np.array([p.split(",") for p in str(g.get("points")).split()], float) for g in root.iter(SVG + "polygon")
+    ]
+    assert len(outlines) == len(polygons) == 18
+    for cut, paper in zip(outlines, polygons, strict=True):
+        assert cut == pytest.approx(paper, abs=1e-3)
+    words = [(one.dxf.text, one.dxf.height) for one in drawn.query("TEXT")]
+    assert words == [(one.text, float(str(one.get("font-size")))) for one in root.iter(SVG + "text")]
+    assert len(drawn.query("POLYLINE[layer=='HELP']")) == 18
+    assert len(drawn.query("POLYLINE[layer=='CENTERS']")) == 300
+    rule = [one for one in drawn.query("POLYLINE[layer=='OUTLINE']") if not one.is_closed]
+    assert [abs(one.vertices[1].dxf.location.x - one.vertices[0].dxf.location.x) for one in rule] == [100]
+
+
+def test_words_of_a_cutting_pattern_are_ascii() -> None:
+    text = to_dxf(Drawing(10, 10, [Text(1, 2, 3, "Kuppel größer\u2033")]))
+    assert text.isascii()
+    assert "gr\\U+00F6\\U+00DFer\\U+2033" in text
+
+
 def test_the_mesh_is_the_surface_with_a_mark_at_each_led(testbed: Testbed) -> None:
-    objects = re.split(r"^o ", templates.template(testbed, "shell"), flags=re.M)[1:]
+    objects = re.split(r"^o ", templates.template(testbed, ".obj"), flags=re.M)[1:]
     vertices = {
         one.split("\n", 1)[0]: np.array([line.split()[1:] for line in one.split("\n") if line.startswith("v ")], float)
         for one in objects
@@ -99,7 +141,7 @@ def test_the_mesh_is_the_surface_with_a_mark_at_each_led(testbed: Testbed) -> No
 
 def test_every_face_looks_inward_or_out_of_its_mark(testbed: Testbed) -> None:
     """The shell is seen from inside, a mark from all sides: its volume is positive."""
-    lines = templates.template(testbed, "shell").split("\n")
+    lines = templates.template(testbed, ".obj").split("\n")
     points = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float)
     corners = [np.array(line.split()[1:], int) - 1 for line in lines if line.startswith("f ")]
     first = 1 + templates.RINGS * templates.SECTORS
@@ -114,5 +156,5 @@ def test_every_face_looks_inward_or_out_of_its_mark(testbed: Testbed) -> None:
 
 
 def test_the_sky_has_no_gores() -> None:
-    with pytest.raises(InputError, match=r"light.kind: stars has no gores; allowed: dome"):
-        templates.template(build_testbed(loader.load("shefex2")), "gores")
+    with pytest.raises(InputError, match=r"light.kind: stars has no .svg; allowed: dome"):
+        templates.template(build_testbed(loader.load("shefex2")), ".svg")

@@ -456,6 +456,15 @@ def test_fields_alike_are_those_that_the_tracker_refuses_as_ambiguous(layout: st
     assert fact(check(testbed), "fields alike").values["share"] == pytest.approx(ambiguous, abs=0.2)
 
 
+def test_fields_whose_leds_have_names_are_not_alike() -> None:
+    """The same spiral with its codes and without."""
+    any_attitude = {"motion__control": "null", "motion__maneuver": "[]"}
+    told = any_attitude | {"light__layout__count": "700", "tracker__survey__led_sigma": "1 mm"}
+    without = check(bed("coded_spiral", **told, light__led__code="null", tracker__decoder="null"))
+    assert any("look like another one" in line for line in without.findings)
+    assert not any("look like another one" in line for line in check(bed("coded_spiral", **told)).findings)
+
+
 def test_half_of_the_stars_at_the_limit_are_detected() -> None:
     """The limit that `light.catalog` is compared with, on rendered frames: most brighter by half a magnitude are."""
     testbed = bed("shefex2", exposure__frames="1", motion__rate_deg_s="[0, 0, 0]")

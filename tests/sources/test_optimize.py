@@ -13,6 +13,7 @@ from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.nearfield import rotation_only
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Sources
+from skysim.scene import loader
 from skysim.scene.sections import layouts
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources import catalog, dome
@@ -272,3 +273,20 @@ def test_the_spacing_is_the_least_distance_of_two_leds() -> None:
     place_m = np.array([[0.0, 0, 1], [0.03, 0, 1], [0.03, 0.02, 1]])
     assert optimize.spacing_ok(place_m, 0.0199)
     assert not optimize.spacing_ok(place_m, 0.0201)
+
+
+def test_field_and_lever_are_the_scene_s_own_if_left_out() -> None:
+    """2 atan(w / 2 f) of the chip's sides, f the image distance; of a layout on a panel or of fibers too."""
+    layout = "{kind: optimized, count: 20, cap_deg: 20, tilt_deg: 8, spacing: 20 mm%s}"
+    own = {"vehicle.camera": "[0 m, 0 m, 0.3 m]", "camera.focal_length": "20 mm", "camera.focus": "1 m"}
+    for text in (layout % "", "{kind: fibers, points: %s}" % (layout % "")):
+        found = loader.load("afit_simsat", own | {"light.layout": text, "light.led.drive": "{kind: direct}"})
+        points = getattr(found.light.layout, "points", found.light.layout)
+        assert points.camera_m == (0, 0, 0.3)
+        distance_m, sides_m = 1 / (1 / 0.02 - 1 / 1), np.array([1600, 1200]) * found.camera.pixel_m
+        assert points.field_deg == pytest.approx(np.degrees(2 * np.arctan(sides_m / 2 / distance_m)), rel=1e-12)
+    given = ", field_deg: [10, 7.5], camera: [0 m, 0 m, 15 in]"
+    points = loader.load("afit_simsat", own | {"light.layout": layout % given}).light.layout
+    assert (points.field_deg, points.camera_m) == ((10, 7.5), (0, 0, pytest.approx(0.381)))
+    with pytest.raises(InputError, match=r"light\.layout\.camera: missing; allowed: that, or vehicle\.camera"):
+        loader.load("afit_simsat", {"light.layout": layout % ""})

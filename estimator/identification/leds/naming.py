@@ -13,9 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from estimator.attitude.solvers import rotation
 from estimator.core.arrays import Floats, Ints
+from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.leds.search import MARGIN_DEX
@@ -73,7 +74,7 @@ def identify(lights: NamedLights, sphere: Sphere) -> StarMatch | str:
     by_code = excess[rows[matched], star[best][matched]]
     if by_code.sum() > TRUSTED * np.sqrt(matched.sum()) or matched.sum() < max(2, 2 * len(rows) / 3):
         return CONTRADICTED
-    return StarMatch(rows[matched], star[best][matched], Rotation.from_matrix(R_cam_from_lab[best]), -MARGIN_DEX)
+    return StarMatch(rows[matched], star[best][matched], rotation(R_cam_from_lab[best]), -MARGIN_DEX)
 
 
 def _best_pair(ray: Floats, excess: Floats) -> tuple[int, int]:
@@ -90,16 +91,33 @@ def _pair_names(lights: NamedLights, sphere: Sphere, excess: Floats, first: int,
     """(M, 2) names of two lights, the likeliest ones, whose angle about the bearing is that of the lights."""
     rows = [np.flatnonzero(excess[light] <= REACH) for light in (first, second)]
     seen = [_seen_directions(lights.ray[light], sphere, row) for light, row in zip((first, second), rows, strict=True)]
-    cosine = seen[0] @ seen[1].T
-    known = sphere.direction[rows[0]] @ sphere.direction[rows[1]].T
-    gate = GATE_SIGMA * np.hypot(lights.sigma[first], lights.sigma[second])
-    # The difference of two angles that are much greater than it is that of their cosines over the sine.
-    a, b = np.nonzero(np.abs(cosine - known) < gate * np.sqrt(np.maximum(1 - cosine**2, gate**2)))
-    names = np.column_stack([rows[0][a], rows[1][b]])
+    known = [sphere.direction[row] for row in rows]
+    gate = float(GATE_SIGMA * np.hypot(lights.sigma[first], lights.sigma[second]))
+    pairs = np.empty((_alike(*seen, *known, gate, np.empty((0, 2), np.int64)), 2), np.int64)
+    _alike(*seen, *known, gate, pairs)
+    names = np.column_stack([rows[0][pairs[:, 0]], rows[1][pairs[:, 1]]])
     names = names[names[:, 0] != names[:, 1]]
     cost = excess[first, names[:, 0]] + excess[second, names[:, 1]]
     order = np.argsort(cost, kind="stable")
     return names[order[:MAX_HYPOTHESES]] if len(order) else names
+
+
+@jit
+def _alike(u: Floats, v: Floats, known_u: Floats, known_v: Floats, gate: float, pairs: Ints) -> int:
+    """How many pairs of u (K, 3) and v (L, 3) are as far apart as their known directions; the first fill `pairs`.
+
+    The difference of two angles that are much greater than it is that of their cosines over the sine.
+    """
+    found = 0
+    for a in range(len(u)):
+        for b in range(len(v)):
+            cosine = u[a, 0] * v[b, 0] + u[a, 1] * v[b, 1] + u[a, 2] * v[b, 2]
+            known = known_u[a, 0] * known_v[b, 0] + known_u[a, 1] * known_v[b, 1] + known_u[a, 2] * known_v[b, 2]
+            if (cosine - known) ** 2 < gate**2 * max(1 - cosine**2, gate**2):
+                if found < len(pairs):
+                    pairs[found, 0], pairs[found, 1] = a, b
+                found += 1
+    return found
 
 
 def _seen_directions(ray: Floats, sphere: Sphere, rows: Ints) -> Floats:

@@ -51,6 +51,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "scenes": ("skysim scenes", "skysim scenes show shefex2", "skysim scenes export simsat_cmg"),
     "scenes show": ("skysim scenes show shefex2", 'skysim scenes show mine.yaml --set camera.focal_length="16 mm"'),
+    "scenes parts": (
+        "skysim scenes parts coded_spiral",
+        "skysim scenes parts afit_simsat --out out/parts.csv",
+    ),
     "scenes export": ("skysim scenes export simsat_cmg --out out/simsat.xml",),
     "catalog": ("skysim catalog info", "skysim catalog build --source gaia --limit 9 --out deep.ecsv"),
     "catalog build": ("skysim catalog build --source gaia --limit 9 --out deep.ecsv",),

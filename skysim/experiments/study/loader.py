@@ -21,6 +21,7 @@ from skysim.experiments.study.plan import (
     CentroidTrial,
     Figure,
     FlightTrial,
+    FrameTrial,
     Map,
     Plan,
     Study,
@@ -83,7 +84,7 @@ def check(plan: Plan, to_run: bool) -> None:
 
     to_run : whether the trackers and controllers must be installed
     """
-    from skysim.experiments.study.analysis import search
+    from skysim.experiments.study.analysis import cost, search
     from skysim.experiments.study.store import COLUMNS
 
     study = plan.study
@@ -105,6 +106,8 @@ def check(plan: Plan, to_run: bool) -> None:
         try:
             scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(settings, 0))
             check_trial(plan, scene, trial, to_run)
+            if study.optimize:
+                cost.check_parts(study.optimize.cost, scene)
         except InputError as error:
             raise InputError(at_factor(study, name, level, error)) from None
         points.append(unused_options.CheckedPoint(name, level, own, settings, scene, trial))
@@ -163,8 +166,8 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
     """Raise InputError where the trial does not fit the scene of a level."""
     if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(trial, FlightTrial):
         raise InputError(f"trial.kind: {trial.kind} with a collimated display; allowed: flight")
-    if scene.tracker.decoder and not isinstance(trial, FlightTrial):
-        raise InputError(f"trial.kind: {trial.kind} with tracker.decoder, which needs many frames; allowed: flight")
+    if scene.tracker.decoder and isinstance(trial, FrameTrial):
+        raise InputError("trial.kind: frames with tracker.decoder, which needs many; allowed: centroids, flight")
     if SURVEY_SEED in plan.spec.hardware and not has_survey_errors(scene):
         raise InputError(
             "hardware: tracker.survey.seed has no effect without errors of the survey; allowed: with"

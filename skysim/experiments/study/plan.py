@@ -20,6 +20,7 @@ from skysim.core.paths import STUDIES
 from skysim.core.quantities.units import ConfigModel, Fraction, NotNegative, Number, Time, Triple
 from skysim.experiments.study.designs import Design, Point, points
 from skysim.experiments.study.factors import Factor, Settings, Value
+from skysim.results.files.builder.prices import Prices, find_prices, read_prices
 from skysim.scene.loader import find as find_scene
 from skysim.scene.loader import load as load_scene
 from skysim.scene.scene import Scene
@@ -99,6 +100,9 @@ RateAxis = Annotated[
 
 class CentroidTrial(RandomAttitude):
     """Identification and attitude from simulated centroids, without an image.
+
+    With `tracker.decoder` they are those of successive frames at rest, to the first with an attitude, as many as the
+    code has bits at most.
 
     noise_px : standard deviation of a centroid, each axis;  magnitude_sigma : of its brightness, magnitudes
     lights   : maximum number of true sources, the brightest;  missing : fraction of the true sources not detected
@@ -251,8 +255,13 @@ class Threshold(ConfigModel):
 
 
 class Cost(ConfigModel):
-    """Cost of a point: base + sum of `per` times the factor's value + the prices of its named levels."""
+    """Cost of a point: base + sum of `per` times the factor's value + the prices of its named levels + its parts.
 
+    parts : table of prices of the scene's parts (`skysim scenes parts`), whose total is added: `assumed`, or a CSV file
+        beside the study; none if left out
+    """
+
+    parts: str | None = None
     base: Number = 0.0
     per: dict[str, Number] = Field(default_factory=dict)
     levels: dict[str, dict[str, Number]] = Field(default_factory=dict)
@@ -350,12 +359,16 @@ class TrialSpec:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A study with its design points. Trial number = point * replicates + replicate."""
+    """A study with its design points. Trial number = point * replicates + replicate.
+
+    prices : of `optimize.cost.parts`
+    """
 
     path: Path
     study: Study
     spec: TrialSpec
     points: list[Point]
+    prices: Prices | None = None
 
     @property
     def name(self) -> str:
@@ -372,7 +385,8 @@ class Plan:
         """Hash of everything that affects a trial's outcome; title, figures, responses and budget may change."""
         tree = self.study.model_dump(mode="json", by_alias=True)
         keys = ("scene", "seed", "set", "trial", "factors", "design", "replicates", "paired", "hardware", "optimize")
-        return digest({key: tree[key] for key in keys})
+        parts = {"prices": self.prices.parts} if self.prices else {}
+        return digest({key: tree[key] for key in keys} | parts)
 
 
 def digest(value: Any) -> str:
@@ -387,11 +401,13 @@ def find(name: str) -> Path:
 
 
 def make_plan(path: Path, study: Study, trial: dict[str, Any], programs: Mapping[str, str]) -> Plan:
-    """The plan of a study; `trial` is the section as written in the file, with units."""
+    """The plan of a study; `trial` is the section as written in the file, with units. Raises InputError for prices."""
     chosen = [] if study.optimize else points(study.design, study.factors, study.seed)
     folder = str(path.resolve().parent)
     spec = TrialSpec(study.scene, folder, study.seed, study.set, trial, study.paired, study.hardware, dict(programs))
-    return Plan(path, study, spec, chosen)
+    parts = study.optimize.cost.parts if study.optimize else None
+    prices = read_prices(find_prices(parts, path.resolve().parent)) if parts else None
+    return Plan(path, study, spec, chosen, prices)
 
 
 def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:

@@ -127,15 +127,22 @@ RULES = (
     ),
     Rule(
         (
-            *("exposure.time", "exposure.first", "exposure.trigger_jitter", "background", "camera.transmission"),
-            *("camera.f_number", "camera.psf", "camera.shutter", *DETECTOR, "tracker.detector", "tracker.centroider"),
-            *("tracker.threshold_sigma", "tracker.min_area_px", "light.led.intensity", "light.led.radiant_intensity"),
-            *("light.led.pwm_period", "light.led.clock", "light.reflection", "camera.ghosts", "camera.glare"),
+            *("background", "camera.psf", "camera.shutter", *DETECTOR, "tracker.detector", "tracker.centroider"),
+            *("tracker.threshold_sigma", "tracker.min_area_px", "light.reflection", "camera.ghosts", "camera.glare"),
             "camera.chromatic.focus",
         ),
         lambda scene, trial: isinstance(trial, CentroidTrial),
         "a trial of kind centroids has no image: trial.noise_px is the centroids' error",
         "trial.kind: frames",
+    ),
+    Rule(
+        (
+            *("exposure.time", "exposure.first", "exposure.trigger_jitter", "camera.transmission", "camera.f_number"),
+            *("light.led.intensity", "light.led.radiant_intensity", "light.led.pwm_period", "light.led.clock"),
+        ),
+        lambda scene, trial: isinstance(trial, CentroidTrial) and scene.tracker.decoder is None,
+        "a trial of kind centroids has no image: trial.noise_px is the centroids' error",
+        "trial.kind: frames, or tracker.decoder, which reads the lights' brightness",
     ),
     Rule(
         ("light.led.disk_diameter",),

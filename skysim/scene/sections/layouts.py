@@ -94,11 +94,15 @@ class DimmedConfig(ConfigModel):
 
     Each LED's brightness is drawn from the list (in `listed`, the list has one value per LED). The smallest magnitude
     is full brightness.
+
+    unique_neighbors : the levels are drawn so that each LED with so many nearest ones looks different from all others,
+        however the field is turned
     """
 
     cap_deg: Cap
     levels: Levels | None = None
     magnitudes: Magnitudes | None = None
+    unique_neighbors: Annotated[int, Field(ge=3, le=16)] | None = None
     hardware_seed: Seed = 0
 
     @property
@@ -110,6 +114,10 @@ class DimmedConfig(ConfigModel):
     def check_brightness(self) -> Self:
         if self.levels is not None and self.magnitudes is not None:
             raise ValueError("a layout takes either levels or magnitudes")
+        if self.unique_neighbors and len(set(self.dimming)) < 2:
+            raise ValueError(
+                "unique_neighbors: all LEDs are equally bright; allowed: two levels or magnitudes, or more"
+            )
         return self
 
 
@@ -195,8 +203,8 @@ class StringConfig(LitConfig):
 class OptimizedConfig(DimmedConfig):
     """`count` LEDs placed for one camera's best accuracy at its worst attitudes: tilts to tilt_deg, any yaw.
 
-    field_deg : the camera's field of view along body x and y
-    camera    : its entrance pupil on the body; it looks along body z
+    field_deg : the camera's field of view along body x and y; the scene's camera's if left out, its rows along x
+    camera    : its entrance pupil on the body, `vehicle.camera` if left out; it looks along body z
     spacing   : least distance between two LEDs
     coincidence : LEDs of two fields coincide if they are closer than this when one field is laid on the other: a few
         times the survey's error
@@ -207,8 +215,8 @@ class OptimizedConfig(DimmedConfig):
     kind: Literal["optimized"]
     count: Annotated[int, Field(ge=3, le=2000)]
     tilt_deg: Annotated[Number, Field(ge=0, le=60)]
-    field_deg: tuple[FieldOfView, FieldOfView]
-    camera_m: tuple[Length, Length, Length]
+    field_deg: tuple[FieldOfView, FieldOfView] | None = None
+    camera_m: tuple[Length, Length, Length] | None = None
     spacing_m: Annotated[Length, Field(gt=0)]
     coincidence_m: Annotated[Length, Field(gt=0)] = 1e-3
     min_leds: Annotated[int, Field(ge=2, le=50)] = 5
@@ -269,6 +277,8 @@ class ListedConfig(DimmedConfig):
         if len(lists) != 1:
             raise ValueError("listed takes one of positions, directions_deg, file")
         dimmed = len(self.levels or self.magnitudes or ())
+        if self.unique_neighbors:
+            raise ValueError("unique_neighbors: a list has its own levels; allowed: none")
         if dimmed and self.file is not None:
             raise ValueError("levels and magnitudes of a file belong in its columns")
         if dimmed and dimmed != len(lists[0]):

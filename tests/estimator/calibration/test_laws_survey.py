@@ -255,6 +255,7 @@ def filmed(rng: np.random.Generator, count: int) -> tuple[list[StarFrame], Rotat
     return frames, truths
 
 
+@pytest.mark.slow
 @law(star_field.calibrate, star_field.disagreement_px, LensPrior.sigma)
 @given(rng=SEEDS, longer=some.floats(-0.03, 0.03))
 def test_star_fields_give_the_lens(rng: np.random.Generator, longer: float) -> None:

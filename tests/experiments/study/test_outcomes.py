@@ -26,10 +26,9 @@ ARCMIN_RAD = math.radians(1 / 60)
 def solved(spec: TrialSpec, seed: int = 3) -> tuple[Setup, Report, TrueLights]:
     """A centroid trial's report and true lights."""
     setup = setups.prepared_setup(spec, {})
-    lab_from_body, xy_px, detections = trials.simulate_centroids(setup, seed)
-    report = Report(setup.estimator.solve_centroids(detections), detections)
+    lights, report = trials.solved_centroids(setup, seed)
     assert report.attitude.solved
-    return setup, report, TrueLights(lab_from_body, xy_px, xy_px, None)
+    return setup, report, lights
 
 
 def scored(setup: Setup, report: Report, lights: TrueLights) -> Outcome:

@@ -145,7 +145,7 @@ def test_codes_of_leds_need_a_flight(tmp_path):
     single = FLIGHT.format(scene="coded_spiral", start="scene").replace(
         "{kind: flight, start: scene}", "{kind: frames}"
     )
-    with pytest.raises(InputError, match=r"trial\.kind: frames with tracker\.decoder, which needs many frames"):
+    with pytest.raises(InputError, match=r"frames with tracker\.decoder, which needs many; allowed: centroids, flight"):
         loader.load(written(tmp_path, single))
 
 

@@ -15,13 +15,16 @@ import yaml
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan, store
-from skysim.experiments.study.analysis import search
+from skysim.experiments.study.analysis import cost, search
 from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution import engines, runner
 from skysim.experiments.study.execution.outcomes import FAILED, Outcome
 from skysim.experiments.study.execution.setups import code_version, seed_of
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.factors import Settings
+from skysim.results.files.builder.parts import parts_list
+from skysim.results.files.builder.prices import find_prices, read_prices
+from skysim.scene import loader as scene_loader
 
 pytest.importorskip("optuna")
 
@@ -331,8 +334,55 @@ def test_cost_is_in_si_units(tmp_path: Path) -> None:
             },
         }
     )
-    price = search.cost(wanted, {"size": "48 in", "leds": 300, "dome": "precise"})
+    price = cost.factors_cost(wanted.cost, {"size": "48 in", "leds": 300, "dome": "precise"})
     assert price == pytest.approx(1 + 2 * 1.2192 + 3 + 5, rel=1e-12)
+
+
+DOME = STUDY | {
+    "scene": "coded_spiral",
+    "factors": {
+        "leds": {"key": "light.layout.count", "values": [100, 200]},
+        "survey": {"key": "tracker.survey.led_sigma", "values": ["0.2 mm", "1 mm"]},
+    },
+}
+
+
+def priced(folder: Path, parts: str) -> plan.Plan:
+    config = {"candidates": 2, "objectives": [{"response": "cost"}], "cost": {"parts": parts, "base": 7}}
+    return loaded(folder, DOME | {"optimize": config})
+
+
+def test_cost_is_the_total_of_the_parts(tmp_path: Path) -> None:
+    """As `skysim scenes parts` has it, of the candidate's own scene; a survey that no line reaches has none."""
+    made = priced(tmp_path, "assumed")
+    settings: Settings = {"light.layout.count": 200, "tracker.survey.led_sigma": "1 mm"}
+    scene = scene_loader.load("coded_spiral", {key: str(value) for key, value in settings.items()})
+    total = parts_list(scene, read_prices(find_prices("assumed"))).total
+    found, why = cost.cost(made, Point({"leds": 200, "survey": "1 mm"}, settings))
+    assert (found, why) == (pytest.approx(7 + total, abs=1e-9), "")
+    refused, why = cost.cost(made, Point({}, settings | {"tracker.survey.led_sigma": "1 um"}))
+    assert math.isnan(refused)
+    assert "no survey reaches 0.001 mm" in why
+
+
+def test_other_prices_are_another_search(tmp_path: Path) -> None:
+    text = find_prices("assumed").read_text()
+    (tmp_path / "mine.csv").write_text(text)
+    first = priced(tmp_path, "mine.csv")
+    assert first.digest != priced(tmp_path, "assumed").digest
+    (tmp_path / "mine.csv").write_text(text.replace("led,each,0.4", "led,each,0.5"))
+    again = priced(tmp_path, "mine.csv")
+    assert again.digest != first.digest
+    settings: Settings = {"light.layout.count": 200}
+    prices = [cost.cost(one, Point({}, settings))[0] for one in (first, again)]
+    assert prices[1] - prices[0] == pytest.approx(200 * 0.1, abs=0.01)
+
+
+def test_bad_prices_are_the_study_s_fault(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.csv cannot be read .*study\.yaml"):
+        priced(tmp_path, "none.csv")
+    with pytest.raises(InputError, match=r"optimize\.cost\.parts: light of kind stars has no parts; allowed: dome"):
+        loaded(tmp_path, changed(cost={"parts": "assumed"}))
 
 
 LEVELS = {"levels": {"cheap": {"trial.missing": 0.1}, "precise": {"trial.missing": 0.0}}}
@@ -400,7 +450,7 @@ def test_a_factor_sets_several_keys_alike(factor: dict[str, Any]) -> None:
     study = plan.Study.model_validate(STUDY | {"factors": {"size": factor | {"keys": keys}}})
     value, settings = study.factors["size"].value_at(0.75)
     assert settings == dict.fromkeys(keys, value)
-    assert 1 < search.si(value) <= 2
+    assert 1 < cost.si(value) <= 2
     for wrong in ({}, {"key": "a", "keys": ["b"]}):
         with pytest.raises(ValueError, match="needs either key or keys"):
             plan.Study.model_validate(STUDY | {"factors": {"size": factor | wrong}})
@@ -416,5 +466,5 @@ def test_the_shipped_study_is_what_it_says(tmp_path: Path) -> None:
         settings |= sets
     scene, _ = plan.resolve_point(made.spec, settings)
     surface: Any = scene.light.surface  # type: ignore[union-attr]
-    assert surface.apex_m == surface.radius_m == search.si(first["radius"][0])
-    assert scene.vehicle.camera_m == (0.0, 0.0, search.si(first["lever"][0]))
+    assert surface.apex_m == surface.radius_m == cost.si(first["radius"][0])
+    assert scene.vehicle.camera_m == (0.0, 0.0, cost.si(first["lever"][0]))

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.paths import SCENES
 from skysim.core.types import Trajectory
 from skysim.experiments.study import plan
-from skysim.experiments.study.execution import setups, trials
+from skysim.experiments.study.execution import detections, setups, trials
 from skysim.experiments.study.plan import CentroidTrial, FrameTrial, TrialSpec
 from skysim.simulation import exposure, run
 from skysim.sources.solar_system.observer import observe_from
@@ -130,7 +131,7 @@ def test_lights_are_where_the_renderer_puts_them_and_as_bright(spec):
     lab_from_body = trials.random_attitude(ready, np.random.default_rng(5))
     still = Trajectory(np.array([-1.0, 9.0]), Rotation.concatenate([lab_from_body] * 2), np.zeros((2, 3)))
     _, truth = exposure.render_frame(replace(testbed, trajectory=still), 0)
-    xy_px, electrons = trials.visible_sources(testbed, lab_from_body)
+    xy_px, electrons = detections.visible_sources(testbed, lab_from_body)
     size_px = np.array(testbed.canvas.shape[::-1])
     inner = np.flatnonzero(((truth.sources.xy_px > 40) & (truth.sources.xy_px < size_px - 41)).all(axis=1))
     assert len(inner) >= 5
@@ -147,7 +148,7 @@ def test_what_is_spoilt_is_spoilt_as_told():
     trial = CentroidTrial(kind="centroids", noise_px=0.3, missing=0.25, false_share=0.5, magnitude_sigma=0.0)
     xy_px, electrons = np.full((40, 2), 300.0), np.linspace(1e5, 2e5, 40)
     rng = np.random.default_rng(6)
-    seen = [trials.simulate_detections(trial, xy_px, electrons, ready.testbed.scene, rng) for _ in range(400)]
+    seen = [detections.simulate_detections(trial, xy_px, electrons, ready.testbed.scene, rng) for _ in range(400)]
     true = [np.hypot(*(one.xy_px - 300).T) < 3 for one in seen]
     kept = sum(int(one.sum()) for one in true)
     assert kept / (400 * 40) == pytest.approx(0.75, abs=4 * math.sqrt(0.75 * 0.25 / 16_000))
@@ -161,18 +162,68 @@ def test_what_is_spoilt_is_spoilt_as_told():
 def test_the_brightest_are_kept_where_only_so_many_may_be():
     ready = setups.prepared_setup(SKY, {})
     trial = CentroidTrial(kind="centroids", noise_px=0.0, lights=3, magnitude_sigma=0.0)
-    seen = trials.simulate_detections(
+    seen = detections.simulate_detections(
         trial, np.zeros((9, 2)), np.arange(9.0), ready.testbed.scene, np.random.default_rng(1)
     )
-    assert seen.flux.tolist() == [8, 7, 6]
+    gain_e_dn = ready.testbed.scene.camera.detector.gain_e_dn
+    assert seen.flux * gain_e_dn == pytest.approx([8, 7, 6], rel=1e-12)
 
 
 def test_other_noise_leaves_the_attitude():
     told = [setups.prepared_setup(SKY, {"trial.noise_seed": n}) for n in (0, 1)]
-    (first, xy_px, seen), (again, its_px, other) = (trials.simulate_centroids(ready, 12) for ready in told)
-    assert (first * again.inv()).magnitude() == 0
-    assert (xy_px == its_px).all()
-    assert not np.array_equal(seen.xy_px, other.xy_px)
+    (first, seen), (again, other) = (trials.solved_centroids(ready, 12) for ready in told)
+    assert (first.lab_from_body * again.lab_from_body.inv()).magnitude() == 0
+    assert (first.xy_px == again.xy_px).all()
+    assert not np.array_equal(seen.centroids.xy_px, other.centroids.xy_px)
+
+
+CODED = TrialSpec("coded_spiral", ".", 1, {}, {"kind": "centroids"}, True)
+
+
+def coded(settings: dict[str, Any], count: int) -> list[Any]:
+    """Outcomes of trials under the spiral of 400 coded LEDs."""
+    return [row.outcome for row in trials.run_segments(CODED, (trials.Segment(0, settings, 0, range(count)),))]
+
+
+CODES = [
+    {"kind": "bch", "distance": 5},
+    {"kind": "cyclic", "bit_time": "20 ms"},
+    {"kind": "gold", "depth": 1},
+]
+
+
+@pytest.mark.parametrize("code", CODES)
+def test_lights_of_a_coded_trial_are_as_bright_as_rendered_ones(code):
+    """Of frame 7, over the mean light of each LED: bits, edges of bits, pulses."""
+    ready = setups.prepared_setup(CODED, {"light.led.code": code})
+    testbed, lab_from_body = ready.testbed.in_run(5), Rotation.from_rotvec([0.1, 0.05, 1.0])
+    rows, xy_px, electrons = detections.visible_rows(testbed, lab_from_body)
+    light_e = electrons * detections.brightness(testbed, rows, 7)
+    _, truth = exposure.render_frame(testbed.at_rest(lab_from_body, 7), 7)
+    size_px = np.array(testbed.canvas.shape[::-1])
+    inner = np.flatnonzero(((xy_px > 40) & (xy_px < size_px - 41)).all(axis=1))
+    assert len(inner) >= 2
+    for n in inner:
+        off_px = np.hypot(*(truth.sources.xy_px - xy_px[n]).T)
+        rendered_e = truth.sources.electrons[off_px.argmin()] if off_px.min() < 0.5 else 0.0  # a dark LED is no source
+        assert light_e[n] == pytest.approx(rendered_e, rel=0.01, abs=1)
+
+
+@pytest.mark.slow
+def test_a_coded_trial_is_a_sequence_of_frames():
+    """With codes all attitudes of the spiral are solved, by one frame each or two bits would do; without them few."""
+    outcomes = coded({}, 60)
+    assert all(one.solved and not one.wrong and not one.misidentified for one in outcomes)
+    without = coded({"light.led.code": None, "tracker.decoder": None}, 60)
+    assert sum(one.solved for one in without) < 20
+
+
+@pytest.mark.slow
+def test_codes_without_light_to_read_them_are_refused_not_guessed():
+    """Half of all bits fail: no word can be read."""
+    outcomes = coded({"light.led.code": {"kind": "gray", "dropout": 0.49, "depth": 0.1}}, 60)
+    assert sum(one.solved for one in outcomes) < 30
+    assert not any(one.wrong for one in outcomes)
 
 
 @pytest.mark.slow

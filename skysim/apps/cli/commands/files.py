@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load
-from skysim.apps.cli.terminal import print_catalog, print_json, print_titles, progress
+from skysim.apps.cli.terminal import print_catalog, print_json, print_table, print_titles, progress
 
 scenes_app = typer.Typer(
     invoke_without_command=True, help="List the shipped scenes; show every key of a scene, or export it for MuJoCo."
@@ -44,18 +44,20 @@ def scenes_export(
     scene: SceneArg,
     out: Annotated[
         Path | None,
-        typer.Option(help="Output file, .xml, or of a dome .csv (LEDs), .svg (gores), .obj; default: out/SCENE.xml."),
+        typer.Option(
+            help="Output file, .xml; of a dome .csv (LEDs), .svg, .dxf (gores), .obj; default: out/SCENE.xml."
+        ),
     ] = None,
     seed: Seed = None,
     set_: Overrides = None,
 ) -> None:
     """Write a scene as one MJCF file for MuJoCo's viewer, or what a builder of its dome needs.
 
-    The builder gets a list of the LEDs (.csv), a pattern of gores at full scale to print (.svg), or the shell with a
-    mark at each LED as a mesh (.obj).
+    The builder gets a list of the LEDs (.csv), a pattern of gores at full scale to print (.svg) or to cut (.dxf), or
+    the shell with a mark at each LED as a mesh (.obj).
     """
     from skysim.core.io import files
-    from skysim.results.files import templates
+    from skysim.results.files.builder import templates
     from skysim.simulation.testbed import build_testbed, export_leds, export_mjcf
 
     loaded = load(scene, None, seed, set_)
@@ -64,13 +66,41 @@ def scenes_export(
     if path.suffix.lower() == ".csv":
         text, cap_deg = export_leds(testbed)
         use = f"light.layout: {{kind: listed, cap_deg: {cap_deg}, file: {path}}}"
-    elif kind := {".svg": "gores", ".obj": "shell"}.get(path.suffix.lower()):
-        text, use = templates.template(testbed, kind), {"gores": "print it at 100 %", "shell": "in mm"}[kind]
+    elif (ending := path.suffix.lower()) in templates.TEMPLATES:
+        text, use = templates.template(testbed, ending), "print it at 100 %" if ending == ".svg" else "in mm"
     else:
         text = export_mjcf(testbed)
     files.make_folder(path.parent)
     files.write_text(path, text)
     print(f"{path}: {use}")
+
+
+@scenes_app.command("parts")
+def scenes_parts(
+    scene: SceneArg,
+    prices: Annotated[
+        str, typer.Option(metavar="FILE", help="Table of prices (.csv); `assumed` is the one that comes along.")
+    ] = "assumed",
+    out: Annotated[Path | None, typer.Option(help="Also write the list as CSV.")] = None,
+    seed: Seed = None,
+    set_: Overrides = None,
+    json: Json = False,
+) -> None:
+    """List the parts of a scene's dome with their prices: LEDs, tape or boards, drivers, wire, shell, survey."""
+    from skysim.core.io import files
+    from skysim.results.files.builder import parts
+    from skysim.results.files.builder.prices import find_prices, read_prices
+
+    loaded = load(scene, None, seed, set_)
+    found = parts.parts_list(loaded, read_prices(find_prices(prices)))
+    if out:
+        files.make_folder(out.parent)
+        files.write_text(out, parts.to_csv(found, loaded.name))
+    if json:
+        print_json({"parts": [line._asdict() for line in found.lines], "total": found.total})
+        return
+    rows = [*map(parts.cells, found.lines), ["total", "", "", "", "", f"{found.total:.2f}", ""]]
+    print_table(f"Parts of {loaded.name}, prices: {prices}", parts.COLUMNS, rows)
 
 
 @catalog_app.command("build")

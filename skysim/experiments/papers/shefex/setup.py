@@ -22,7 +22,7 @@ from skysim.core.paths import CATALOGS
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey import detect_lights
-from skysim.experiments.study.execution import trials
+from skysim.experiments.study.execution import detections
 from skysim.results.metrics import Summary
 from skysim.results.plots import INK, MARKS
 from skysim.scene.loader import load
@@ -144,7 +144,7 @@ def random_fields(count: int, seed: int) -> list[Field]:
     testbed = testbed_with(paper_catalog("chosen"))
     result = []
     for lab_from_body in Rotation.random(count, rng=random_stream(seed, 0)):
-        xy_px, electrons = trials.visible_sources(testbed, lab_from_body)
+        xy_px, electrons = detections.visible_sources(testbed, lab_from_body)
         order = np.argsort(-electrons, kind="stable")
         result.append(Field(xy_px[order], testbed.mount.cam_from_body * lab_from_body.inv()))
     return result

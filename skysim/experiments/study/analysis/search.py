@@ -16,21 +16,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skysim.core.errors import InputError, unknown_name
-from skysim.core.quantities.units import in_si
+from skysim.core.errors import InputError
+from skysim.experiments.study.analysis.cost import COST, check_cost, cost
 from skysim.experiments.study.designs import Point, make_point
 from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.execution.outcomes import FAILED
 from skysim.experiments.study.execution.runner import Progress, Watch, run_points
 from skysim.experiments.study.execution.setups import code_version, seed_of
 from skysim.experiments.study.execution.trials import Row
-from skysim.experiments.study.factors import Distribution, Factor, Levels, Range, Value, split_quantity
+from skysim.experiments.study.factors import Distribution, Range, Value
 from skysim.experiments.study.plan import Constraint, Plan, Search, Study
 from skysim.experiments.study.store import Store
 from skysim.results import metrics
 from skysim.results.metrics import Columns, Summary
 
-COST = "cost"
 STARTUP_CANDIDATES = 10  # random candidates before the sampler uses earlier results
 MAX_REPEATS = 50  # repeated proposals in succession after which all points count as evaluated
 MISSING_VIOLATION = 1e3  # violation of a candidate without a value; larger than usual relative violations
@@ -94,7 +93,7 @@ def check(study: Study) -> None:
             raise InputError(
                 f"factors.{name}: a distribution cannot be optimized; allowed: levels, values, from and to"
             )
-    check_cost(study, config)
+    check_cost(study.factors, config.cost)
     trials, budget = config.candidates * study.replicates, study.budget.trials
     if budget is not None and trials > budget:
         raise InputError(f"budget.trials: {budget}; allowed: at least {trials}, the trials of the search")
@@ -113,62 +112,21 @@ def check_response(response: str, where: str) -> None:
         raise InputError(f"{where}: {response} is not reproducible; allowed: {allowed}")
 
 
-def check_cost(study: Study, config: Search) -> None:
-    """Raise InputError for prices of unknown factors or levels, and for prices per unit of a factor without numbers."""
-    factors: dict[str, Factor] = dict(study.factors)
-    for name in config.cost.per:
-        where = f"optimize.cost.per.{name}"
-        factor = require_factor(name, factors, where)
-        values = [value for value, _ in factor.options()]
-        try:
-            for value in values if not isinstance(factor, Levels) else [values[0]]:
-                si(value)
-        except ValueError as error:
-            raise InputError(f"{where}: {error}; prices of named levels: optimize.cost.levels") from None
-    for name, prices in config.cost.levels.items():
-        where = f"optimize.cost.levels.{name}"
-        factor = require_factor(name, factors, where)
-        named = [str(level) for level, _ in factor.options()] if not isinstance(factor, Range) else []
-        if sorted(named) != sorted(prices):
-            allowed = f"a price of each of {', '.join(named)}" if named else "optimize.cost.per, as it is a range"
-            raise InputError(f"{where}: prices {', '.join(prices) or 'nothing'}; allowed: {allowed}")
-
-
-def require_factor(name: str, factors: dict[str, Factor], where: str) -> Factor:
-    """The factor with a name. Raises InputError if there is none."""
-    if name not in factors:
-        raise InputError(f"{where}: {unknown_name('factor', name, factors)}")
-    return factors[name]
-
-
-def si(value: Value) -> float:
-    """A plain number unchanged, or a quantity in SI units: "48 in" is 1.2192. Raises ValueError."""
-    number, unit = split_quantity(value)
-    return in_si(value) if unit else number
-
-
-def cost(config: Search, levels: dict[str, Value]) -> float:
-    """Cost of a point: base + sum of per[factor] * value + prices of the named levels, with values in SI units."""
-    prices = config.cost
-    linear = sum(price * si(levels[name]) for name, price in prices.per.items())
-    return prices.base + linear + sum(price[str(levels[name])] for name, price in prices.levels.items())
-
-
 # Evaluation of a candidate.
 
 
-def evaluate_candidate(study: Study, number: int, point: Point, columns: Columns) -> Candidate:
-    """The candidate computed from the columns of all its trials."""
-    config = study.optimize
+def evaluate_candidate(plan: Plan, number: int, point: Point, columns: Columns) -> Candidate:
+    """The candidate computed from the columns of all its trials, and its cost."""
+    config = plan.study.optimize
     assert config is not None
     figures = {name: metrics.response(name)(columns) for name in config.responses if name != COST}
-    price = cost(config, point.levels)
+    price, unpriced = cost(plan, point)
     values = {name: figure.value for name, figure in figures.items()} | {COST: price}
     objectives = tuple(values[one.response] for one in config.objectives)
     violated = [one.response for one in config.constraints if violation(one, values[one.response]) > 0]
     violated += [f"no {one.response}" for one in config.objectives if math.isnan(values[one.response])]
     refused = scene_error(columns)
-    message = last_line(refused).partition(f"{InputError.__name__}: ")[2] if refused else ""
+    message = last_line(refused).partition(f"{InputError.__name__}: ")[2] if refused else unpriced
     why = message or ", ".join(violated)
     return Candidate(number, point.levels, objectives, figures, price, not why, bool(refused), why)
 
@@ -215,7 +173,7 @@ def collect_result(plan: Plan, store: Store) -> SearchResult:
     study, replicates = plan.study, plan.study.replicates
     assert study.optimize is not None
     evaluated = [
-        evaluate_candidate(study, n, point, columns)
+        evaluate_candidate(plan, n, point, columns)
         for n, point in enumerate(store.points())
         if len((columns := store.point_columns(n))["trial"]) == replicates
     ]
@@ -249,7 +207,7 @@ def search(plan: Plan, store: Store, engine: Engine, watch: Watch | None = None)
         refused = study.replicates * sum(one.refused for one in evaluated.values())
         if not run_candidate(plan, store, engine, n, point, total, refused, watch):
             return collect_result(plan, store)
-        evaluated[key_of(point)] = evaluate_candidate(study, n, point, store.point_columns(n))
+        evaluated[key_of(point)] = evaluate_candidate(plan, n, point, store.point_columns(n))
         report_to_sampler(sampler, proposal, config, evaluated[key_of(point)])
     return collect_result(plan, store)
 

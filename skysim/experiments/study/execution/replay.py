@@ -84,12 +84,11 @@ def replayed_frames(setup: Setup, seed: int) -> Iterator[tuple[Frame, Truth, Rep
     """
     trial = setup.trial
     if isinstance(trial, CentroidTrial):
-        _, _, centroids = trials.simulate_centroids(setup, seed)
         frame_trial = FrameTrial(
             kind="frames", **{name: getattr(trial, name) for name in ("tilt_deg", "dec_deg", "near")}
         )
         frame, truth, _ = trials.render_trial_frame(setup._replace(trial=frame_trial), seed)
-        yield frame, truth, solve_or_failed(lambda: Report(setup.estimator.solve_centroids(centroids), centroids))
+        yield frame, truth, solve_or_failed(lambda: trials.solved_centroids(setup, seed)[1])
     elif isinstance(trial, FlightTrial):
         testbed = run.simulate_motion(trials.flight_testbed(setup, seed))
         for result in run.run(testbed, setup.estimator):

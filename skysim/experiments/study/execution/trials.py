@@ -13,17 +13,22 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.core.types import Centroids, RateEstimate
+from estimator.core.types import RateEstimate
+from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.pipeline import Report
 from skysim.camera import render
-from skysim.camera.render import Poses, image_tracks, in_view
 from skysim.core import quaternion
 from skysim.core.paths import ROOT
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Frame, Mount, Trajectory, Truth
+from skysim.experiments.study.execution.detections import (
+    simulate_detections,
+    solve_coded,
+    visible_rows,
+    visible_sources,
+)
 from skysim.experiments.study.execution.outcomes import (
     FAILED,
     Outcome,
@@ -44,8 +49,7 @@ from skysim.experiments.study.plan import (
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation import exposure, run
-from skysim.simulation.exposure import occlusion_test
-from skysim.simulation.testbed import MARGIN_S, Testbed, exposure_window, sky_during
+from skysim.simulation.testbed import MARGIN_S, Testbed, exposure_window
 from skysim.sources.air.air import topocentric_axes
 from skysim.sources.solar_system.observer import observe_from
 from skysim.sources.solar_system.places import place
@@ -54,7 +58,6 @@ from skysim.tracking import factory
 GYRO_RAD_S = 1e-5  # standard deviation that a frame trial's gyro claims, 2 arcseconds a second
 KNOTS = 9  # samples of a frame trial's trajectory
 STREAK_POSES = 9  # poses along the streak of a frame that is not rendered
-ANY_TIME_S = np.array([0.0, 1.0])  # the pose does not change, so the times are arbitrary
 
 
 class Row(NamedTuple):
@@ -108,18 +111,23 @@ def run_trial(spec: TrialSpec, segment: Segment, trial: int, replicate: int) -> 
 
 def run_centroid_trial(setup: Setup, seed: int) -> Outcome:
     """Centroid trial: random attitude, noisy true detections and false ones; identified and solved."""
-    lab_from_body, xy_px, detections = simulate_centroids(setup, seed)
-    report = Report(setup.estimator.solve_centroids(detections), detections)
-    return score(setup.testbed, setup.estimator, report, TrueLights(lab_from_body, xy_px, xy_px, None))
+    lights, report = solved_centroids(setup, seed)
+    return score(setup.testbed, setup.estimator, report, lights)
 
 
-def simulate_centroids(setup: Setup, seed: int) -> tuple[Rotation, Floats, Centroids]:
-    """Inputs of a centroid trial: lab_from_body, (N, 2) true pixel positions, and the simulated detections."""
+def solved_centroids(setup: Setup, seed: int) -> tuple[TrueLights, Report]:
+    """The lights of a centroid trial, and the report on its detections; of coded light on those of the last frame."""
     trial, (attitude_rng, noise) = setup.trial, streams(setup, seed)
     assert isinstance(trial, CentroidTrial)
     lab_from_body = random_attitude(setup, attitude_rng)
-    xy_px, electrons = visible_sources(setup.testbed, lab_from_body)
-    return lab_from_body, xy_px, simulate_detections(trial, xy_px, electrons, setup.testbed.scene, noise)
+    if isinstance(setup.estimator, CodedTracker):
+        xy_px, report = solve_coded(setup.testbed, setup.estimator, trial, lab_from_body, noise)
+    else:
+        xy_px, electrons = visible_sources(setup.testbed, lab_from_body)
+        detections = simulate_detections(trial, xy_px, electrons, setup.testbed.scene, noise)
+        exposure_s = setup.testbed.scene.exposure.time_s
+        report = Report(factory.solve_centroids(setup.estimator, detections, exposure_s), detections)
+    return TrueLights(lab_from_body, xy_px, xy_px, None), report
 
 
 def streams(setup: Setup, seed: int) -> tuple[np.random.Generator, np.random.Generator]:
@@ -233,60 +241,6 @@ def zyz(first_rad: float, second_rad: float, third_rad: float) -> Floats:
     sine, cosine = math.sin(half), math.cos(half)
     x, y = -sine * math.sin(difference), sine * math.cos(difference)
     return np.array([cosine * math.cos(sum_), x, y, cosine * math.sin(sum_)])
-
-
-def visible_sources(testbed: Testbed, lab_from_body: Rotation) -> tuple[Floats, Floats]:
-    """(N, 2) pixel positions and (N,) photoelectrons of the visible sources whose center is on the detector.
-
-    Occluded sources are left out.
-    """
-    return visible_rows(testbed, lab_from_body)[1:]
-
-
-def visible_rows(
-    testbed: Testbed, lab_from_body: Rotation, t_s: float = 0.0
-) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """As `visible_sources` at a time, after the sources' (N,) rows in `testbed.sources`."""
-    R_lab_from_body = lab_from_body.as_matrix()
-    R_cam_from_lab = testbed.mount.cam_from_body.as_matrix() @ R_lab_from_body.T
-    poses = Poses(R_cam_from_lab[None], (R_lab_from_body @ testbed.mount.camera_body_m)[None])
-    rows = in_view(testbed.sources, testbed.optics, poses)
-    near, sky = testbed.sources.take(rows), sky_during(testbed, t_s)
-    if sky:
-        near = sky.stars_seen(near)
-    tracks, _, _ = image_tracks(near, testbed.optics, poses, ANY_TIME_S, testbed.emitter)
-    xy_px, (width_px, height_px) = tracks.xy_px[0], testbed.canvas.shape[::-1]
-    x, y = xy_px.T
-    visible = np.flatnonzero((x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5))
-    occludes = occlusion_test(testbed, lab_from_body, sky)
-    if occludes:
-        visible = visible[~occludes(near.take(visible))]
-    duty_cycle = np.minimum(near.on_s / near.period_s, 1.0)
-    electrons = tracks.rate_e_s[0] * duty_cycle * testbed.scene.exposure.time_s
-    return rows[visible], xy_px[visible], electrons[visible]
-
-
-def simulate_detections(
-    trial: CentroidTrial, xy_px: Floats, electrons: Floats, scene: Scene, rng: np.random.Generator
-) -> Centroids:
-    """Simulated detections, brightest first: some true sources missed, all with noise, false detections added.
-
-    The flux of a false detection is that of a random true source, including those that `visible_sources` leaves out.
-    """
-    # Draw noise for all sources, also the missing ones, so that the stream does not depend on which are missing.
-    detected = np.flatnonzero(rng.random(len(xy_px)) >= trial.missing)
-    flux = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
-    xy_px = xy_px + trial.noise_px * rng.standard_normal(xy_px.shape)
-    detected = detected[np.argsort(-flux[detected], kind="stable")][: trial.lights]
-    false = trial.false_lights + round(len(detected) * trial.false_share / (1 - trial.false_share))
-    if not false:
-        return Centroids(xy_px[detected], np.full(len(detected), trial.noise_px), flux[detected])
-    false_px = rng.random((false, 2)) * [scene.camera.width_px, scene.camera.height_px] - 0.5
-    false_flux = flux[rng.integers(len(flux), size=false)] if len(flux) else rng.random(false) + 1.0
-    all_flux = np.concatenate([flux[detected], false_flux])
-    order = np.argsort(-all_flux, kind="stable")
-    sigma_px = np.full(len(order), trial.noise_px)
-    return Centroids(np.concatenate([xy_px[detected], false_px])[order], sigma_px, all_flux[order])
 
 
 def render_trial_frame(setup: Setup, seed: int) -> tuple[Frame, Truth, tuple[float, float] | None]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -336,15 +336,23 @@ def search_png(panels: dict[str, Panel], points: Sequence[int], front: Sequence[
     return png(draw, (7.4, 0.6 + 1.9 * len(panels)))
 
 
-def pareto_png(one: Panel, other: Panel, points: Sequence[int], front: Sequence[int]) -> bytes:
-    """Candidates in the plane of the two objectives; Pareto-optimal ones are joined and, if few, labeled."""
+def pareto_png(
+    one: Panel, other: Panel, points: Sequence[int], front: Sequence[int], also: Mapping[str, Floats] | None = None
+) -> bytes:
+    """Candidates in the plane of the two objectives; Pareto-optimal ones are joined and, if few, labeled.
+
+    also : fronts of other searches with the same objectives, (K, 2) by label
+    """
     from matplotlib.patheffects import withStroke
 
     def draw(fig: Any) -> None:
         axes, marked = fig.subplots(), np.flatnonzero(np.isin(points, front))
         axes.plot(one.value, other.value, "o", color=GRAY, label="candidate")
         marked = marked[np.argsort(one.value[marked], kind="stable")]
-        axes.set_ylim(*layout.limits([other.value], [other.low[marked], other.high[marked]], False, False))
+        heights = [other.value, *(values[:, 1] for values in (also or {}).values())]
+        axes.set_ylim(*layout.limits(heights, [other.low[marked], other.high[marked]], False, False))
+        for name, values in (also or {}).items():
+            axes.plot(*values.T, "s:", color=INK, markerfacecolor="none", markersize=4, label=name)
         low_m, high_m = drawn_interval(axes, Panel("", other.value, other.low, other.high, []))
         axes.vlines(one.value[marked], low_m[marked], high_m[marked], color=ORANGE, alpha=0.5, linewidth=1)
         axes.plot(one.value[marked], other.value[marked], "D--", color=ORANGE, label="front")

@@ -38,10 +38,11 @@ class Lookalike(NamedTuple):
 
 
 def of(context: Context, samples: Samples) -> Lookalike | None:
-    """The fields of a dome, each about an LED within the greatest tilt; None for few LEDs, or stars."""
+    """The fields of a dome, each about an LED within the greatest tilt; None for few or coded LEDs, or stars."""
     testbed, camera = context.testbed, context.camera.optics.camera
     mean = float(samples.reach.counts().mean())
-    if not isinstance(testbed.scene.light, DomeConfig) or mean < MIN_LEDS:
+    coded = testbed.scene.tracker.decoder is not None
+    if not isinstance(testbed.scene.light, DomeConfig) or mean < MIN_LEDS or coded:
         return None
     sigma_px = [
         believed_sigma_px(view, Independent(centroid_variance(view, context)), context)

@@ -343,6 +343,7 @@ def camera_geometry(config: layouts.OptimizedConfig, field_fraction: float = 1.0
 
 def tan_half(config: layouts.OptimizedConfig) -> Floats:
     """(2,) tangents of half the field's width and height."""
+    assert config.field_deg is not None, "completed by the scene"
     return np.tan(np.radians(config.field_deg) / 2)
 
 
@@ -444,6 +445,7 @@ def thin(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
 def layout_ambiguity(config: layouts.OptimizedConfig, place_m: Floats) -> Ambiguity:
     """Ambiguity of the layout (`ambiguity`), for a round field of the same area as the camera's."""
     radius_rad = math.atan(math.sqrt(4 * float(np.prod(tan_half(config))) / math.pi))
+    assert config.camera_m is not None, "completed by the scene"
     return field_ambiguity(place_m, config.camera_m[2], math.radians(config.tilt_deg), radius_rad, config.coincidence_m)
 
 

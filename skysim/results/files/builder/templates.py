@@ -1,4 +1,4 @@
-"""Templates for the builder of a dome: a gore pattern at full scale (SVG), and the shell with its LEDs (OBJ, mm).
+"""Templates for the builder of a dome: gores at full scale (SVG, DXF), and the shell with its LEDs (OBJ, mm).
 
 A gore is a strip of the surface along a meridian. Paper bends along the meridian but does not stretch, so a point of
 the surface is drawn by its Cassini coordinates: y is the length of the gore's central meridian from the apex to the
@@ -15,8 +15,7 @@ is longer than the surface by the factor 1 / cos(x / R), which `MAX_WIDTH_M` lim
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from html import escape
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
+from skysim.results.files.builder.drawing import Circle, Drawing, Path, Shape, Text, to_dxf, to_svg
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.testbed import Testbed
 from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
@@ -56,16 +56,16 @@ class Dome(NamedTuple):
     led_radius_m: float
 
 
-def template(testbed: Testbed, kind: str) -> str:
-    """The text of a template for a scene's dome; `kind` is one of TEMPLATES. Raises InputError without a dome."""
+def template(testbed: Testbed, ending: str) -> str:
+    """The text of a template for a scene's dome, by its file's ending. Raises InputError without a dome."""
     light = testbed.scene.light
     if not isinstance(light, DomeConfig):
-        raise InputError(f"light.kind: {light.kind} has no {kind}; allowed: dome")
+        raise InputError(f"light.kind: {light.kind} has no {ending}; allowed: dome")
     surface = build_surface(light.surface)
     leds = design_leds(light, surface, testbed.band)
     cap_deg = max(float(getattr(light.layout, "cap_deg", 0.0)), max_tilt_deg(leds.place[:, :3]))  # boards stand out
     dome = Dome(testbed.scene.name, surface, cap_deg, leds.id, leds.place[:, :3], light.led.disk_diameter_m / 2)
-    return TEMPLATES[kind](dome)
+    return TEMPLATES[ending](dome)
 
 
 def at(surface: Surface, rays: Floats) -> Floats:
@@ -103,15 +103,15 @@ def gore_count(surface: Surface, cap_deg: float) -> int:
     return max(LEAST_GORES, math.ceil(2 * math.pi * ring_m / MAX_WIDTH_M))
 
 
-def gores_svg(dome: Dome) -> str:
-    """The gores of a dome side by side at full scale, 1 user unit = 1 mm, apex up, seen from inside the dome.
+def gores(dome: Dome) -> Drawing:
+    """The gores of a dome side by side at full scale, apex up, seen from inside the dome.
 
     Every LED is a circle of its diameter with its number; a line of RULE_MM tells whether the print is to scale.
     """
     count = gore_count(dome.surface, dome.cap_deg)
     rays = dome.led_m / np.linalg.norm(dome.led_m, axis=1, keepdims=True)
     nearest = np.rint(np.arctan2(rays[:, 1], rays[:, 0]) * count / (2 * np.pi)).astype(int) % count
-    parts, left_mm, bottom_mm = list[str](), MARGIN_MM, 0.0
+    shapes, left_mm, bottom_mm = list[Shape](), MARGIN_MM, 0.0
     for gore in range(count):
         own, meridian_rad = nearest == gore, 2 * math.pi / count * gore
         outline_mm, leds_mm = (
@@ -120,21 +120,17 @@ def gores_svg(dome: Dome) -> str:
         )
         shift_mm = np.array([left_mm + outline_mm[:, 0].max(), MARGIN_MM + CAPTION_MM])
         outline_mm, leds_mm = shift_mm + FROM_INSIDE * outline_mm, shift_mm + FROM_INSIDE * leds_mm
-        parts += gore_parts(outline_mm, f"{gore + 1}: {math.degrees(meridian_rad):.4g} deg")
-        parts += marks(dome.led[own], leds_mm, 1e3 * dome.led_radius_m)
+        shapes += gore_shapes(outline_mm, f"{gore + 1}: {math.degrees(meridian_rad):.4g} deg")
+        shapes += marks(dome.led[own], leds_mm, 1e3 * dome.led_radius_m)
         left_mm += float(np.ptp(outline_mm[:, 0])) + GAP_MM
         bottom_mm = max(bottom_mm, float(outline_mm[:, 1].max()))
     rule_mm = bottom_mm + CAPTION_MM
-    width_mm, height_mm = left_mm - GAP_MM + MARGIN_MM, rule_mm + CAPTION_MM + MARGIN_MM
     caption = f"{dome.name}: {count} gores, seen from inside, azimuth on top. To scale if this line is {RULE_MM:g} mm."
-    parts += [
-        f'<path d="M{MARGIN_MM:g} {rule_mm:.3f}h{RULE_MM:g}"/>',
-        text(MARGIN_MM, rule_mm + 6, 5.0, caption),
-        "</svg>\n",
+    shapes += [
+        Path(np.array([[MARGIN_MM, rule_mm], [MARGIN_MM + RULE_MM, rule_mm]])),
+        Text(MARGIN_MM, rule_mm + 6, 5.0, caption),
     ]
-    size = f'width="{width_mm:.3f}mm" height="{height_mm:.3f}mm" viewBox="0 0 {width_mm:.3f} {height_mm:.3f}"'
-    pen = 'fill="none" stroke="black" stroke-width="0.2"'
-    return "\n".join([f'<svg xmlns="http://www.w3.org/2000/svg" {size} {pen}>', *parts])
+    return Drawing(left_mm - GAP_MM + MARGIN_MM, rule_mm + CAPTION_MM + MARGIN_MM, shapes)
 
 
 def outline(meridian_rad: float, half_rad: float, cap_deg: float) -> Floats:
@@ -146,28 +142,21 @@ def outline(meridian_rad: float, half_rad: float, cap_deg: float) -> Floats:
     return directions(tilt_rad, meridian_rad + aside_rad)
 
 
-def gore_parts(outline_mm: Floats, title: str) -> Iterator[str]:
+def gore_shapes(outline_mm: Floats, title: str) -> Iterator[Shape]:
     """The outline of a gore, its central meridian and its title at the apex."""
-    points = " ".join(f"{x:.3f},{y:.3f}" for x, y in outline_mm)
     apex = outline_mm[0]
-    yield f'<polygon points="{points}"/>'
-    yield f'<path d="M{apex[0]:.3f} {apex[1]:.3f}V{outline_mm[:, 1].max():.3f}" stroke-dasharray="4 2"/>'
-    yield text(apex[0] - 12, apex[1] - 2, 4.0, title)
+    yield Path(outline_mm, closed=True)
+    yield Path(np.array([apex, [apex[0], outline_mm[:, 1].max()]]), dashed=True)
+    yield Text(apex[0] - 12, apex[1] - 2, 4.0, title)
 
 
-def marks(numbers: NDArray[np.int64], xy_mm: Floats, radius_mm: float) -> Iterator[str]:
+def marks(numbers: NDArray[np.int64], xy_mm: Floats, radius_mm: float) -> Iterator[Shape]:
     """A circle with a cross for each LED, and its number."""
     for number, (x, y) in zip(numbers, xy_mm, strict=True):
-        yield f'<circle cx="{x:.3f}" cy="{y:.3f}" r="{radius_mm:.3f}"/>'
-        yield f'<path d="M{x - 1:.3f} {y:.3f}h2m-1 -1v2"/>'
-        yield text(x + radius_mm + 0.5, y - 0.5, 2.0, f"{number}")
-
-
-def text(x_mm: float, y_mm: float, size_mm: float, words: str) -> str:
-    return (
-        f'<text x="{x_mm:.3f}" y="{y_mm:.3f}" font-size="{size_mm:g}" font-family="sans-serif" fill="black" '
-        f'stroke="none">{escape(words)}</text>'
-    )
+        yield Circle(x, y, radius_mm)
+        yield Path(np.array([[x - 1, y], [x + 1, y]]), layer="CENTERS")
+        yield Path(np.array([[x, y - 1], [x, y + 1]]), layer="CENTERS")
+        yield Text(x + radius_mm + 0.5, y - 0.5, 2.0, f"{number}")
 
 
 def shell_obj(dome: Dome) -> str:
@@ -207,4 +196,8 @@ def vertex_lines(points_m: Floats) -> list[str]:
     return [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in 1e3 * points_m]
 
 
-TEMPLATES = {"gores": gores_svg, "shell": shell_obj}
+TEMPLATES: dict[str, Callable[[Dome], str]] = {
+    ".svg": lambda dome: to_svg(gores(dome)),
+    ".dxf": lambda dome: to_dxf(gores(dome)),
+    ".obj": shell_obj,
+}

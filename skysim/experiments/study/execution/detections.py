@@ -1,0 +1,120 @@
+"""Detections of a trial without a frame: the lights in view with noise, and a sequence of them under coded light.
+
+Under coded light (`tracker.decoder`) a trial is as many frames of one attitude as the code has bits, or fewer if the
+tracker solves one before: that frame is the trial's, or else the last one. A light's brightness in a frame is that of
+its code and of its drive's pulses in the exposure, with photon noise and FLUX_NOISE.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.core.types import Centroids
+from estimator.trackers.coded_tracker import CodedTracker
+from estimator.trackers.pipeline import Report
+from skysim.camera.render import Poses, image_tracks, in_view
+from skysim.core.types import Floats
+from skysim.experiments.study.plan import CentroidTrial
+from skysim.scene.scene import Scene
+from skysim.simulation.exposure import occlusion_test
+from skysim.simulation.testbed import Testbed, exposure_window, sky_during
+from skysim.sources.dome.led import lit_moments_s
+
+ANY_TIME_S = np.array([0.0, 1.0])  # the pose does not change, so the times are arbitrary
+FLUX_NOISE = 0.02  # relative, of a light in a frame; above that of rendered ones (benchmarks/codes.py)
+
+
+def visible_sources(testbed: Testbed, lab_from_body: Rotation) -> tuple[Floats, Floats]:
+    """(N, 2) pixel positions and (N,) photoelectrons of the visible sources whose center is on the detector.
+
+    Occluded sources are left out.
+    """
+    return visible_rows(testbed, lab_from_body)[1:]
+
+
+def visible_rows(
+    testbed: Testbed, lab_from_body: Rotation, t_s: float = 0.0
+) -> tuple[NDArray[np.int64], Floats, Floats]:
+    """As `visible_sources` at a time, after the sources' (N,) rows in `testbed.sources`."""
+    R_lab_from_body = lab_from_body.as_matrix()
+    R_cam_from_lab = testbed.mount.cam_from_body.as_matrix() @ R_lab_from_body.T
+    poses = Poses(R_cam_from_lab[None], (R_lab_from_body @ testbed.mount.camera_body_m)[None])
+    rows = in_view(testbed.sources, testbed.optics, poses)
+    near, sky = testbed.sources.take(rows), sky_during(testbed, t_s)
+    if sky:
+        near = sky.stars_seen(near)
+    tracks, _, _ = image_tracks(near, testbed.optics, poses, ANY_TIME_S, testbed.emitter)
+    xy_px, (width_px, height_px) = tracks.xy_px[0], testbed.canvas.shape[::-1]
+    x, y = xy_px.T
+    visible = np.flatnonzero((x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5))
+    occludes = occlusion_test(testbed, lab_from_body, sky)
+    if occludes:
+        visible = visible[~occludes(near.take(visible))]
+    duty_cycle = np.minimum(near.on_s / near.period_s, 1.0)
+    electrons = tracks.rate_e_s[0] * duty_cycle * testbed.scene.exposure.time_s
+    return rows[visible], xy_px[visible], electrons[visible]
+
+
+def simulate_detections(
+    trial: CentroidTrial, xy_px: Floats, electrons: Floats, scene: Scene, rng: np.random.Generator
+) -> Centroids:
+    """Simulated detections, brightest first: some true sources missed, all with noise, false detections added.
+
+    The flux of a false detection is that of a random true source, including those that `visible_sources` leaves out.
+    """
+    # Draw noise for all sources, also the missing ones, so that the stream does not depend on which are missing.
+    detected = np.flatnonzero(rng.random(len(xy_px)) >= trial.missing)
+    flux = electrons / scene.camera.detector.gain_e_dn
+    flux = flux * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
+    xy_px = xy_px + trial.noise_px * rng.standard_normal(xy_px.shape)
+    detected = detected[np.argsort(-flux[detected], kind="stable")][: trial.lights]
+    false = trial.false_lights + round(len(detected) * trial.false_share / (1 - trial.false_share))
+    if not false:
+        return Centroids(xy_px[detected], np.full(len(detected), trial.noise_px), flux[detected])
+    false_px = rng.random((false, 2)) * [scene.camera.width_px, scene.camera.height_px] - 0.5
+    false_flux = flux[rng.integers(len(flux), size=false)] if len(flux) else rng.random(false) + 1.0
+    all_flux = np.concatenate([flux[detected], false_flux])
+    order = np.argsort(-all_flux, kind="stable")
+    sigma_px = np.full(len(order), trial.noise_px)
+    return Centroids(np.concatenate([xy_px[detected], false_px])[order], sigma_px, all_flux[order])
+
+
+def solve_coded(
+    testbed: Testbed, tracker: CodedTracker, trial: CentroidTrial, lab_from_body: Rotation, rng: np.random.Generator
+) -> tuple[Floats, Report]:
+    """(N, 2) true pixel positions, and the report of the first frame with an attitude, or of the code's last one."""
+    testbed = testbed.in_run(int(rng.integers(2**62)))
+    rows, xy_px, electrons = visible_rows(testbed, lab_from_body)
+    electrons = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(rows)))
+    per_frame = trial.model_copy(update={"magnitude_sigma": 0.0})  # the error of a brightness is that of the LED
+    tracker.last_s = None  # begins anew
+    first = int(rng.integers(tracker.code.bits))
+    for frame in range(first, first + tracker.code.bits):
+        light_e = electrons * brightness(testbed, rows, frame) * (1 + FLUX_NOISE * rng.standard_normal(len(rows)))
+        light_e += np.sqrt(np.maximum(light_e, 0)) * rng.standard_normal(len(rows))
+        lit = light_e > 0
+        detections = simulate_detections(per_frame, xy_px[lit], light_e[lit], testbed.scene, rng)
+        window = exposure_window(testbed.scene, frame)
+        middle_s = window.middle_s(testbed.scene.camera.height_px)
+        attitude = tracker.solve_centroids(detections, exposure_s=window.exposure_s, t_s=middle_s, frame=frame)
+        if attitude.solved:
+            break
+    return xy_px, Report(attitude, detections)
+
+
+def brightness(testbed: Testbed, rows: NDArray[np.int64], frame: int) -> Floats:
+    """(K,) light of LEDs in the exposure of a frame over their mean light: what code, pulses and filters leave."""
+    window, steady = exposure_window(testbed.scene, frame), testbed.sources.take(rows)
+    begin_s, end_s = window.open_s, window.open_s + window.exposure_s
+    shown = testbed.sources
+    if testbed.clocks:
+        shown = testbed.clocks.lights_at(shown, (begin_s + end_s) / 2, window.exposure_s)
+    if testbed.codes:
+        shown = testbed.codes.shown(shown, begin_s, window.exposure_s, frame)
+    shown = shown.take(rows)
+    pulses = zip(shown.period_s.tolist(), shown.start_s.tolist(), shown.on_s.tolist(), strict=True)
+    lit_s = np.array([lit_moments_s(begin_s, end_s, *one)[0] for one in pulses])
+    mean = steady.strength * np.minimum(steady.on_s / steady.period_s, 1.0)
+    return np.asarray(shown.strength * lit_s / window.exposure_s / mean)
