@@ -72,7 +72,7 @@ def non_dimensional(camera: Camera, leds: LedMap, lever: Lever, settings: Settin
     sight = sight._replace(field_tan=nominal.field_tan, field_area=nominal.field_area)
     least_rad = MIN_ERROR_PX / camera.focal_px
     return lambda rays_cam, sigma_rad, flux_s: search.identify(
-        rays_cam, np.hypot(sigma_rad, least_rad), sight, FOCAL_CHECKS, uncertainty, flux_s
+        rays_cam, np.hypot(sigma_rad, least_rad), sight, FOCAL_CHECKS, flux_s, uncertainty
     )
 
 

@@ -17,7 +17,7 @@ from skysim.core.quantities.tolerance import TimeError
 from skysim.core.quantities.units import ConfigModel, Number, Time
 from skysim.core.quantities.utc import check_year
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.layouts import FibersConfig, LcdConfig, OptimizedConfig
+from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, Glow, Light, StarsConfig
 from skysim.scene.sections.motion import MotionConfig, PointingConfig
 from skysim.scene.sections.orbit import Orbit
@@ -110,8 +110,8 @@ class Scene(ConfigModel):
     def complete_layout(self) -> Scene:
         """The scene whose optimized layout has a field of view and a camera: those that it leaves out are its own."""
         layout = self.light.layout if isinstance(self.light, DomeConfig) else None
-        nested = isinstance(layout, FibersConfig | LcdConfig)
-        points = layout.points if isinstance(layout, FibersConfig | LcdConfig) else layout
+        nested = isinstance(layout, OnPoints)
+        points = layout.points if isinstance(layout, OnPoints) else layout
         if not isinstance(points, OptimizedConfig):
             return self
         camera_m, chip = points.camera_m or self.vehicle.camera_m, (self.camera.width_px, self.camera.height_px)

@@ -35,7 +35,7 @@ from skysim.scene.sections.motion import PointingConfig
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
 from skysim.sources.air.air import Air, Sky
-from skysim.sources.dome import display
+from skysim.sources.dome.displays import display
 from skysim.sources.dome.layouts.led_list import led_list
 from skysim.sources.dome.led import Emitter
 from skysim.sources.dome.reflection.dome import ReflectingDome, reflecting_dome

@@ -20,7 +20,7 @@ from skysim.core.errors import InputError
 from skysim.core.types import Frame, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
-from skysim.sources.dome import display
+from skysim.sources.dome.displays import display
 from skysim.tracking.external import adapter
 from skysim.tracking.external.adapter import ExternalTracker
 from skysim.tracking.external.function import FunctionTracker

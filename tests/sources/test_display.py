@@ -19,7 +19,7 @@ from skysim.simulation import exposure
 from skysim.simulation.testbed import Testbed, build_testbed, exposure_window, light_sources
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
-from skysim.sources.dome import display
+from skysim.sources.dome.displays import display
 from skysim.sources.dome.led import lit_moments_s
 from skysim.sources.dome.shell import surface
 from skysim.sources.photometry import SUN, Band, led_strength_e_s_sr, star_flux_e_s_m2

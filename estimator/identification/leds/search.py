@@ -63,15 +63,15 @@ def identify(
     sigma_rad: Floats,
     dome: DomeIndex,
     max_checks: int = 4_000_000,
-    focal_uncertainty: float = 0.0,
     flux_s: Floats | None = None,
+    focal_uncertainty: float = 0.0,
 ) -> StarMatch | str:
     """Identify the LEDs of (N, 3) rays in camera axes: the matches and the attitude, or the reason for a refusal.
 
     sigma_rad  : (N,) standard deviation of a ray about each axis; `dome` holds the survey's own errors
     max_checks : LED pairs tested, plus detections times LEDs compared, before giving up
-    focal_uncertainty : greatest relative error of the focal length; `dome` must hold the pairs of the widest field
     flux_s     : (N,) flux of the lights per second of exposure, for LEDs that differ in brightness; None: unknown
+    focal_uncertainty : greatest relative error of the focal length; `dome` must hold the pairs of the widest field
 
     Detection pairs are tested against all LED pairs of the same angle (`_test_pair`), the pairs with the fewest first.
     After an attitude reaches ACCEPT_DEX, rivals are searched for with a second, disjoint pair of its detections: a
@@ -80,7 +80,7 @@ def identify(
     """
     if len(rays_cam) < MIN_EVIDENCE_MATCHES:
         return NO_MATCH
-    detections = build_detections(rays_cam, sigma_rad, dome, focal_uncertainty, flux_s)
+    detections = build_detections(rays_cam, sigma_rad, dome, flux_s, focal_uncertainty)
     hypothesis, rival_dex = _search(detections, dome, max_checks)
     if hypothesis.dex > AMBIGUOUS_DEX and hypothesis.dex - rival_dex < MARGIN_DEX:
         return AMBIGUOUS
@@ -93,8 +93,8 @@ def build_detections(
     rays_cam: Floats,
     sigma_rad: Floats,
     dome: DomeIndex,
-    focal_uncertainty: float = 0.0,
     flux_s: Floats | None = None,
+    focal_uncertainty: float = 0.0,
 ) -> LedDetections:
     """Detections for the search: rays with their total errors, which include those of the LED map and of the lever.
 

@@ -1,4 +1,4 @@
-"""Residual light of an LCD panel's black pixels, in every pixel of the camera."""
+"""Residual light of a display's black pixels (panel, projector, collimator), in every pixel of the camera."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ from skysim.camera.glow.background import pixel_directions, viewing_geometry
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats
 from skysim.scene.sections import layouts, leds, light
-from skysim.sources.dome.display import black_transmission, panel_strength_e_s_sr, panel_surface
+from skysim.sources.dome.displays.display import black_transmission, panel_strength_e_s_sr, panel_surface
+from skysim.sources.dome.displays.projector import white_wall_per_m2
 from skysim.sources.dome.led import LOBES
 from skysim.sources.dome.shell.surface import build_surface
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
+
+NODE_SPACING_PX = 16  # of a projector's glow
 
 
 def black_glow(
@@ -33,6 +36,9 @@ def black_glow(
     screen = config.layout if isinstance(config, light.DomeConfig) else config
     if not isinstance(screen, layouts.PixelsConfig) or not screen.contrast:
         return None
+    if isinstance(screen, layouts.ProjectorConfig):
+        assert isinstance(config, light.DomeConfig)  # the screen is its layout
+        return projector_glow(config, optics, cam_from_lab, camera_m, band)
     view = viewing_geometry(*chip_directions(optics), optics, cam_from_lab, band)
     if isinstance(config, light.CollimatedDisplayConfig):
         white = collimated_radiance_e_s_m2_sr(config, view.toward_lab, band)
@@ -41,6 +47,27 @@ def black_glow(
         white = panel_radiance_e_s_m2_sr(config, view.toward_lab, camera_m, band)
     glow = black_transmission(screen) * white * view.etendue_m2_sr()
     return glow.reshape(optics.camera.height_px, optics.camera.width_px)
+
+
+def projector_glow(
+    config: light.DomeConfig, optics: Optics, cam_from_lab: Rotation, camera_m: Floats, band: Band
+) -> Floats:
+    """`black_glow` of a projector's picture on the wall, which varies smoothly but at its edges.
+
+    It is computed at nodes at most NODE_SPACING_PX apart and interpolated between them.
+    """
+    assert isinstance(config.layout, layouts.ProjectorConfig)
+    camera = optics.camera
+    x, y = (np.linspace(0, size - 1, size // NODE_SPACING_PX + 2) for size in (camera.width_px, camera.height_px))
+    nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    view = viewing_geometry(*pixel_directions(nodes, optics), optics, cam_from_lab, band)
+    white = projected_radiance_e_s_m2_sr(config, view.toward_lab, camera_m, band)
+    glow = (black_transmission(config.layout) * white * view.etendue_m2_sr()).reshape(len(y), len(x))
+    along = np.array([np.interp(np.arange(camera.width_px), x, row) for row in glow])
+    line = np.arange(camera.height_px) / (camera.height_px - 1) * (len(y) - 1)
+    upper = np.minimum(line.astype(np.int64), len(y) - 2)
+    weight = (line - upper)[:, None]
+    return np.asarray(along[upper] * (1 - weight) + along[upper + 1] * weight)
 
 
 @lru_cache(maxsize=2)
@@ -59,9 +86,30 @@ def panel_radiance_e_s_m2_sr(config: light.DomeConfig, toward_lab: Floats, camer
     panel = panel_surface(config.layout, build_surface(config.surface))
     hits_panel = np.isfinite(panel.meet(camera_m, toward_lab)[:, 0])
     cos_emission = np.where(hits_panel, -toward_lab @ panel.inward(panel.center_m[None])[0], 1.0)
-    emitted = LOBES[config.led.lobe.kind](config.led.lobe, cos_emission) / cos_emission
-    duty = config.led.drive.duty if isinstance(config.led.drive, leds.RefreshConfig) else 1.0
-    return np.asarray(hits_panel * emitted * duty * panel_strength_e_s_sr(config.led, band) / config.layout.pitch_m**2)
+    return np.asarray(hits_panel * white_radiance(config.led, cos_emission, band) / config.layout.pitch_m**2)
+
+
+def projected_radiance_e_s_m2_sr(config: light.DomeConfig, toward_lab: Floats, camera_m: Floats, band: Band) -> Floats:
+    """(N,) radiance of the wall in a projector's white picture, mean over a frame, towards the camera.
+
+    As of a panel, with the area of the wall that a pixel lights in place of p^2, and the pixel's own light.
+    """
+    assert isinstance(config.layout, layouts.ProjectorConfig)
+    surface = build_surface(config.surface)
+    place_m = surface.meet(camera_m, toward_lab)
+    hits_wall = np.isfinite(place_m[:, 0])
+    radiance = np.zeros(len(toward_lab))
+    place_m, toward = place_m[hits_wall], toward_lab[hits_wall]
+    normal = surface.inward(place_m)
+    emitted = white_radiance(config.led, -np.sum(toward * normal, axis=1), band)
+    radiance[hits_wall] = emitted * white_wall_per_m2(config.layout, place_m, normal)
+    return radiance
+
+
+def white_radiance(led: leds.LedConfig, cos_emission: Floats, band: Band) -> Floats:
+    """(N,) radiance of white pixels times the area of one, e s^-1 sr^-1, at these cosines from the normal."""
+    duty = led.drive.duty if isinstance(led.drive, leds.RefreshConfig) else 1.0
+    return LOBES[led.lobe.kind](led.lobe, cos_emission) / cos_emission * duty * panel_strength_e_s_sr(led, band)
 
 
 def collimated_radiance_e_s_m2_sr(config: light.CollimatedDisplayConfig, toward_lab: Floats, band: Band) -> Floats:

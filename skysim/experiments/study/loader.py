@@ -33,7 +33,7 @@ from skysim.experiments.study.plan import (
 )
 from skysim.results import metrics
 from skysim.scene.scene import BODIES_YEARS, Scene
-from skysim.scene.sections.layouts import FibersConfig, LcdConfig
+from skysim.scene.sections.layouts import OnPoints
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.tracking.external.interface import OWN, TRACKERS
 
@@ -200,7 +200,7 @@ def has_survey_errors(scene: Scene) -> bool:
 def fixed_seeds(study: Study, scene: Scene) -> list[str]:
     """Seeds of the survey and of the LEDs that a scene draws once, and the study neither draws anew nor varies."""
     layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
-    points, prefix = (layout.points, ".points") if isinstance(layout, FibersConfig | LcdConfig) else (layout, "")
+    points, prefix = (layout.points, ".points") if isinstance(layout, OnPoints) else (layout, "")
     seeds = [SURVEY_SEED] if has_survey_errors(scene) else []
     seeds += [f"light.layout{prefix}.hardware_seed"] if hasattr(points, "hardware_seed") else []
     varied = {*study.hardware, *study.set}.union(*(factor.value_at(0.5)[1] for factor in study.factors.values()))

@@ -25,7 +25,7 @@ from skysim.experiments.study.plan import (
 from skysim.scene.keys import unused
 from skysim.scene.keys.unused import Rule
 from skysim.scene.scene import Scene
-from skysim.scene.sections.layouts import CelestialConfig, FibersConfig, LcdConfig
+from skysim.scene.sections.layouts import CelestialConfig, OnPoints
 from skysim.scene.sections.light import DomeConfig
 from skysim.tracking import settings
 
@@ -68,7 +68,7 @@ def in_dome(scene: Scene, trial: Trial) -> bool:
 def merges_stars(scene: Scene) -> bool:
     """Whether an LED's size decides which stars share an LED."""
     layout = getattr(scene.light, "layout", None)
-    points = layout.points if isinstance(layout, FibersConfig | LcdConfig) else layout
+    points = layout.points if isinstance(layout, OnPoints) else layout
     return isinstance(points, CelestialConfig)
 
 

@@ -25,9 +25,10 @@ from skysim.scene.sections.layouts import (
     CelestialConfig,
     FibersConfig,
     FibonacciConfig,
-    LcdConfig,
     ListedConfig,
+    OnPoints,
     PatchBoardsConfig,
+    PixelsConfig,
 )
 from skysim.scene.sections.leds import DirectConfig, PwmConfig
 from skysim.scene.sections.light import DomeConfig
@@ -64,7 +65,7 @@ def equally_bright(scene: Scene) -> bool:
     if not isinstance(scene.light, DomeConfig):
         return False
     layout = scene.light.layout
-    points = layout.points if isinstance(layout, FibersConfig | LcdConfig) else layout
+    points = layout.points if isinstance(layout, OnPoints) else layout
     if isinstance(points, PatchBoardsConfig):
         levels = {level for board in points.boards or () for level in board.levels or (1.0,)}
         return len(levels or set(points.pwm_levels)) == 1
@@ -116,7 +117,7 @@ def dome_draws_nothing(scene: Scene) -> bool:
         return False
     if isinstance(layout, FibersConfig) and (layout.radius_variation or layout.aiming):
         return False
-    points = layout.points if isinstance(layout, FibersConfig | LcdConfig) else layout
+    points = layout.points if isinstance(layout, OnPoints) else layout
     if isinstance(points, FibonacciConfig):
         return len(set(points.dimming)) == 1  # the level of each LED is drawn from the list
     return isinstance(points, ListedConfig | CelestialConfig)
@@ -285,8 +286,8 @@ RULES = (
     ),
     Rule(
         ("light.led.color_scatter", "light.led.aging.scatter"),
-        lambda scene: isinstance(getattr(scene.light, "layout", None), LcdConfig),
-        "the pixels of a panel share their light",
+        lambda scene: isinstance(getattr(scene.light, "layout", None), PixelsConfig),
+        "the pixels of a display share their light",
         "another light.layout",
     ),
     Rule(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import math
 from collections.abc import Sequence
 from typing import Annotated, Literal, Self
 
@@ -344,7 +345,7 @@ class FibersConfig(ConfigModel):
 
 
 class PixelsConfig(ConfigModel):
-    """A display's grid and gray levels, common to an LCD panel and a collimated micro-display.
+    """A display's grid and gray levels, common to an LCD panel, a projector and a collimated micro-display.
 
     pixels : columns and rows;  pitch : from one pixel to the next, along both
     block  : a star is drawn as a square of this many pixels a side, all of one gray
@@ -383,6 +384,52 @@ class LcdConfig(PixelsConfig):
         return self.points.cap_deg
 
 
+class ProjectorConfig(PixelsConfig):
+    """A projector in the dome that shows any layout of single LEDs on the matt inside, each on the nearest pixels.
+
+    `led` is the light of one white pixel on the axis as the wall sends it back: intensity along the wall's normal
+    (share / pi of the pixel's lumens, in candela), lobe of the wall; disk_diameter is the blur of lens and paint. The
+    beam is not hidden by the vehicle.
+
+    position, aim : the lens's entrance pupil, and the point of the lab on its axis
+    rotation_deg  : of the picture about the axis; at 0 its rows run along the lab's +x as far as the axis lets them
+    pitch, focal_length, f_number : of the chip's pixels and of the lens
+    focus      : distance along the axis at which it is sharp; that of `aim` if left out
+    distortion : k of the lens: a direction at the tangent t from the axis is at f t (1 + k t^2) on the chip. The
+        picture is drawn for it
+    falloff    : a pixel's light falls as cos^falloff of its angle from the axis; 4 is a lens's natural vignetting
+    """
+
+    kind: Literal["projector"]
+    points: Points
+    position_m: tuple[Length, Length, Length]
+    aim_m: tuple[Length, Length, Length]
+    rotation_deg: Number = 0.0
+    focal_length_m: Annotated[Length, Field(gt=0)]
+    f_number: Annotated[Number, Field(gt=0)] = 2.0
+    focus_m: Annotated[Length, Field(gt=0)] | None = None
+    distortion: Annotated[Number, Field(ge=-1, le=1)] = 0.0
+    falloff: Annotated[Number, Field(ge=0, le=10)] = 4.0
+
+    @property
+    def cap_deg(self) -> float:
+        """Angle from the zenith to which there are points."""
+        return self.points.cap_deg
+
+    @model_validator(mode="after")
+    def check_lens(self) -> ProjectorConfig:
+        sight = [end - start for start, end in zip(self.position_m, self.aim_m, strict=True)]
+        if not any(sight[1:]):
+            raise ValueError("aim: straight along x from the position; allowed: any other direction")
+        corner = math.hypot(*self.pixels) * self.pitch_m / 2 / self.focal_length_m
+        # t (1 + k t^2) has its maximum 2 t / 3 at t^2 = -1 / (3 k).
+        if self.distortion < 0 and 2 / 3 / math.sqrt(-3 * self.distortion) <= corner:
+            raise ValueError(f"distortion: {self.distortion:g} folds the picture's corners back; allowed: nearer to 0")
+        return self
+
+
+OnPoints = FibersConfig | LcdConfig | ProjectorConfig  # layouts that show another layout's points
+
 Layout = Annotated[
     PatchBoardsConfig
     | FibonacciConfig
@@ -394,6 +441,7 @@ Layout = Annotated[
     | CelestialConfig
     | ListedConfig
     | FibersConfig
-    | LcdConfig,
+    | LcdConfig
+    | ProjectorConfig,
     Field(discriminator="kind"),
 ]

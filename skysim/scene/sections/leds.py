@@ -87,7 +87,8 @@ class SequentialConfig(ConfigModel):
 
 
 class RefreshConfig(ConfigModel):
-    """A panel's backlight, lit for `duty` of every frame: row after row from the top, over the course of a frame."""
+    """A display that is lit for `duty` of every frame: a panel's rows one after another from the top, over the course
+    of a frame; a projector's pixels at once (a color wheel: the share of a turn with the color, or its shutter)."""
 
     kind: Literal["refresh"]
     rate_hz: Annotated[Number, Field(gt=0)]

@@ -271,13 +271,15 @@ class DomeConfig(ConfigModel):
 
     @model_validator(mode="after")
     def check_panel(self) -> DomeConfig:
-        panel, drive = self.layout.kind == "lcd", self.led.drive.kind
-        if panel and self.surface.kind != "flat":
+        layout, drive = self.layout.kind, self.led.drive.kind
+        display = layout in ("lcd", "projector")
+        if layout == "lcd" and self.surface.kind != "flat":
             raise ValueError(f"layout: lcd does not fit a surface of kind {self.surface.kind}; allowed: flat")
-        if panel and drive not in ("direct", "refresh"):
-            raise ValueError(f"led.drive: {drive} cannot drive an lcd; allowed: direct, refresh")
-        if not panel and drive == "refresh":
-            raise ValueError(f"led.drive: refresh requires a layout of kind lcd, not {self.layout.kind}")
+        if display and drive not in ("direct", "refresh"):
+            article = "an" if layout == "lcd" else "a"
+            raise ValueError(f"led.drive: {drive} cannot drive {article} {layout}; allowed: direct, refresh")
+        if not display and drive == "refresh":
+            raise ValueError(f"led.drive: refresh requires a layout of kind lcd or projector, not {layout}")
         return self
 
 

@@ -27,7 +27,7 @@ from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.simulation.checks.views import CameraModel
 from skysim.simulation.testbed import Testbed
-from skysim.sources.dome import display
+from skysim.sources.dome.displays import display
 from skysim.sources.dome.survey.survey_errors import led_covariance_m2
 from skysim.tracking import dome_map_file
 from skysim.tracking.onboard_model import assumed_camera, onboard_catalog

@@ -13,7 +13,7 @@ from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig, TwoStopsConfig
-from skysim.scene.sections.layouts import FibersConfig, Layout, LcdConfig
+from skysim.scene.sections.layouts import Layout, OnPoints
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import (
@@ -147,7 +147,7 @@ def least_lights(scene: Scene) -> int:
 def density_key(layout: Layout) -> str:
     """The key that sets how many LEDs a layout has."""
     key, points = "light.layout", layout
-    if isinstance(layout, FibersConfig | LcdConfig):
+    if isinstance(layout, OnPoints):
         key, points = "light.layout.points", layout.points
     for name in ("count", "spacing_m", "limit_mag"):
         if getattr(points, name, None) is not None:
@@ -157,7 +157,7 @@ def density_key(layout: Layout) -> str:
 
 def denser(layout: Layout, mean: float) -> str:
     """How to get a mean of three times the lights that an identification needs, from the mean number on the chip."""
-    points = layout.points if isinstance(layout, FibersConfig | LcdConfig) else layout
+    points = layout.points if isinstance(layout, OnPoints) else layout
     factor = max(3 * MIN_LIGHTS / max(mean, 0.5), 1.5)
     count, spacing_m = getattr(points, "count", None), getattr(points, "spacing_m", None)
     if count is not None:

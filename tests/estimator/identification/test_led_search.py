@@ -336,7 +336,9 @@ def test_the_quick_check_counts_until_it_knows(dead: list[int], required: int, f
     gates, R_grid_from_cam = np.full(5, 1e-4), dome.grid.R_grid_from_lab
     median_m = dome.median_radius_m
     assert PLAIN._quick_check(detections, dome, R_grid_from_cam, 1.0, median_m, 0, 1, gates, required) == found
-    zoomed = search.build_detections(camera.zoomed(1 / 1.08).rays(camera.pixels(rays)), np.full(5, 1e-5), dome, 0.1)
+    zoomed = search.build_detections(
+        camera.zoomed(1 / 1.08).rays(camera.pixels(rays)), np.full(5, 1e-5), dome, focal_uncertainty=0.1
+    )
     assert PLAIN._quick_check(zoomed, dome, R_grid_from_cam, 1.08, median_m, 0, 1, gates, required) == found
     if found > 2:
         assert PLAIN._quick_check(zoomed, dome, R_grid_from_cam, 1.0, median_m, 0, 1, gates, required) < found
@@ -349,7 +351,9 @@ def test_a_pair_tells_the_focal_length_at_which_it_is_two_leds(ratio: float) -> 
     dome = build_dome_index(spread(60, OVAL, seed=1), LEVER, CAMERA)
     ends = [np.array(PLAIN._direction_from_bearing(*one)) for one in ((rays[0], dome, 1.1), (rays[1], dome, 1.3))]
     pixels = CAMERA.pixels(rays)
-    seen = search.build_detections(CAMERA.zoomed(1 / ratio).rays(pixels), np.full(2, 1e-5), dome, 0.12)
+    seen = search.build_detections(
+        CAMERA.zoomed(1 / ratio).rays(pixels), np.full(2, 1e-5), dome, focal_uncertainty=0.12
+    )
     chord = float(np.linalg.norm(ends[0] - ends[1]))
     assert PLAIN._fit_focal_ratio(seen, dome, 0, 1, 1.1, 1.3, chord) == pytest.approx(ratio, abs=1e-6)
     known = seen._replace(focal_uncertainty=0.0)
@@ -452,7 +456,7 @@ def test_lights_that_fell_anywhere_have_no_attitude_at_any_focal_length() -> Non
     rng, dex = np.random.default_rng(8), []
     for _ in range(200):
         rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (8, 2)))
-        fallen = search.build_detections(rays, np.full(8, NOISE_PX / CAMERA.focal_px), dome, 0.12)
+        fallen = search.build_detections(rays, np.full(8, NOISE_PX / CAMERA.focal_px), dome, focal_uncertainty=0.12)
         best, _ = search._search(fallen, dome, 10**7)
         dex.append(best.dex)
     assert np.mean(np.array(dex) > 1) <= 0.1 + 3 * np.sqrt(0.09 / 200)

@@ -218,7 +218,7 @@ def test_leds_are_named_rightly_at_any_focal_length_or_not_at_all(
     star = np.concatenate([star, np.full(false, -1)])
     camera = CAMERA.zoomed(1 / ratio)
     identify = dome_tracker.non_dimensional(camera, eye.leds, eye.lever, settings)
-    match = identify(camera.rays(xy), np.full(len(xy), 1e-4))
+    match = identify(camera.rays(xy), np.full(len(xy), 1e-4), None)
     named = np.zeros((0, 2), int) if isinstance(match, str) else np.column_stack([star[match.observed], match.star])
     assert all(seen in (led, -1) for seen, led in named)
     solved = DomeTracker(camera, eye.leds, eye.lever, settings).solve_centroids(

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.scene.sections.layouts import FibersConfig, LcdConfig
+from skysim.scene.sections.layouts import OnPoints
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
@@ -77,7 +77,7 @@ def finding(found: Lookalike, light: DomeConfig) -> str:
     """Warn where many fields look like another one."""
     if found.share <= MAX_ALIKE:
         return ""
-    points = light.layout.points if isinstance(light.layout, FibersConfig | LcdConfig) else light.layout
+    points = light.layout.points if isinstance(light.layout, OnPoints) else light.layout
     key = "light.layout.kind" if points is light.layout else "light.layout.points.kind"
     random = points.kind in ("poisson_disk", "random", "optimized")
     change = "add LEDs" if random else "change it to poisson_disk"

@@ -1,6 +1,6 @@
 """All layouts of LEDs by name. LAYOUTS maps the scene's `light.layout.kind` to a function that returns all LEDs.
 
-The real sky, and two kinds that take the points of another layout, optical fibers and an LCD panel, are defined here;
+The real sky, and three kinds that take the points of another layout (fibers, panel, projector) are defined here;
 the others in their own modules.
 """
 
@@ -13,10 +13,19 @@ import numpy as np
 
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Sources
-from skysim.scene.sections.layouts import HOLES, CelestialConfig, FibersConfig, Layout, LcdConfig, PatchBoardsConfig
+from skysim.scene.sections.layouts import (
+    HOLES,
+    CelestialConfig,
+    FibersConfig,
+    Layout,
+    LcdConfig,
+    PatchBoardsConfig,
+    ProjectorConfig,
+)
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome import celestial as celestial_dome
-from skysim.sources.dome import display
+from skysim.sources.dome.displays import display
+from skysim.sources.dome.displays.projector import projector_sources
 from skysim.sources.dome.layouts.boards import patch_boards
 from skysim.sources.dome.layouts.fibers import displace_ends
 from skysim.sources.dome.layouts.geodesic import geodesic
@@ -52,6 +61,12 @@ def lcd(config: LcdConfig, surface: Surface, led: LedConfig, band: Band) -> Sour
     return display.panel_sources(config, panel, led, band, stars)
 
 
+def projector(config: ProjectorConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+    """Another layout's LEDs drawn on the nearest pixels of a projector: `projector.projector_sources`."""
+    stars = LAYOUTS[config.points.kind](config.points, surface, display.ideal_led(led), band)
+    return projector_sources(config, surface, led, band, stars)
+
+
 # Arguments: its section of the scene, the surface, the LED type, the chip's band. Returns all LEDs.
 LAYOUTS: dict[str, Callable[[Any, Surface, LedConfig, Band], Sources]] = {
     "patch_boards": patch_boards,
@@ -65,6 +80,7 @@ LAYOUTS: dict[str, Callable[[Any, Surface, LedConfig, Band], Sources]] = {
     "listed": listed,
     "fibers": fibers,
     "lcd": lcd,
+    "projector": projector,
 }
 
 

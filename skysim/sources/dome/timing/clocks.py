@@ -23,7 +23,7 @@ import numpy as np
 from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import LED_CLOCKS, random_stream
 from skysim.core.types import Floats, Sources
-from skysim.scene.sections.layouts import FibersConfig, Layout, LcdConfig
+from skysim.scene.sections.layouts import Layout, OnPoints
 from skysim.scene.sections.leds import ClockConfig, DirectConfig, PwmConfig
 from skysim.scene.sections.light import DomeConfig, Light
 
@@ -114,4 +114,4 @@ def build_clocks(light: Light, sources: Sources, seed: int) -> Clocks | None:
 
 def hardware_seed(layout: Layout) -> int:
     """The seed of a layout's hardware; a panel's or a shell's is that of the points on it."""
-    return hardware_seed(layout.points) if isinstance(layout, FibersConfig | LcdConfig) else layout.hardware_seed
+    return hardware_seed(layout.points) if isinstance(layout, OnPoints) else layout.hardware_seed

@@ -32,6 +32,7 @@ from skysim.sources.dome.shell.surface import Plane
 from skysim.sources.photometry import SUN, Band, star_chromatic, star_flux_e_s_m2
 
 Ints = NDArray[np.int64]
+PanelConfig = layouts.LcdConfig | layouts.ProjectorConfig
 
 
 class PixelBlocks(NamedTuple):
@@ -124,29 +125,58 @@ def panel_sources(config: layouts.LcdConfig, panel: Plane, led: leds.LedConfig, 
     stars. Raises InputError for a star nearer to black than to the first gray level.
     """
     own_m = panel.lab_from_own.inv().apply(stars.place[:, :3] - panel.center_m)
-    level = stars.strength / full_strength_e_s_sr(led, band)
-    blocks = draw_blocks(config, own_m[:, :2], level)
+    blocks = visible_blocks(config, own_m[:, :2], stars.strength / full_strength_e_s_sr(led, band))
+    flat_m = np.column_stack([blocks.center_px * config.pitch_m, np.zeros(len(blocks.star))])
+    place_m = panel.center_m + panel.lab_from_own.apply(flat_m)
+    patches = Patches(place_m, panel.inward(place_m), config.block * led.disk_diameter_m / 2, 1.0)
+    row = blocks.corner_px[:, 1] / config.pixels[1]
+    return block_sources(config, led, band, stars, blocks, patches, row)
+
+
+def visible_blocks(config: PanelConfig, position_m: Floats, level: Floats) -> PixelBlocks:
+    """`draw_blocks`; raises InputError for a star that is nearer to black than to the first gray level."""
+    blocks = draw_blocks(config, position_m, level)
     if not np.all(blocks.level > 0):
         raise InputError(
             f"light.layout.points: a star of level {level.min():.2g} is black on {config.gray_levels} gray levels;"
             f" allowed: {min_level(config):.2g} or more"
         )
+    return blocks
+
+
+class Patches(NamedTuple):
+    """M blocks of pixels as they are lit: place and inward normal (M, 3), radius of the disk, and the light of one of
+    their pixels over that of the white pixel `led`."""
+
+    place_m: Floats
+    normal: Floats
+    radius_m: Floats | float
+    gain: Floats | float
+
+
+def block_sources(
+    config: PanelConfig,
+    led: leds.LedConfig,
+    band: Band,
+    stars: Sources,
+    blocks: PixelBlocks,
+    patches: Patches,
+    row: Floats | float,
+) -> Sources:
+    """The blocks as sources, n^2 times the light of a pixel each; row : of `DriveInput`."""
     rng = random_stream(config.points.hardware_seed)
     count = len(blocks.star)
     # Pixels scatter independently: the mean of n^2 of them scatters by 1 / n as much, and is nearly Gaussian.
     scatter = strength_factors(
         led.scatter if config.block == 1 else led.scatter / config.block, rng.standard_normal(count)
     )
-    row = blocks.corner_px[:, 1] / config.pixels[1]
     pulses = DRIVES[led.drive.kind](led, DriveInput(blocks.level, np.zeros(count, dtype=np.int64), row), rng)
-    flat_m = np.column_stack([blocks.center_px * config.pitch_m, np.zeros(count)])
-    place_m = panel.center_m + panel.lab_from_own.apply(flat_m)
     return Sources(
         id=stars.id[blocks.star],
-        place=np.column_stack([place_m, np.ones(count)]),
-        normal=panel.inward(place_m),
-        radius_m=np.full(count, config.block * led.disk_diameter_m / 2),
-        strength=panel_strength_e_s_sr(led, band) * config.block**2 * scatter * pulses.strength,
+        place=np.column_stack([patches.place_m, np.ones(count)]),
+        normal=patches.normal,
+        radius_m=np.broadcast_to(patches.radius_m, (count,)).copy(),
+        strength=panel_strength_e_s_sr(led, band) * config.block**2 * scatter * pulses.strength * patches.gain,
         period_s=pulses.period_s,
         start_s=pulses.start_s,
         on_s=pulses.on_s,
