@@ -2,7 +2,8 @@
 
 Centroids of scene coded_spiral, 400 LEDs on a spiral, at random attitudes within 30 degrees of tilt, at rest or turning
 at a constant rate about a random axis. A light's position and brightness have the errors of `Noise`. Some sequences are
-rendered too. `python -m benchmarks.codes [ATTITUDES [RENDERED]]` prints the rows.
+rendered too, and other codes, levels and clocks are tried.
+`python -m benchmarks.codes [ATTITUDES [RENDERED [VARIANTS]]]` prints the rows.
 """
 
 from __future__ import annotations
@@ -91,12 +92,12 @@ class Bench:
                     break
         return Sequence(first, wrong, fewest)
 
-    def rendered(self, rate_deg_s: float, seed: int) -> Sequence:
+    def rendered(self, rate_deg_s: float, seed: int, frames: int) -> Sequence:
         """As `sequence`, in rendered frames, of which all are solved."""
         rng, scene = random_stream(seed), self.testbed.scene
         start, axis, begin = attitude(rng), rng.standard_normal(3), int(rng.integers(0, 1000))
         turn_rad_s = np.radians(rate_deg_s) * axis / np.linalg.norm(axis)
-        last = begin + self.tracker.code.bits
+        last = begin + frames
         t_s = np.array([exposure_window(scene, n).open_s - MARGIN_S for n in (begin, last)])
         body_from_lab = Rotation.from_rotvec(turn_rad_s * (t_s - t_s[0])[:, None]) * start
         trajectory = Trajectory(t_s, body_from_lab.inv(), np.tile(-turn_rad_s, (2, 1)))
@@ -152,19 +153,43 @@ def is_wrong(solved: Attitude, cam_from_lab: Rotation, name: Ints) -> bool:
     return metrics.is_wrong(error_rad, nees) or bool(np.any(name[solved.match.observed] != solved.match.star))
 
 
-def measure(attitudes: int = ATTITUDES, rendered: int = RENDERED) -> list[dict[str, Any]]:
+# Other codes than the scene's, failing bits, and clocks of their own: a bit of 20 ms is one frame.
+VARIANTS = {
+    "BCH, 4 levels": {"light.led.code": "{kind: bch, distance: 5, depth: 0.75, levels: 4}"},
+    "De Bruijn": {"light.led.code": "{kind: de_bruijn}"},
+    "De Bruijn, 4 levels": {"light.led.code": "{kind: de_bruijn, depth: 0.75, levels: 4}"},
+    "on and off": {"light.led.code.depth": "1"},
+    "2 % of the bits fail": {"light.led.code.dropout": "0.02"},
+    "free-running": {"light.led.code": "{kind: cyclic, bit_time: 20 ms}"},
+    "free-running, 2,000 ppm fast": {
+        "light.led.code": "{kind: cyclic, bit_time: 20 ms}",
+        "light.led.clock": "{offset_ppm: 2000}",
+    },
+}
+MOST_FRAMES = 40  # of a variant's sequence: a De Bruijn word is much longer
+
+
+def measure(
+    attitudes: int = ATTITUDES, rendered: int = RENDERED, variants: int = ATTITUDES // 20
+) -> list[dict[str, Any]]:
     """All rows; bit errors against theory in benchmarks/bit_errors.py."""
-    return identified("centroids", attitudes) + identified("rendered", rendered) + bit_errors.measure()
+    rows = identified("centroids", attitudes) + identified("rendered", rendered) + bit_errors.measure()
+    for name, settings in VARIANTS.items():
+        rows += identified("centroids", variants, name, settings)
+    return rows
 
 
-def identified(kind: str, attitudes: int) -> list[dict[str, Any]]:
+def identified(
+    kind: str, attitudes: int, variant: str = "", settings: dict[str, str] | None = None
+) -> list[dict[str, Any]]:
     """Attitudes found within the code's length of frames, and wrong ones, at rest and turning."""
-    bench, rows = Bench(), list[dict[str, Any]]()
+    bench, rows = Bench(settings), list[dict[str, Any]]()
     one = bench.rendered if kind == "rendered" else bench.sequence
     for rate_deg_s in RATES_DEG_S:
-        results = [one(rate_deg_s, seed) for seed in range(attitudes)]
+        bits = min(bench.tracker.code.bits, MOST_FRAMES)
+        results = [one(rate_deg_s, seed, bits) for seed in range(attitudes)]
         found = 100 * float(np.mean([result.first > 0 for result in results]))
-        name, bits = f"spiral of 400, {kind}, {rate_deg_s:g} deg/s", bench.tracker.code.bits
+        name = f"spiral of 400, {variant or kind}, {rate_deg_s:g} deg/s"
         wrong = sum(result.wrong for result in results)
         rows += [
             verdict(f"{name}: attitude within {bits} frames", found, "%", f"{attitudes} attitudes", 99.9, least=True),

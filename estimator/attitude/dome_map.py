@@ -30,6 +30,8 @@ class LedMap:
     covariance_m2 : (N, 3, 3) of each LED's own error; None if it is the same for all, along all axes
     common_m   : (M, N, 3) displacement of each LED by one standard deviation of each error that all LEDs share: of the
         surface, of the instrument's place and orientation; None without any
+    flux_s     : (N,) flux of each LED's light, in the frame's numbers per second of exposure; None if all are alike
+    flux_sigma : standard deviation of the natural logarithm of a measured flux over that
     """
 
     id: Ints
@@ -40,6 +42,8 @@ class LedMap:
     sigma_m: float = 0.0
     covariance_m2: Floats | None = None
     common_m: Floats | None = None
+    flux_s: Floats | None = None
+    flux_sigma: float = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +114,9 @@ def check_map(leds: object) -> None:
         checks.floats("leds: covariance_m2", leds.covariance_m2, (count, 3, 3))
     if leds.common_m is not None:
         checks.floats("leds: common_m", leds.common_m, (None, count, 3))
+    checks.number("leds: flux_sigma", leds.flux_sigma, 1e-3, 10.0, "0.001 to 10")
+    if leds.flux_s is not None and not (checks.floats("leds: flux_s", leds.flux_s, (count,)) > 0).all():
+        raise ImageError("leds: flux_s is 0 or less, or not a number; allowed: above 0")
 
 
 def check_lever(leds: LedMap, lever: Lever) -> None:

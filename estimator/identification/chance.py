@@ -55,14 +55,17 @@ def least(values: Floats) -> float:
 
 
 @jit
-def required_matches(sigma: Floats, field_area: float, attitude_dex: float, min_dex: float) -> int:
+def required_matches(
+    sigma: Floats, field_area: float, attitude_dex: float, min_dex: float, light_dex: float = 0.0
+) -> int:
     """Least number of matches that can reach min_dex, from an estimate of the greatest evidence.
 
     The estimate has no residuals and no missing sources: each match contributes the density ratio
-    1 / (2 pi sigma^2 rho) of the least sigma of all detections, the attitude contributes attitude_dex.
+    1 / (2 pi sigma^2 rho) of the least sigma of all detections and light_dex by its brightness, the attitude
+    contributes attitude_dex.
     """
     total = len(sigma)
-    match_dex = -log10(2 * pi * least(sigma) ** 2 * total / field_area)
+    match_dex = light_dex - log10(2 * pi * least(sigma) ** 2 * total / field_area)
     for count in range(MIN_EVIDENCE_MATCHES, total):
         if count * match_dex + attitude_dex - log10(count + 1.0) >= min_dex:
             return count

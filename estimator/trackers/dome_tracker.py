@@ -43,14 +43,16 @@ from estimator.trackers.star_tracker import NO_STARS
 
 MIN_ERROR_PX = 0.3  # least centroid error of an LED, for effects outside of survey and calibration
 SETTINGS = Settings(identifier="led_pairs", solver="rotation_only")
-Identify = Callable[[Floats, Floats], StarMatch | str]
+Identify = Callable[[Floats, Floats, Floats | None], StarMatch | str]
 
 
 def led_pairs(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
     """The default LED identifier: pair hypotheses and evidence; see `identification.leds.search.identify`."""
     sight = build_dome_index(leds, lever, camera)
     least_rad = MIN_ERROR_PX / camera.focal_px
-    return lambda rays_cam, sigma_rad: search.identify(rays_cam, np.hypot(sigma_rad, least_rad), sight)
+    return lambda rays_cam, sigma_rad, flux_s: search.identify(
+        rays_cam, np.hypot(sigma_rad, least_rad), sight, flux_s=flux_s
+    )
 
 
 def star_identifier(name: str, camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
@@ -67,7 +69,7 @@ def star_identifier(name: str, camera: Camera, leds: LedMap, lever: Lever, setti
     pairs = pair_index.build(leds.position_m / radius[:, None], reach_rad * 1.05, leds.board)
     stretch = 2 * float(np.std(radius)) / (median_radius_m - float(np.linalg.norm(pupil_m))) + 5e-4
 
-    def identify(rays_cam: Floats, sigma_rad: Floats) -> StarMatch | str:
+    def identify(rays_cam: Floats, sigma_rad: Floats, flux_s: Floats | None) -> StarMatch | str:
         match = STAR_IDENTIFIERS[name](
             on_sphere(rays_cam, pupil_m, median_radius_m) / median_radius_m,
             pairs,
@@ -82,8 +84,8 @@ def star_identifier(name: str, camera: Camera, leds: LedMap, lever: Lever, setti
     return identify
 
 
-# Each maps (camera, leds, lever, settings) to a function that identifies (N, 3) rays with (N,) errors: it returns the
-# match, or the reason for a refusal.
+# Each maps (camera, leds, lever, settings) to a function that identifies (N, 3) rays with (N,) errors and, if the
+# exposure is known, (N,) fluxes per second: it returns the match, or the reason for a refusal.
 IDENTIFIERS: dict[str, Callable[[Camera, LedMap, Lever, Settings], Identify]] = {
     "led_pairs": led_pairs,
     "pyramid": partial(star_identifier, "pyramid"),
@@ -182,9 +184,9 @@ class DomeTracker:
         lever_cam_m = self.lever.cam_from_body.apply(self.lever.camera_body_m)
         lights = Lights(self.leds.position_m, lever_cam_m, self._with_errors)
         if self.camera.row_time_s:
-            solve = partial(self._solve_global, clock=clock)
+            solve = partial(self._solve_global, clock=clock, exposure_s=exposure_s)
             return solve_rolling(self.camera, lights, centroids, solve, rate, exposure_s)
-        return with_streak_rate(self._solve_global(centroids, clock), centroids, exposure_s, rate, lights)
+        return with_streak_rate(self._solve_global(centroids, clock, exposure_s), centroids, exposure_s, rate, lights)
 
     def _with_errors(self, centroids: Centroids, star: NDArray) -> Centroids:
         """K centroids with their total errors: the LEDs' places and the focal length too."""
@@ -195,12 +197,13 @@ class DomeTracker:
         sigma_px = self.camera.focal_px * np.hypot(pixel_rad, self.led_sigma_rad[star])
         return replace(centroids, sigma_px=sigma_px, covariance_px2=None)
 
-    def _solve_global(self, centroids: Centroids, clock: Clock) -> Attitude:
+    def _solve_global(self, centroids: Centroids, clock: Clock, exposure_s: float | None) -> Attitude:
         """Identify and solve centroids of one time."""
         bright = brightest(centroids, self.settings)
         rays = self.camera.rays(bright.xy_px)
         focal_rad = focal_error_rad(rays, self.camera)
-        match = self.identify(rays, np.hypot(direction_sigma_rad(bright, self.camera, self.settings), focal_rad))
+        sigma_rad = np.hypot(direction_sigma_rad(bright, self.camera, self.settings), focal_rad)
+        match = self.identify(rays, sigma_rad, bright.flux / exposure_s if exposure_s else None)
         return self._solve_identified(centroids, match, clock)
 
     def _solve_identified(self, centroids: Centroids, match: StarMatch | str, clock: Clock) -> Attitude:

@@ -214,8 +214,13 @@ def error_figure(rows: list[FrameRow]) -> bytes:
     fig, (errors, stars, rate) = stacked_axes([2.9, 1.45, 1.45])
     solved = [row for row in rows if row.status == "solved"]
     t = [row.t_s for row in solved]
-    errors.semilogy(t, [max(row.cross_arcsec, 1e-6) for row in solved], ".-", label="cross-boresight")
-    errors.semilogy(t, [max(abs(row.roll_arcsec), 1e-6) for row in solved], ".-", label="roll")
+    cross, roll = ([max(abs(getattr(row, f"{name}_arcsec")), 1e-6) for row in solved] for name in ("cross", "roll"))
+    errors.plot(t, cross, ".-", label="cross-boresight")
+    errors.plot(t, roll, ".-", label="roll")
+    if solved and max(cross + roll) > 10 * min(cross + roll):
+        errors.set_yscale("log")
+    else:
+        errors.set_ylim(bottom=0)
     for row in rows:
         if row.status != "solved":
             errors.axvline(row.t_s, color="tab:red", alpha=0.4)

@@ -33,6 +33,7 @@ from skysim.tracking.onboard_model import (
     assumed_lever,
     onboard_catalog,
     surveyed_dome,
+    with_brightness,
 )
 from skysim.tracking.orbit_velocity import OrbitStarTracker, assumed_observer, assumed_orbit
 from skysim.tracking.settings import assumed_settings
@@ -55,6 +56,7 @@ def build_tracker(scene: Scene, mount: Mount, sources: Sources, programs: Mappin
         leds, lever = assumed_dome(scene, scene.light, sources), assumed_lever(scene, mount)
         if scene.tracker.map:
             camera, leds, lever = surveyed_dome(scene, scene.tracker.map, leds, lever)
+        leds = with_brightness(scene, scene.light, leds, lever)
         if scene.tracker.name != OWN:
             return ExternalTracker.start(scene, camera, settings, adapter.led_map(leds, lever), programs)
         try:
@@ -98,3 +100,10 @@ def solve_frame(
         return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s)
     except ImageError as error:
         return Report(Attitude(str(error)), Centroids.empty())
+
+
+def solve_centroids(estimator: Estimator, centroids: Centroids, exposure_s: float) -> Attitude:
+    """The tracker's attitude of centroids of an exposure; the dome's tracker needs it for the lights' brightness."""
+    if isinstance(estimator, DomeTracker):
+        return estimator.solve_centroids(centroids, exposure_s=exposure_s)
+    return estimator.solve_centroids(centroids)

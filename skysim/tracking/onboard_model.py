@@ -13,6 +13,7 @@ from estimator.catalog.refraction import SiteAir
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.identification.leds.codes import LedCode
+from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
 from skysim.core.types import Mount, Sources
 from skysim.scene.scene import Scene
@@ -20,10 +21,11 @@ from skysim.scene.sections.camera import CameraConfig, RollingShutterConfig
 from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.sources.air.air import weather_of
 from skysim.sources.catalog import require_catalog
-from skysim.sources.dome.layouts import registry
+from skysim.sources.dome.layouts import led_list, registry
+from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
 from skysim.sources.dome.shell import surface
 from skysim.sources.dome.survey import survey_errors
-from skysim.sources.dome.timing.codebooks import codebook
+from skysim.sources.dome.timing.codebooks import codebook, light_levels
 from skysim.sources.photometry import Band
 from skysim.tracking import dome_map_file
 
@@ -47,12 +49,28 @@ def assumed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
     return LedMap(sources.id, position_m, *ellipsoid, board, sigma_m, covariance_m2, common_m)
 
 
+def with_brightness(scene: Scene, light: DomeConfig, leds: LedMap, lever: Lever) -> LedMap:
+    """The map with the flux of each LED in DN per second of exposure, as the data sheets say it: without scatter.
+
+    Each is seen along its normal by the camera that points at it, at its distance from the bearing less the lever.
+    """
+    if scene.tracker.brightness_sigma is None:
+        return leds
+    nominal = led_list.design_leds(light, surface.build_surface(light.surface), Band.from_camera(scene.camera))
+    order = np.argsort(nominal.id)
+    nominal = nominal.take(order[np.searchsorted(nominal.id, leds.id, sorter=order)])
+    distance_m = np.linalg.norm(leds.position_m, axis=1) - np.linalg.norm(lever.camera_body_m)
+    strength = nominal.strength * np.minimum(nominal.on_s / nominal.period_s, 1.0)
+    light_e_s_m2 = irradiance_e_s_m2(strength, Emitter.from_config(light.led), np.ones(1), np.ones(1), distance_m)
+    flux_s = light_e_s_m2 * Optics.from_camera(scene.camera).collecting_m2 / scene.camera.detector.gain_e_dn
+    return replace(leds, flux_s=flux_s, flux_sigma=scene.tracker.brightness_sigma)
+
+
 def assumed_code(light: DomeConfig, sources: Sources, leds: LedMap) -> LedCode:
     """The words of the LEDs of the tracker's map, as the dome has them."""
     assert light.led.code is not None
     code, row = light.led.code, np.searchsorted(sources.id, leds.id, sorter=np.argsort(sources.id))
-    words = codebook(code, len(sources))[np.argsort(sources.id)[row]]
-    levels = np.where(words > 0, 1.0, 1 - code.depth)
+    levels = light_levels(code, codebook(code, len(sources))[np.argsort(sources.id)[row]])
     return LedCode(levels, None if code.bit_time_s == "frame" else code.bit_time_s)
 
 

@@ -13,4 +13,5 @@ from skysim.core.errors import InputError
 def test_message_is_one_printable_line(error, quoted):
     message = str(error(f"file.tle, line 2: the checksum is {quoted}; it should be 9"))
     assert message.isprintable()
-    assert message.startswith("file.tle, line 2: ") and message.endswith("; it should be 9")
+    assert message.startswith("file.tle, line 2: ")
+    assert message.endswith("; it should be 9")

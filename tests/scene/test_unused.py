@@ -40,6 +40,10 @@ class Case(NamedTuple):
 
 
 DOME, SKY, BENCH, CODED = "afit_simsat", "shefex2", "collimated_display", "coded_spiral"
+MANY = "{kind: fibonacci, count: 700, cap_deg: 34}"
+DENSE = {"light.layout.count": "4000"}  # for the small field of these tests
+TWO_LEVELS = {"light.layout.levels": "[1, 0.5]"}
+BY_LEVELS = {"light.layout": MANY} | TWO_LEVELS
 DIRECT = {"light.led.drive": "{kind: direct}"}
 FLAT = {"light.surface": "{kind: flat, apex: 48 in}"}
 FLOOR = "{share: 0.5, depth: 1 m, radius: 1 m}"
@@ -58,10 +62,21 @@ CASES = [
     Case(SKY, {}, "tracker.options", "{a: 1}", {"tracker.name": "tetra3rs"}),
     Case(SKY, {}, "tracker.time_limit", "3 s", {"tracker.name": "tetra3rs"}),
     Case(CODED, {"tracker.name": "guest"}, "tracker.decoder", "{gate_px: 40}", {"tracker.name": "own"}),
-    Case(CODED, {}, "tracker.identifier", "pyramid", {"tracker.decoder": "null"}),
+    Case(CODED, DENSE, "tracker.identifier", "pyramid", {"tracker.decoder": "null"}),
+    Case(SKY, {}, "tracker.brightness_sigma", "0.2", {}),
+    Case(CODED, DENSE | TWO_LEVELS, "tracker.brightness_sigma", "0.2", {"tracker.decoder": "null"}),
+    Case(DOME, BY_LEVELS | {"tracker.name": "guest"}, "tracker.brightness_sigma", "0.2", {"tracker.name": "own"}),
+    Case(
+        DOME,
+        BY_LEVELS | {"tracker.identifier": "saa"},
+        "tracker.brightness_sigma",
+        "0.2",
+        {"tracker.identifier": "led_pairs"},
+    ),
+    Case(DOME, {"light.layout": MANY}, "tracker.brightness_sigma", "0.2", TWO_LEVELS),
     Case(
         CODED,
-        DIRECT,
+        DENSE | DIRECT,
         "light.led.clock.offset_ppm",
         "7",
         {"light.led.code": "{kind: cyclic, bit_time: 20 ms}"},

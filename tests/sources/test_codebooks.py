@@ -44,6 +44,59 @@ def test_words_are_as_far_apart_as_stated(code: Code, bits: int, distance: int) 
     assert np.ptp(words, axis=1).min() == 1
 
 
+@pytest.mark.parametrize(
+    ("code", "frames", "distance"),
+    [
+        (PlainCodeConfig(kind="gray", levels=4), 5, 1),
+        (PlainCodeConfig(kind="gray", levels=8), 4, 1),
+        (PlainCodeConfig(kind="hamming", levels=4), 8, 2),
+        (BchCodeConfig(kind="bch", distance=5, levels=4), 10, 3),
+        (BchCodeConfig(kind="bch", distance=5, levels=8), 7, 2),
+    ],
+)
+def test_levels_show_several_bits_a_frame(code: PlainCodeConfig | BchCodeConfig, frames: int, distance: int) -> None:
+    """A distance of d bits is one of d / bits a frame at least, also from a word at any other unknown brightness:
+
+    levels are equally spaced in magnitude, so that a brightness shifts a word by a constant.
+    """
+    words = codebook(code, 400).astype(int)
+    assert words.shape == (400, frames)
+    assert words.max() == code.levels - 1
+    for shift in range(code.levels):
+        apart = (words[:, None] + shift != words).sum(axis=2)
+        if shift == 0:
+            np.fill_diagonal(apart, frames)
+            assert apart.min() >= distance
+        assert apart.min() >= 1
+
+
+@pytest.mark.parametrize(("levels", "bits"), [(4, 2), (8, 3)])
+def test_an_error_by_one_level_is_one_wrong_bit(levels: int, bits: int) -> None:
+    words = (np.arange(levels)[:, None] >> np.arange(bits)[::-1] & 1).astype(np.uint8)
+    level = codebooks.symbols_of(words, bits)[:, 0]
+    assert sorted(level.tolist()) == list(range(levels))
+    by_level = words[np.argsort(level)]
+    assert (by_level[1:] != by_level[:-1]).sum(axis=1).tolist() == [1] * (levels - 1)
+
+
+def test_levels_are_equally_spaced_in_magnitude() -> None:
+    code = PlainCodeConfig(kind="gray", levels=4, depth=0.9)
+    light = codebooks.light_levels(code, np.arange(4))
+    np.testing.assert_allclose(-2.5 * np.log10(light), [2.5, 5 / 3, 5 / 6, 0], rtol=0, atol=1e-12)
+    two = PlainCodeConfig(kind="gray", depth=0.3)
+    np.testing.assert_array_equal(codebooks.light_levels(two, np.arange(2)), [0.7, 1.0])
+
+
+@pytest.mark.parametrize(("count", "levels", "k"), [(400, 2, 9), (400, 4, 5), (65, 4, 4), (64, 8, 2)])
+def test_a_few_frames_or_neighbors_of_a_de_bruijn_sequence_are_unique(count: int, levels: int, k: int) -> None:
+    words = codebook(PlainCodeConfig(kind="de_bruijn", levels=levels), count)
+    assert words.shape == (count, levels**k)
+    frames = {tuple(np.take(words[0], np.arange(n, n + k), mode="wrap").tolist()) for n in range(levels**k)}
+    assert len(frames) == levels**k
+    assert len({tuple(word.tolist()) for word in words[:, 17 % levels**k : 17 % levels**k + k]}) >= count - k
+    np.testing.assert_array_equal(words[1:, :-1], words[:-1, 1:])  # the light moves along the LEDs
+
+
 @pytest.mark.parametrize("distance", [5, 7])
 @pytest.mark.slow
 def test_cyclic_words_are_as_far_apart_at_any_shift(distance: int) -> None:

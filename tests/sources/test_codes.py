@@ -11,7 +11,7 @@ from skysim.scene.sections.leds import CyclicCodeConfig, PlainCodeConfig
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.testbed import build_testbed
 from skysim.sources.dome.timing.clocks import Clocks
-from skysim.sources.dome.timing.codebooks import codebook
+from skysim.sources.dome.timing.codebooks import codebook, light_levels
 from skysim.sources.dome.timing.codes import LedCodes
 
 SCENE = "coded_spiral"
@@ -55,6 +55,18 @@ def test_bits_fail_as_often_as_stated_and_independently() -> None:
     np.testing.assert_array_equal(shown.level(5), shown.level(5))
 
 
+def test_a_bit_of_several_levels_fails_to_any_other_level() -> None:
+    """40,000 bits at 30 %: each of the three other levels as often."""
+    code = PlainCodeConfig(kind="gray", depth=0.75, levels=4, dropout=0.3)
+    words = codebook(code, 400)
+    shown, light = LedCodes(words, code, None, 3), light_levels(code, np.arange(4))
+    steps = [
+        (np.abs(shown.level(n)[:, None] - light).argmin(axis=1) - words[:, n % words.shape[1]]) % 4 for n in range(100)
+    ]
+    share = np.bincount(np.concatenate(steps).astype(int), minlength=4) / 40_000
+    np.testing.assert_allclose(share, [0.7, 0.1, 0.1, 0.1], rtol=0, atol=5 * np.sqrt(0.3 * 0.7 / 40_000))
+
+
 def test_a_run_s_code_begins_anywhere_and_its_clock_is_the_hardware_s() -> None:
     settings = {"light.led.code": "{kind: cyclic, bit_time: 20 ms}", "light.led.clock": "{offset_ppm: 50}"}
     testbed = build_testbed(loader.load(SCENE, settings))
@@ -88,6 +100,8 @@ def test_codes_that_cannot_be_read_are_refused() -> None:
             {"light.led.code": "{kind: cyclic, bit_time: 20 ms}", "camera.shutter": "{kind: rolling, row_time: 10 us}"},
             "the rows of a rolling shutter show different bits",
         ),
+        ({"light.led.code": "{kind: gray, depth: 1, levels: 4}"}, "levels: 4 with depth 1, equally spaced"),
+        ({"light.led.code": "{kind: cyclic, levels: 4}"}, "levels"),
         ({"light.led.code": "null"}, "tracker.decoder: requires light.led.code"),
     ):
         with pytest.raises(InputError, match=reason):

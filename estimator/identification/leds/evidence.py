@@ -7,7 +7,7 @@ Unlike stars, LEDs are near: the projection includes the lever from the bearing 
 
 from __future__ import annotations
 
-from math import log, log10, pi
+from math import log, log10, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,8 @@ from estimator.core.vectors import Vector
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES, counts_dex, middle, separation
 from estimator.identification.leds.index import DomeIndex
 
+STRAY, STRAY_DENSITY = 0.01, 0.1  # part of the lights of any brightness: blends, reflections; per unit of logarithm
+
 
 class LedDetections(NamedTuple):
     """The detections of one frame, in camera axes.
@@ -27,6 +29,8 @@ class LedDetections(NamedTuple):
     ray     : (N, 3) unit;  tangent : (N, 2) x / z and y / z;  sigma : (N,) total standard deviation of each tangent
     direction : (N, 3) unit vector from the bearing to the point where the ray meets the sphere of the median LED radius
     direction_per_m : (N, 3) derivative of `direction` with respect to that radius, 1 / m
+    log_flux  : (N,) logarithm of the flux per second of exposure; of length 0 where brightness is not used
+    light_density : (N,) density of that brightness, per unit of the logarithm, if the light may be any LED or none
     """
 
     ray: Floats
@@ -34,6 +38,8 @@ class LedDetections(NamedTuple):
     sigma: Floats
     direction: Floats
     direction_per_m: Floats
+    log_flux: Floats
+    light_density: Floats
 
 
 class LedHypothesis(NamedTuple):
@@ -43,6 +49,16 @@ class LedHypothesis(NamedTuple):
     star: NDArray[np.int64]
     R_cam_from_lab: Floats
     dex: float
+
+
+@jit
+def light_dex(detections: LedDetections, dome: DomeIndex, n: int, star: int) -> float:
+    """log10 of the ratio of a light's brightness density as that LED to its density as any LED; 0 if it is not used."""
+    if len(detections.log_flux) == 0 or len(dome.log_flux) == 0:
+        return 0.0
+    z = (detections.log_flux[n] - dome.log_flux[star]) / dome.flux_sigma
+    as_led = np.exp(-z * z / 2) / (sqrt(2 * pi) * dome.flux_sigma)
+    return log10(((1 - STRAY) * as_led + STRAY * STRAY_DENSITY) / detections.light_density[n])
 
 
 @jit
@@ -189,7 +205,8 @@ def _evidence(
 ) -> float:
     """log10 of the Bayes factor of this attitude over detections at random positions.
 
-    Each match contributes N(residual) / rho, rho the density of detections on the sensor. The counts of matched (m)
+    Each match contributes N(residual) / rho, rho the density of detections on the sensor, and the evidence of its
+    brightness (`light_dex`). The counts of matched (m)
     and missing (k) LEDs contribute B(m + 1, k + 1), a uniform prior on the fraction of dead LEDs. The attitude
     contributes (2 pi)^1.5 / sqrt(det info) over the prior volume (Laplace's approximation). By Markov's inequality,
     random detections reach 10^x for any attitude in at most one of 10^x frames.
@@ -207,6 +224,7 @@ def _evidence(
         x, y = detections.tangent[observed[k], 0], detections.tangent[observed[k], 1]
         residual2 = (x - qx / qz) ** 2 + (y - qy / qz) ** 2
         match_dex = -residual2 / variance / 2 / log(10.0) - log10(2 * pi * variance * density)
+        match_dex += light_dex(detections, dome, observed[k], star[k])
         same_board = 0
         for m in range(k):
             same_board += group[star[m]] == group[star[k]]

@@ -51,6 +51,8 @@ class DomeIndex(NamedTuple):
     field_area : of the sensor, in tangents squared
     prior_volume : of attitudes that see the dome: steradians of boresight times 2 pi of roll
     led_sigma, lever_sigma : standard deviations of LED positions and of the pupil, over their least distance
+    log_flux   : (L,) logarithm of each LED's flux per second; of length 0 if all are alike
+    flux_sigma : standard deviation of the logarithm of a measured flux
     """
 
     pairs: PairIndex
@@ -65,6 +67,8 @@ class DomeIndex(NamedTuple):
     prior_volume: float
     led_sigma: float
     lever_sigma: float
+    log_flux: Floats
+    flux_sigma: float
 
 
 def build_dome_index(leds: LedMap, lever: Lever, camera: Camera) -> DomeIndex:
@@ -103,6 +107,8 @@ def build_dome_index(leds: LedMap, lever: Lever, camera: Camera) -> DomeIndex:
         (2 * np.pi) ** 2 * cap_height(leds.position_m / radius[:, None], theta),
         float(leds.sigma_m / (radius.min() - lever_m)),
         float(lever.sigma_m / (radius.min() - lever_m)),
+        np.zeros(0) if leds.flux_s is None else np.log(leds.flux_s),
+        float(leds.flux_sigma),
     )
 
 

@@ -35,7 +35,14 @@ from estimator.identification.chance import (
     required_matches,
     separation,
 )
-from estimator.identification.leds.evidence import LedDetections, LedHypothesis, evaluate, same_identification
+from estimator.identification.leds.evidence import (
+    STRAY,
+    STRAY_DENSITY,
+    LedDetections,
+    LedHypothesis,
+    evaluate,
+    same_identification,
+)
 from estimator.identification.leds.index import DirectionGrid, DomeIndex
 
 MARGIN_DEX = 5.0  # by which the best attitude must beat every other one
@@ -45,20 +52,27 @@ AMBIGUOUS = "ambiguous: another attitude fits the lights as well"
 NO_MATCH = "no identification beyond chance"
 
 
-def identify(rays_cam: Floats, sigma_rad: Floats, dome: DomeIndex, max_checks: int = 4_000_000) -> StarMatch | str:
+def identify(
+    rays_cam: Floats,
+    sigma_rad: Floats,
+    dome: DomeIndex,
+    max_checks: int = 4_000_000,
+    flux_s: Floats | None = None,
+) -> StarMatch | str:
     """Identify the LEDs of (N, 3) rays in camera axes: the matches and the attitude, or the reason for a refusal.
 
     sigma_rad  : (N,) standard deviation of a ray about each axis; `dome` holds the survey's own errors
     max_checks : LED pairs tested, plus detections times LEDs compared, before giving up
+    flux_s     : (N,) flux of the lights per second of exposure, for LEDs that differ in brightness; None: unknown
 
     Detection pairs are tested against all LED pairs of the same angle (`_test_pair`), the pairs with the fewest first.
     After an attitude reaches ACCEPT_DEX, rivals are searched for with a second, disjoint pair of its detections: a
     rival that explains almost as much must contain one of the two pairs. If a rival comes within MARGIN_DEX, the
-    pattern is ambiguous and no attitude is returned. Brightness is not used, because all LEDs may be equally bright.
+    pattern is ambiguous and no attitude is returned. Brightness counts only if the map's LEDs differ in it.
     """
     if len(rays_cam) < MIN_EVIDENCE_MATCHES:
         return NO_MATCH
-    hypothesis, rival_dex = _search(build_detections(rays_cam, sigma_rad, dome), dome, max_checks)
+    hypothesis, rival_dex = _search(build_detections(rays_cam, sigma_rad, dome, flux_s), dome, max_checks)
     if hypothesis.dex > AMBIGUOUS_DEX and hypothesis.dex - rival_dex < MARGIN_DEX:
         return AMBIGUOUS
     if hypothesis.dex < ACCEPT_DEX:
@@ -68,7 +82,9 @@ def identify(rays_cam: Floats, sigma_rad: Floats, dome: DomeIndex, max_checks: i
     )
 
 
-def build_detections(rays_cam: Floats, sigma_rad: Floats, dome: DomeIndex) -> LedDetections:
+def build_detections(
+    rays_cam: Floats, sigma_rad: Floats, dome: DomeIndex, flux_s: Floats | None = None
+) -> LedDetections:
     """Detections for the search: rays with their total errors, which include those of the LED map and of the lever.
 
     A lateral error of the pupil shifts all LEDs alike and is absorbed by the attitude; an axial one scales the
@@ -87,7 +103,18 @@ def build_detections(rays_cam: Floats, sigma_rad: Floats, dome: DomeIndex) -> Le
         np.hypot(ray_sigma, pupil_sigma),
         point_m / dome.median_radius_m,
         rays_cam / along_m - point_m / dome.median_radius_m**2,
+        *_brightness(flux_s, dome),
     )
+
+
+def _brightness(flux_s: Floats | None, dome: DomeIndex) -> tuple[Floats, Floats]:
+    """(N,) logarithms of lights' fluxes, and (N,) density of each if it may be any LED or none; empty if unused."""
+    if flux_s is None or not len(dome.log_flux):
+        return np.zeros(0), np.zeros(0)
+    log_flux = np.log(np.maximum(flux_s, 1e-300))
+    z = (log_flux[:, None] - dome.log_flux) / dome.flux_sigma
+    as_any = np.exp(-(z**2) / 2).mean(axis=1) / (np.sqrt(2 * np.pi) * dome.flux_sigma)
+    return log_flux, (1 - STRAY) * as_any + STRAY * STRAY_DENSITY
 
 
 @jit
@@ -190,7 +217,8 @@ def _test_pair(
     index, radius = dome.pairs, dome.radius_m
     begin, end, gate = _pair_range(detections, dome, a, b)
     attitude_dex = _attitude_dex(detections, dome, a, b)
-    required = required_matches(detections.sigma, dome.field_area, attitude_dex, min_dex)
+    most_light_dex = _most_light_dex(detections, dome)
+    required = required_matches(detections.sigma, dome.field_area, attitude_dex, min_dex, most_light_dex)
     gates = _pair_gates(detections, dome, a, b)
     in_cam, in_lab, R_cam_from_lab = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     R_grid_from_cam = np.empty((3, 3))
@@ -233,6 +261,14 @@ def _direction_from_bearing(ray: Floats, dome: DomeIndex, radius_m: float) -> Ve
         (py + distance * ray[1]) * inverse,
         (pz + distance * ray[2]) * inverse,
     )
+
+
+@jit
+def _most_light_dex(detections: LedDetections, dome: DomeIndex) -> float:
+    """Greatest evidence that the brightness of any light can give."""
+    if len(detections.light_density) == 0:
+        return 0.0
+    return -log10(least(detections.light_density) * sqrt(2 * pi) * dome.flux_sigma)
 
 
 @jit

@@ -59,6 +59,20 @@ def steady(scene: Scene) -> bool:
     return isinstance(scene.light, DomeConfig) and isinstance(scene.light.led.drive, DirectConfig)
 
 
+def equally_bright(scene: Scene) -> bool:
+    """Whether all LEDs of a dome have one nominal brightness; LEDs of a file and of a sky have not."""
+    if not isinstance(scene.light, DomeConfig):
+        return False
+    layout = scene.light.layout
+    points = layout.points if isinstance(layout, FibersConfig | LcdConfig) else layout
+    if isinstance(points, PatchBoardsConfig):
+        levels = {level for board in points.boards or () for level in board.levels or (1.0,)}
+        return len(levels or set(points.pwm_levels)) == 1
+    return (
+        not isinstance(points, CelestialConfig) and not getattr(points, "file", None) and len(set(points.dimming)) == 1
+    )
+
+
 def free_running_code(scene: Scene) -> bool:
     """Whether the LEDs' bits have a clock of their own."""
     code = scene.light.led.code if isinstance(scene.light, DomeConfig) else None
@@ -196,6 +210,36 @@ RULES = (
         lambda scene: scene.tracker.decoder is not None,
         "the LEDs are identified by their codes",
         "no tracker.decoder",
+    ),
+    Rule(
+        ("tracker.brightness_sigma",),
+        external,
+        "an external tracker has its own algorithms",
+        "tracker.name: own",
+    ),
+    Rule(
+        ("tracker.brightness_sigma",),
+        lambda scene: not under_dome(scene),
+        "stars are identified by their places",
+        "a dome",
+    ),
+    Rule(
+        ("tracker.brightness_sigma",),
+        lambda scene: scene.tracker.decoder is not None,
+        "the LEDs are identified by their codes",
+        "no tracker.decoder",
+    ),
+    Rule(
+        ("tracker.brightness_sigma",),
+        lambda scene: scene.tracker.identifier not in (None, "led_pairs"),
+        "this identifier does not use brightness",
+        "tracker.identifier: led_pairs",
+    ),
+    Rule(
+        ("tracker.brightness_sigma",),
+        equally_bright,
+        "all LEDs are equally bright",
+        "two levels of brightness in light.layout",
     ),
     Rule(
         ("tracker.gyro",),

@@ -93,11 +93,15 @@ class DimmedConfig(ConfigModel):
 
     Each LED's brightness is drawn from the list (in `listed`, the list has one value per LED). The smallest magnitude
     is full brightness.
+
+    unique_neighbors : the levels are drawn so that each LED with so many nearest ones looks different from all others,
+        however the field is turned
     """
 
     cap_deg: Cap
     levels: Levels | None = None
     magnitudes: Magnitudes | None = None
+    unique_neighbors: Annotated[int, Field(ge=3, le=16)] | None = None
     hardware_seed: Seed = 0
 
     @property
@@ -109,6 +113,10 @@ class DimmedConfig(ConfigModel):
     def check_brightness(self) -> Self:
         if self.levels is not None and self.magnitudes is not None:
             raise ValueError("a layout takes either levels or magnitudes")
+        if self.unique_neighbors and len(set(self.dimming)) < 2:
+            raise ValueError(
+                "unique_neighbors: all LEDs are equally bright; allowed: two levels or magnitudes, or more"
+            )
         return self
 
 
@@ -268,6 +276,8 @@ class ListedConfig(DimmedConfig):
         if len(lists) != 1:
             raise ValueError("listed takes one of positions, directions_deg, file")
         dimmed = len(self.levels or self.magnitudes or ())
+        if self.unique_neighbors:
+            raise ValueError("unique_neighbors: a list has its own levels; allowed: none")
         if dimmed and self.file is not None:
             raise ValueError("levels and magnitudes of a file belong in its columns")
         if dimmed and dimmed != len(lists[0]):

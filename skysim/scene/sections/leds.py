@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
 
@@ -109,11 +109,11 @@ class ClockConfig(ConfigModel):
 
 
 class CodeConfig(ConfigModel):
-    """A name for each LED in time: its light changes between two levels by a word of bits, over and over.
+    """A name for each LED in time: its light changes between levels by a word, over and over.
 
-    The words are given by LED number, in order. A failed bit shows the other level.
+    The words are given by LED number, in order. A failed bit shows another level.
 
-    depth    : part of its light that an LED lacks at a bit that is 0; 1 is on and off
+    depth    : part of its light that an LED lacks at its lowest level; 1 is on and off
     bit_time : of one bit, by a clock of the dome's own (`clock`) that runs freely; `frame`: the camera's trigger
         advances the code, one bit a frame
     dropout  : probability that an LED's bit fails, independent of all others; drawn from the scene's seed
@@ -124,18 +124,34 @@ class CodeConfig(ConfigModel):
     dropout: Annotated[Number, Field(ge=0, lt=0.5)] = 0.0
 
 
-class PlainCodeConfig(CodeConfig):
-    """Codes that need the camera's trigger.
+class TriggeredCodeConfig(CodeConfig):
+    """Codes that need the camera's trigger, and may have more than two levels of light.
 
-    kind : gray: numbers, distance 1; hamming: extended and shortened, distance 4; gold: all sequences and shifts,
-        distance 12 of 31 bits
+    levels : of light, equally spaced in magnitude; 4 show two bits a frame and 8 show three
     """
 
-    kind: Literal["gray", "hamming", "gold"]
+    levels: Literal[2, 4, 8] = 2
+
+    @model_validator(mode="after")
+    def check_levels(self) -> Self:
+        if self.levels > 2 and self.depth == 1:
+            raise ValueError(f"levels: {self.levels} with depth 1, equally spaced in magnitude; allowed: depth below 1")
+        return self
 
 
-class BchCodeConfig(CodeConfig):
-    """The shortest BCH code for the LEDs with a designed distance; needs the camera's trigger."""
+class PlainCodeConfig(TriggeredCodeConfig):
+    """Codes of all kinds without a parameter.
+
+    kind : gray: numbers, distance 1; hamming: extended and shortened, distance 4; gold: all sequences and shifts,
+        distance 12 of 31 bits; de_bruijn: one sequence that moves along the LEDs, in which any few successive LEDs and
+        any few successive frames of an LED are unique: the data of a shift register
+    """
+
+    kind: Literal["gray", "hamming", "gold", "de_bruijn"]
+
+
+class BchCodeConfig(TriggeredCodeConfig):
+    """The shortest BCH code for the LEDs with a designed distance."""
 
     kind: Literal["bch"]
     distance: Literal[3, 5, 7, 11] = 5

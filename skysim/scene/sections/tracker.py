@@ -118,6 +118,8 @@ class TrackerConfig(ConfigModel):
     refraction : whether the tracker knows `site`, weather and the time, and undoes the refraction of `light.air`
     exposure_control : every frame is exposed for `exposure.time` if left out
     decoder : identifies LEDs by their codes over the frames, in order; without it frame by frame, by their places
+    brightness_sigma : LEDs are identified by their brightness too, whose logarithm has this standard deviation over the
+        data sheet's: scatter, aging, angle, flicker; by their places alone if left out
     """
 
     name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")] = "own"
@@ -143,6 +145,7 @@ class TrackerConfig(ConfigModel):
     survey: SurveyErrorsConfig = SurveyErrorsConfig()
     exposure_control: ExposureControlConfig | None = None
     decoder: DecoderConfig | None = None
+    brightness_sigma: Annotated[Number, Field(ge=0.02, le=2)] | None = None
     map: Annotated[str, AfterValidator(existing_file)] | None = None
 
     @model_validator(mode="after")

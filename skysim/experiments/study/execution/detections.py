@@ -66,7 +66,11 @@ def simulate_detections(
     """
     # Draw noise for all sources, also the missing ones, so that the stream does not depend on which are missing.
     detected = np.flatnonzero(rng.random(len(xy_px)) >= trial.missing)
-    flux = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
+    flux = (
+        electrons
+        / scene.camera.detector.gain_e_dn
+        * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
+    )
     xy_px = xy_px + trial.noise_px * rng.standard_normal(xy_px.shape)
     detected = detected[np.argsort(-flux[detected], kind="stable")][: trial.lights]
     false = trial.false_lights + round(len(detected) * trial.false_share / (1 - trial.false_share))
@@ -84,7 +88,7 @@ def solve_coded(
     testbed: Testbed, tracker: CodedTracker, trial: CentroidTrial, lab_from_body: Rotation, rng: np.random.Generator
 ) -> tuple[Floats, Report]:
     """(N, 2) true pixel positions, and the report of the first frame with an attitude, or of the code's last one."""
-    testbed, gain_e_dn = testbed.in_run(int(rng.integers(2**62))), testbed.scene.camera.detector.gain_e_dn
+    testbed = testbed.in_run(int(rng.integers(2**62)))
     rows, xy_px, electrons = visible_rows(testbed, lab_from_body)
     electrons = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(rows)))
     per_frame = trial.model_copy(update={"magnitude_sigma": 0.0})  # the error of a brightness is that of the LED
@@ -94,7 +98,7 @@ def solve_coded(
         light_e = electrons * brightness(testbed, rows, frame) * (1 + FLUX_NOISE * rng.standard_normal(len(rows)))
         light_e += np.sqrt(np.maximum(light_e, 0)) * rng.standard_normal(len(rows))
         lit = light_e > 0
-        detections = simulate_detections(per_frame, xy_px[lit], light_e[lit] / gain_e_dn, testbed.scene, rng)
+        detections = simulate_detections(per_frame, xy_px[lit], light_e[lit], testbed.scene, rng)
         window = exposure_window(testbed.scene, frame)
         middle_s = window.middle_s(testbed.scene.camera.height_px)
         attitude = tracker.solve_centroids(detections, exposure_s=window.exposure_s, t_s=middle_s, frame=frame)

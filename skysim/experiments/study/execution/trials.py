@@ -125,7 +125,8 @@ def solved_centroids(setup: Setup, seed: int) -> tuple[TrueLights, Report]:
     else:
         xy_px, electrons = visible_sources(setup.testbed, lab_from_body)
         detections = simulate_detections(trial, xy_px, electrons, setup.testbed.scene, noise)
-        report = Report(setup.estimator.solve_centroids(detections), detections)
+        exposure_s = setup.testbed.scene.exposure.time_s
+        report = Report(factory.solve_centroids(setup.estimator, detections, exposure_s), detections)
     return TrueLights(lab_from_body, xy_px, xy_px, None), report
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
-from skysim.scene.sections.layouts import HOLES, LitConfig
+from skysim.scene.sections.layouts import HOLES, DimmedConfig, LitConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.led import (
     DRIVES,
@@ -23,6 +22,7 @@ from skysim.sources.dome.led import (
     full_strength_e_s_sr,
     strength_factors,
 )
+from skysim.sources.dome.placement.neighborhoods import unique_levels
 from skysim.sources.dome.shell.surface import Surface
 from skysim.sources.photometry import Band
 
@@ -85,15 +85,19 @@ def on_surface(surface: Surface, place_m: Floats, level: Floats) -> PlacedLeds:
 
 
 def dimmed_sources(
-    dimming: Sequence[float],
+    config: DimmedConfig,
     surface: Surface,
     place_m: Floats,
     led: LedConfig,
     band: Band,
     rng: np.random.Generator,
 ) -> Sources:
-    """Sources of LEDs at (N, 3) places on the surface, each with a random level of `dimming`."""
-    level = rng.choice(dimming, len(place_m))
+    """Sources of LEDs at (N, 3) places on the surface, each with a random level of the layout's `dimming`."""
+    if config.unique_neighbors:
+        levels = np.unique(config.dimming)
+        level = levels[unique_levels(len(levels), config.unique_neighbors, place_m, rng)]
+    else:
+        level = rng.choice(config.dimming, len(place_m))
     return led_sources(on_surface(surface, place_m, level), led, band, rng)
 
 
@@ -101,7 +105,7 @@ def lit_sources(config: LitConfig, surface: Surface, place_m: Floats, led: LedCo
     """Sources of the drawn fraction of LEDs at (N, 3) places; each keeps its number among all places."""
     rng = random_stream(config.hardware_seed)
     number = np.sort(rng.permutation(len(place_m))[: max(round(config.lit_fraction * len(place_m)), 1)])
-    return replace(dimmed_sources(config.dimming, surface, place_m[number], led, band, rng), id=number)
+    return replace(dimmed_sources(config, surface, place_m[number], led, band, rng), id=number)
 
 
 def cap(count: int, half_angle_rad: float) -> Floats:

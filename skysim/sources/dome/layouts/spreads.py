@@ -24,14 +24,14 @@ def fibonacci(config: FibonacciConfig, surface: Surface, led: LedConfig, band: B
     """LEDs on a Fibonacci spiral: equal solid angles about the bearing hold equal numbers, to within a few."""
     rng = random_stream(config.hardware_seed)
     place_m = project_from_bearing(surface, cap(config.count, np.radians(config.cap_deg)))
-    return dimmed_sources(config.dimming, surface, place_m, led, band, rng)
+    return dimmed_sources(config, surface, place_m, led, band, rng)
 
 
 def random_places(config: RandomPlacesConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
     """Independent LEDs, uniform in solid angle about the bearing: a Poisson field, like that of real stars."""
     rng = random_stream(config.hardware_seed)
     place_m = project_from_bearing(surface, scattered_cap(config.count, np.radians(config.cap_deg), rng))
-    return dimmed_sources(config.dimming, surface, place_m, led, band, rng)
+    return dimmed_sources(config, surface, place_m, led, band, rng)
 
 
 def poisson_disk(config: PoissonDiskConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
@@ -50,7 +50,7 @@ def poisson_disk(config: PoissonDiskConfig, surface: Surface, led: LedConfig, ba
         count = config.count or 1
         darts_m = project_from_bearing(surface, scattered_cap(DARTS_PER_LED * count, half, rng))
         place_m = darts_m[optimize.spread(darts_m, 0.0, count, BISECTIONS)]
-        return dimmed_sources(config.dimming, surface, place_m, led, band, rng)
+        return dimmed_sources(config, surface, place_m, led, band, rng)
     directions = cap(1000, half)
     points = project_from_bearing(surface, directions)
     # Surface area per steradian seen from the bearing, r^2 / cos(incidence). Where it is greatest, points uniform in
@@ -65,7 +65,7 @@ def poisson_disk(config: PoissonDiskConfig, surface: Surface, led: LedConfig, ba
         )
     darts_m = project_from_bearing(surface, scattered_cap(max(int(dart_count), 1), half, rng))
     place_m = darts_m[optimize.thin(darts_m, config.spacing_m)]
-    return dimmed_sources(config.dimming, surface, place_m, led, band, rng)
+    return dimmed_sources(config, surface, place_m, led, band, rng)
 
 
 def optimized(config: OptimizedConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
@@ -80,4 +80,4 @@ def optimized(config: OptimizedConfig, surface: Surface, led: LedConfig, band: B
     sites = project_from_bearing(surface, scattered_cap(options.sites_per_led * config.count, reach, rng))
     spirals = [project_from_bearing(surface, cap(config.count, half)) for half in (np.radians(config.cap_deg), reach)]
     place_m = optimize.optimize_places(config, sites, spirals, rng, options)
-    return dimmed_sources(config.dimming, surface, place_m, led, band, rng)
+    return dimmed_sources(config, surface, place_m, led, band, rng)

@@ -1,31 +1,39 @@
-"""Codebooks of LEDs: a binary word for each LED, with a stated least distance between any two words.
+"""Codebooks of LEDs: a word for each LED, with a stated least distance between any two words.
 
-| kind    | words                                                    | distance                      | receiver     |
-|---------|----------------------------------------------------------|-------------------------------|--------------|
-| gray    | numbers in the reflected binary code                     | 1                             | synchronous  |
-| hamming | Hamming code, shortened, and a parity bit                | 4                             | synchronous  |
-| bch     | BCH code, shortened                                      | as designed                   | synchronous  |
-| gold    | Gold's sequences, each at all its shifts                 | (n - t) / 2, t = 9 for n = 31 | synchronous  |
-| cyclic  | one word of each orbit of a BCH code under cyclic shifts | as designed, at all shifts    | free-running |
+| kind      | words                                                    | distance                      | receiver     |
+|-----------|----------------------------------------------------------|-------------------------------|--------------|
+| gray      | numbers in the reflected binary code                     | 1                             | synchronous  |
+| hamming   | Hamming code, shortened, and a parity bit                | 4                             | synchronous  |
+| bch       | BCH code, shortened                                      | as designed                   | synchronous  |
+| gold      | Gold's sequences, each at all its shifts                 | (n - t) / 2, t = 9 for n = 31 | synchronous  |
+| de_bruijn | shifts of a De Bruijn sequence                           | 1 in any k frames             | synchronous  |
+| cyclic    | one word of each orbit of a BCH code under cyclic shifts | as designed, at all shifts    | free-running |
 
 A synchronous receiver knows which bit each frame shows. A free-running one does not: it must not confuse a word with a
 shifted one either, and all shifts of a cyclic code's words are words of that code.
 
-Words whose bits are all equal are left out: an LED of unknown brightness would not tell them apart. Of words as good
-otherwise those with as many ones as zeros come first; a Gray code stays in its order, in which LEDs of successive
-numbers differ in one bit.
+Two levels of light show one bit. Four show two bits and eight three, each by its reflected binary number, so that an
+error by one level is one wrong bit; a word of b bits takes b / 2 or b / 3 frames. A De Bruijn sequence has symbols of
+2, 4 or 8 levels itself.
 
-References: Lin and Costello 2004, Error Control Coding, chapters 4 to 6; Gold 1967, IEEE Trans. Inf. Theory 13, 619.
+Words without the highest level or without another one are left out: an LED of unknown brightness would not tell them
+from words that are shifted in level, which are equally spaced in magnitude. Of words as good otherwise those with as
+many ones as zeros come first; a Gray code stays in its order, in which LEDs of successive numbers differ in one bit.
+
+References: Lin and Costello 2004, Error Control Coding, chapters 4 to 6; Gold 1967, IEEE Trans. Inf. Theory 13, 619;
+Fredricksen and Maiorana 1978, Discrete Mathematics 23, 207 (De Bruijn sequences).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
+from skysim.core.types import Floats
 from skysim.scene.sections.leds import BchCodeConfig, Code, CyclicCodeConfig
 
 Words = NDArray[np.uint8]
@@ -39,14 +47,67 @@ MAX_DATA_BITS = 20  # 2^20 words are listed at most
 
 
 def codebook(config: Code, count: int) -> Words:
-    """(count, bits) words of a scene's code. Raises InputError if the kind has not so many."""
-    if isinstance(config, BchCodeConfig | CyclicCodeConfig):
-        words = (bch if config.kind == "bch" else cyclic)(count, config.distance)
+    """(count, frames) levels of a scene's code, 0 the lowest. Raises InputError if the kind has not so many words."""
+    if isinstance(config, BchCodeConfig):
+        words = packed(partial(bch, distance=config.distance), count, config.levels)
+    elif isinstance(config, CyclicCodeConfig):
+        words = cyclic(count, config.distance)
+    elif config.kind == "de_bruijn":
+        words = de_bruijn(count, config.levels)
     else:
-        words = PLAIN[config.kind](count)
+        words = packed(PLAIN[config.kind], count, config.levels)
     if len(words) < count:
         raise InputError(f"light.led.code: {count} LEDs; allowed: at most the {len(words)} words of kind {config.kind}")
     return words
+
+
+def light_levels(config: Code, words: Words) -> Floats:
+    """Part of its light that an LED shows at the levels of words: from 1 - depth to 1, equally spaced in magnitude."""
+    steps = getattr(config, "levels", 2) - 1
+    return np.array([(1 - config.depth) ** ((steps - level) / steps) for level in range(steps + 1)])[words]
+
+
+def packed(kind: Callable[[int], Words], count: int, levels: int) -> Words:
+    """(count, frames) words of a binary code, log2(levels) bits in each level of light, or as many as there are."""
+    bits, wanted = levels.bit_length() - 1, count
+    while True:
+        words = kind(wanted)
+        symbols = readable(symbols_of(words, bits), levels) if bits > 1 else words
+        if len(symbols) >= count or len(words) < wanted:
+            return symbols[:count]
+        wanted *= 2
+
+
+def symbols_of(words: Words, bits: int) -> Words:
+    """(N, ceil(B / bits)) levels whose reflected binary numbers are the bits of (N, B) words, padded with zeros."""
+    padded = np.pad(words, ((0, 0), (0, -words.shape[1] % bits))).reshape(len(words), -1, bits)
+    digits = np.bitwise_xor.accumulate(padded, axis=2)
+    return (digits @ (1 << np.arange(bits)[::-1])).astype(np.uint8)
+
+
+def readable(words: Words, levels: int) -> Words:
+    """The words with the highest level and another one."""
+    return words[(words.max(axis=1) == levels - 1) & (words.min(axis=1) < levels - 1)]
+
+
+def de_bruijn(count: int, levels: int) -> Words:
+    """(count, levels^k) shifts of a De Bruijn sequence with the least k that gives so many.
+
+    Every k successive symbols of the sequence are unique in it, so that an LED is known by its last k frames, and k
+    LEDs that follow each other by one frame. The sequence joins the Lyndon words whose lengths divide k, in
+    lexicographic order (Fredricksen and Maiorana).
+    """
+    k = next(k for k in range(2, 32) if levels**k >= count)
+    word, sequence = [0], [0]
+    while word:
+        word = (word * k)[:k]
+        while word and word[-1] == levels - 1:
+            word.pop()
+        if word:
+            word[-1] += 1
+            sequence += word if k % len(word) == 0 else []
+    shifts = np.arange(count)[:, None] + np.arange(len(sequence))
+    return np.array(sequence, np.uint8)[shifts % len(sequence)]
 
 
 def gray(count: int) -> Words:

@@ -1,7 +1,7 @@
-"""LEDs that blink their names: the light of each by its word's bits, integrated over an exposure.
+"""LEDs that show their names: the light of each by its word, integrated over an exposure.
 
-In bit k of the code's time an LED shines with the part 1 - depth (1 - b) of its light, b the bit of its word there, or
-the other bit if it fails. The code's clock is the camera's trigger, one bit a frame, or a free-running oscillator with
+In bit k of the code's time an LED shines with the part of its light that its word has there, or with that of another
+level if the bit fails. The code's clock is the camera's trigger, one bit a frame, or a free-running oscillator with
 offset and drift (`clocks`). An exposure that crosses a bit's edge gets the mean of both bits by their times in it. The
 drive's pulses are much faster than a bit; the code scales their light.
 """
@@ -18,14 +18,14 @@ from skysim.core.types import Floats, Sources
 from skysim.scene.sections.leds import Code
 from skysim.scene.sections.light import DomeConfig, Light
 from skysim.sources.dome.timing.clocks import Clocks, hardware_seed
-from skysim.sources.dome.timing.codebooks import Words, codebook
+from skysim.sources.dome.timing.codebooks import Words, codebook, light_levels
 
 
 @dataclass(frozen=True, slots=True)
 class LedCodes:
     """The code of a dome's LEDs in one run.
 
-    words  : (N, B) bits, in the order of the dome's LEDs
+    words  : (N, B) levels, in the order of the dome's LEDs
     clock  : one oscillator; None if the camera's trigger advances the code
     seed   : of the run, which draws the bits that fail
     """
@@ -52,11 +52,12 @@ class LedCodes:
 
     def level(self, bit: int) -> Floats:
         """(N,) part of their light in bit number `bit` of the code's time."""
-        shown = self.words[:, bit % self.words.shape[1]] > 0
+        shown = self.words[:, bit % self.words.shape[1]]
         if self.config.dropout:
-            failed = random_stream(self.seed, LED_CODE, bit).random(len(shown)) < self.config.dropout
-            shown = shown != failed
-        return np.where(shown, 1.0, 1 - self.config.depth)
+            rng, levels = random_stream(self.seed, LED_CODE, bit), int(self.words.max()) + 1
+            failed = rng.random(len(shown)) < self.config.dropout
+            shown = (shown + failed * (rng.integers(1, levels, len(shown)) if levels > 2 else 1)) % levels
+        return light_levels(self.config, shown)
 
     def time_s(self, t_s: float) -> float:
         """The code clock's time."""
