@@ -52,7 +52,7 @@ gui: $(READY)
 pictures: demo
 	$(BIN)/python docs/site/pictures.py
 
-STUDIES := dome_shape dome_size led_count needed_leds led_brightness rate_smear false_stars moon_and_planets ground_night dome_reflections error_budget end_to_end
+STUDIES := dome_shape dome_size led_count led_brightness needed_leds rate_smear false_stars moon_and_planets ground_night dome_reflections error_budget end_to_end
 studies: $(READY)
 	for name in $(STUDIES); do $(BIN)/skysim study run $$name || $(BIN)/skysim study resume $$name || exit 1; done
 	$(BIN)/skysim study optimize dome_without_codes

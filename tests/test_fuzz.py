@@ -42,7 +42,7 @@ def test_every_target_has_a_corpus() -> None:
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("files", [8, pytest.param(3000, marks=pytest.mark.long)])
+@pytest.mark.parametrize("files", [4, pytest.param(3000, marks=pytest.mark.long)])
 def test_what_grew_from_the_corpus_is_read_or_refused_in_one_line(name: str, files: int) -> None:
     rng, corpus = Random(2026), seeds(name)
     for data in corpus:

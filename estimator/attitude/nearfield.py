@@ -68,27 +68,49 @@ def rotation_only(
     rotates about the bearing center, but not the surface. Raises ValueError if it does not converge, or if the LEDs do
     not determine all three angles.
     """
+    body_from_lab, _, covariance_cam = _fit_rotation(rays_cam, sigma_rad, position_m, lever, body_from_lab, False)
+    return body_from_lab, _in_body_axes(covariance_cam, lever)
+
+
+def fit_focal_ratio(
+    rays_cam: Floats, sigma_rad: Floats, position_m: Floats, lever: Lever, body_from_lab: Rotation
+) -> float:
+    """The true focal length over the assumed one, from N >= 2 rays and their LEDs.
+
+    The fit of `rotation_only` with one more unknown, the logarithm of the ratio rho: the tangents are
+    rho (q_x / q_z, q_y / q_z), their derivative by it they themselves. Raises ValueError as that does.
+    """
+    return _fit_rotation(rays_cam, sigma_rad, position_m, lever, body_from_lab, True)[1]
+
+
+def _fit_rotation(
+    rays_cam: Floats, sigma_rad: Floats, position_m: Floats, lever: Lever, body_from_lab: Rotation, with_focal: bool
+) -> tuple[Rotation, float, Floats]:
+    """body_from_lab, the focal ratio (1 unless it is fitted), and the covariance of both in camera axes."""
     measured = rays_cam[:, :2] / rays_cam[:, 2:]
-    weight = np.repeat(1 / sigma_rad, 2)
+    weight, ratio = np.repeat(1 / sigma_rad, 2), 1.0
     cam_from_body = lever.cam_from_body
     for _ in range(30):
         b = cam_from_body.apply(body_from_lab.apply(position_m))
         q = b - cam_from_body.apply(lever.camera_body_m)
-        jacobian = tangent_jacobian(b, q) * weight[:, None]
-        residual = (measured - q[:, :2] / q[:, 2:]).ravel() * weight
+        tangent = ratio * q[:, :2] / q[:, 2:]
+        jacobian = ratio * tangent_jacobian(b, q) * weight[:, None]
+        if with_focal:
+            jacobian = np.column_stack([jacobian, tangent.ravel() * weight])
+        residual = (measured - tangent).ravel() * weight
         step, _, rank, _ = np.linalg.lstsq(jacobian, residual, rcond=None)
         # Rank 2: the LEDs lie in one direction from the bearing, about which any rotation fits.
-        if rank < 3:
+        if rank < jacobian.shape[1]:
             raise ValueError(
                 f"{len(rays_cam)} rays do not determine a rotation; two LEDs in different directions are needed"
             )
-        body_from_lab = cam_from_body.inv() * Rotation.from_rotvec(step) * cam_from_body * body_from_lab
+        body_from_lab = cam_from_body.inv() * Rotation.from_rotvec(step[:3]) * cam_from_body * body_from_lab
+        ratio *= float(np.exp(np.clip(step[3], -1, 1))) if with_focal else 1.0
         if np.linalg.norm(step) < 1e-15:
             break
     if not np.linalg.norm(step) < 1e-9:
         raise ValueError(f"rotation_only: not converged, last step {np.linalg.norm(step):.1e} rad")
-    covariance_cam = np.linalg.inv(jacobian.T @ jacobian)
-    return body_from_lab, _in_body_axes(covariance_cam, lever)
+    return body_from_lab, ratio, np.asarray(np.linalg.inv(jacobian.T @ jacobian))
 
 
 def tangent_gradients(q: Floats) -> Floats:

@@ -19,7 +19,7 @@ from estimator.core.camera import Camera
 class Geometry(NamedTuple):
     """K rays as a solution sees them, in camera axes.
 
-    jacobian : (K, 2, 3) derivative of the tangents (x / z, y / z) by a small rotation
+    jacobian : (K, 2, 3) derivative of the tangents (x / z, y / z) by a small rotation; (K, 2, 4) `with_focal`
     gradient : (K, 2, 3) derivative of the tangents by a displacement of the LED, 1/m; of a star's direction
     tangent  : (K, 2) x / z and y / z
     """
@@ -35,8 +35,13 @@ def geometry(place_cam: Floats, ray_cam: Floats) -> Geometry:
     return Geometry(jacobian, tangent_gradients(ray_cam), ray_cam[:, :2] / ray_cam[:, 2:])
 
 
+def with_focal(view: Geometry) -> Geometry:
+    """The geometry of a fit of the rotation and the logarithm of the focal length, by which the tangents change."""
+    return view._replace(jacobian=np.concatenate([view.jacobian, view.tangent[:, :, None]], axis=2))
+
+
 def from_independent(view: Geometry, sigma_rad: Floats, covariance_rad2: Floats) -> Floats:
-    """(3, 3) covariance of a least-squares rotation from independent errors of the tangents, (K, 2, 2).
+    """(P, P) covariance of a least-squares rotation from independent errors of the tangents, (K, 2, 2).
 
     With weights 1 / sigma^2 and the tangents' errors e_i the rotation errs by w = S sum_i J_i' e_i / sigma_i^2, S the
     inverse of sum_i J_i' J_i / sigma_i^2. For errors with covariances C_i that is S (sum_i J_i' C_i J_i / sigma_i^4) S;
@@ -47,7 +52,7 @@ def from_independent(view: Geometry, sigma_rad: Floats, covariance_rad2: Floats)
 
 
 def from_common(view: Geometry, sigma_rad: Floats, error_rad: Floats) -> Floats:
-    """(3, 3) covariance of a least-squares rotation from M errors that all rays share.
+    """(P, P) covariance of a least-squares rotation from M errors that all rays share.
 
     error_rad : (M, K, 2) change of the tangents by one standard deviation of each
     """
@@ -56,7 +61,10 @@ def from_common(view: Geometry, sigma_rad: Floats, error_rad: Floats) -> Floats:
 
 
 def response(view: Geometry, sigma_rad: Floats) -> Floats:
-    """(K, 3, 2) rotation that an error of each ray's tangents causes in the weighted least-squares solution."""
+    """(K, P, 2) rotation that an error of each ray's tangents causes in the weighted least-squares solution.
+
+    P is 3, or 4 for `with_focal`, where the last number is of the focal length's logarithm.
+    """
     weighted = view.jacobian / sigma_rad[:, None, None] ** 2
     information = np.einsum("kia,kib->ab", weighted, view.jacobian)
     return np.asarray(np.linalg.solve(information, np.moveaxis(weighted, 2, 1)))
@@ -65,11 +73,11 @@ def response(view: Geometry, sigma_rad: Floats) -> Floats:
 def residual_products(view: Geometry, sigma_rad: Floats, error_rad: Floats) -> Floats:
     """(M, M) inner products of the weighted residuals that M common errors (M, K, 2) leave after the solution.
 
-    With z standard normal and unit noise in every weighted tangent, the sum of squares has the mean 2 K - 3 + tr Q and
-    the variance 2 (2 K - 3) + 4 tr Q + 2 tr Q^2, Q these products.
+    With z standard normal and unit noise in every weighted tangent, the sum of squares has the mean 2 K - P + tr Q and
+    the variance 2 (2 K - P) + 4 tr Q + 2 tr Q^2, Q these products, P the number of unknowns.
     """
-    weighted = (error_rad / sigma_rad[:, None]).reshape(len(error_rad), -1)
-    jacobian = (view.jacobian / sigma_rad[:, None, None]).reshape(-1, 3)
+    weighted = (error_rad / sigma_rad[:, None]).reshape(len(error_rad), 2 * len(sigma_rad))
+    jacobian = (view.jacobian / sigma_rad[:, None, None]).reshape(2 * len(sigma_rad), -1)
     absorbed, _, _, _ = np.linalg.lstsq(jacobian, weighted.T, rcond=None)
     left = weighted.T - jacobian @ absorbed
     return np.asarray(left.T @ left)
@@ -81,13 +89,20 @@ def isotropic(sigma_rad: Floats) -> Floats:
 
 
 def with_survey(
-    covariance_rad2: Floats, view: Geometry, sigma_rad: Floats, noise_rad2: Floats, own_rad2: Floats, common_rad: Floats
+    covariance_rad2: Floats,
+    view: Geometry,
+    sigma_rad: Floats,
+    noise_rad2: Floats,
+    own_rad2: Floats,
+    common_rad: Floats,
+    fits_focal: bool = False,
 ) -> tuple[Floats, Floats]:
     """The (3, 3) covariance of an attitude with its errors as they are, and the part that successive frames share.
 
     covariance_rad2 : of the solver, for independent errors of sigma_rad (K,), equal in all directions
     noise_rad2      : (K, 2, 2) of the tangents in one frame;  own_rad2 : of each light's survey
     common_rad      : (M, K, 2) change of the tangents by one standard deviation of each error that all lights share
+    fits_focal      : whether the focal length was fitted with the attitude, from the same lights
 
     The errors are propagated through the least-squares solution of the tangents, whose covariance is S = L L'. A solver
     with the covariance L_0 L_0' is taken to respond as that solution does after the rotation L_0 L^-1.
@@ -97,8 +112,9 @@ def with_survey(
         np.linalg.cholesky(from_independent(view, sigma_rad, isotropic(sigma_rad))),
     )
     adapt = solver @ np.linalg.inv(least_squares)
-    shared = from_independent(view, sigma_rad, own_rad2) + from_common(view, sigma_rad, common_rad)
-    noise = from_independent(view, sigma_rad, noise_rad2)
+    fitted = with_focal(view) if fits_focal else view
+    shared = (from_independent(fitted, sigma_rad, own_rad2) + from_common(fitted, sigma_rad, common_rad))[:3, :3]
+    noise = from_independent(fitted, sigma_rad, noise_rad2)[:3, :3]
     return adapt @ (noise + shared) @ adapt.T, adapt @ shared @ adapt.T
 
 

@@ -375,10 +375,25 @@ def fit_attitudes(bundle: Bundle, sightings: Sightings, rounds: int) -> Bundle:
     return bundle
 
 
-def covariance(
-    terms: NormalEquations, bundle: Bundle, fixed_led: Floats, fixed_rest: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Covariances in a given gauge: (N, 3, 3) of positions, (F, 3, 3) of rotations, and of lever and free lens.
+class Covariances(NamedTuple):
+    """Diagonal blocks of the covariance: (N, 3, 3) of LEDs, (F, 3, 3) of rotations, and that of lever and free lens."""
+
+    by_led: Floats
+    by_rotation: Floats
+    shared: Floats
+
+
+def covariance(terms: NormalEquations, bundle: Bundle) -> Covariances:
+    """Diagonal blocks of the inverse normal matrix: errors against the truth if the prior map fixes the gauge.
+
+    Without a prior map the gauge freedoms are held by their penalty: see `covariance_in_gauge`. Raises LinAlgError if
+    an unknown is undetermined.
+    """
+    return _blocks(*_inverse(terms, bundle), bundle)
+
+
+def covariance_in_gauge(terms: NormalEquations, bundle: Bundle, fixed_led: Floats, fixed_rest: Floats) -> Covariances:
+    """The covariance in a given gauge, without the error of the gauge itself.
 
     fixed_led, fixed_rest : (3 N, 4), (R, 4) the matrix H of the four linear gauge constraints H'd = 0
     With Z the gauge freedoms, any generalized inverse Q of the normal matrix becomes T Q T', T = I - Z (H'Z)^-1 H'
@@ -386,12 +401,8 @@ def covariance(
     undetermined.
     """
     led_free, rest_free = gauge_freedoms(bundle)
-    reduced = eliminate_lights(terms, _free_gauge(bundle), 0.0)
-    size = len(reduced.scale)
-    # Inverse of the Schur complement: covariance Q of the rest before the transformation to the gauge.
-    rest = cho_solve(reduced.factor, np.eye(size)) * reduced.scale * reduced.scale[:, None]
-    lights = len(bundle.position_m)
-    elimination = reduced.elimination.toarray()
+    reduced, rest = _inverse(terms, bundle)
+    blocks = _blocks(reduced, rest, bundle)
     # Q H: covariance of all unknowns with the four gauge constraints.
     through = fixed_rest - reduced.elimination.T @ fixed_led
     rest_fixed = rest @ through
@@ -399,24 +410,32 @@ def covariance(
     transform = np.linalg.inv(led_free.T @ fixed_led + rest_free.T @ fixed_rest)  # (H'Z)^-T
     k_led, k_rest = led_fixed @ transform, rest_fixed @ transform
     outer = transform.T @ (fixed_led.T @ led_fixed + fixed_rest.T @ rest_fixed) @ transform
+    rotation_size = 3 * len(bundle.R_body_from_lab)
+    rotated, shared = slice(rotation_size), slice(rotation_size, None)
+    return Covariances(
+        blocks.by_led + _gauge_terms(k_led.reshape(-1, 3, 4), led_free.reshape(-1, 3, 4), outer),
+        blocks.by_rotation
+        + _gauge_terms(k_rest[rotated].reshape(-1, 3, 4), rest_free[rotated].reshape(-1, 3, 4), outer),
+        blocks.shared + _gauge_terms(k_rest[None, shared], rest_free[None, shared], outer)[0],
+    )
 
-    # Covariance of the lights by block inversion: A^-1 + S Q S', S = A^-1 C' the elimination matrix.
+
+def _inverse(terms: NormalEquations, bundle: Bundle) -> tuple[ReducedSystem, Floats]:
+    """The reduced system, and the (R, R) inverse of the Schur complement: covariance of all but the lights."""
+    reduced = eliminate_lights(terms, _free_gauge(bundle), 0.0)
+    rest = cho_solve(reduced.factor, np.eye(len(reduced.scale))) * reduced.scale * reduced.scale[:, None]
+    return reduced, rest
+
+
+def _blocks(reduced: ReducedSystem, rest: Floats, bundle: Bundle) -> Covariances:
+    """Covariance of the lights by block inversion, A^-1 + S Q S', S = A^-1 C' the elimination matrix; of the rest Q."""
+    lights, size, frames = len(bundle.position_m), len(rest), len(bundle.R_body_from_lab)
+    elimination = reduced.elimination.toarray()
     by_led = np.einsum(
         "nik,njk->nij", (elimination @ rest).reshape(lights, 3, size), elimination.reshape(lights, 3, size)
     )
-    by_led += reduced.inverse_led.data
-    by_led += _gauge_terms(k_led.reshape(lights, 3, 4), led_free.reshape(lights, 3, 4), outer)
-    rotation_size = 3 * len(bundle.R_body_from_lab)
-    frames = rotation_size // 3
     by_rotation = np.array([rest[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(frames)])
-    by_rotation += _gauge_terms(
-        k_rest[:rotation_size].reshape(-1, 3, 4), rest_free[:rotation_size].reshape(-1, 3, 4), outer
-    )
-    shared = (
-        rest[rotation_size:, rotation_size:]
-        + _gauge_terms(k_rest[None, rotation_size:], rest_free[None, rotation_size:], outer)[0]
-    )
-    return by_led, by_rotation, shared
+    return Covariances(by_led + reduced.inverse_led.data, by_rotation, rest[3 * frames :, 3 * frames :])
 
 
 def _gauge_terms(with_gauge: Floats, free: Floats, outer: Floats) -> Floats:

@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError
@@ -36,7 +37,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map
 from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration.bundle_adjustment import Bundle, Sightings
+from estimator.calibration.bundle_adjustment import Bundle, Covariances, Sightings
 from estimator.calibration.gauge import Gauge, Subset
 from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
@@ -48,6 +49,7 @@ LOSSES: dict[str, float] = {"linear": np.inf, "cauchy": CAUCHY}
 GATE = 5.0  # residuals above this many robust sigmas are outliers in the final fit
 GROSS_GATE = 6.0  # the same for the first rejection, after only the attitudes are fitted
 CROSSING_RAD = 0.005  # least rms angle between the rays to one light; below, its distance is undetermined
+NOISE_ROUNDS, NOISE_TOLERANCE = 8, 0.01  # of the noise estimated from the residuals; the tolerance is relative
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +68,10 @@ class DomeFrame:
 
 @dataclass(frozen=True, slots=True)
 class DomeSurvey:
-    """Result of a dome survey. The covariances are relative to the gauge and do not include its error.
+    """Result of a dome survey.
+
+    The covariances are of errors against the truth if the start map is used as a measurement. Otherwise, or with a
+    known length or a reference frame, they are relative to the gauge and do not include its error.
 
     status         : "converged", or "stopped ..." if the iteration did not converge
     leds           : the map with surveyed positions; lights that are not `surveyed` keep their start positions
@@ -78,7 +83,8 @@ class DomeSurvey:
     led_covariance_m2 (N, 3, 3), attitude_covariance_rad2 (F, 3, 3) in body axes: NaN if not surveyed or tied
     lever_covariance_m2 (3, 3), lens_covariance: of the fitted elements of focal_px, center x and y, k1, k2, p1, p2
     rms_px         : of the residual coordinates
-    misfit         : sqrt(chi-square / degrees of freedom), near 1 if sigma_px is correct
+    misfit         : sqrt(chi-square / redundancy), near 1 if sigma_px is correct
+    noise_scale    : factor by which sigma_px was multiplied; 1 unless the noise is fitted
     """
 
     status: str
@@ -95,6 +101,7 @@ class DomeSurvey:
     lens_covariance: Floats
     rms_px: float
     misfit: float
+    noise_scale: float = 1.0
 
     @property
     def focal_sigma_px(self) -> float:
@@ -119,6 +126,7 @@ def survey(
     loss: str = "linear",
     reference_frame: int | None = None,
     leds_sigma_m: float = np.inf,
+    fit_noise: bool = False,
 ) -> DomeSurvey:
     """Survey the dome: least squares over all lights and attitudes, the lever and the lens.
 
@@ -131,6 +139,9 @@ def survey(
     reference_frame : row of the frame whose start attitude fixes the lab frame, instead of the start map
     leds_sigma_m    : standard deviation of the start map per axis; the map is then used as a measurement, which the
         weakly determined moves need. inf: the map is only a start value
+    fit_noise       : multiply sigma_px by the misfit and fit again until the misfit is 1 (estimation of a variance
+        component: Koch 1999, Parameter Estimation and Hypothesis Testing in Linear Models, section 3.6). The weights of
+        pixels and map are then right even if the noise is known only up to a factor
 
     Raises ValueError in one line if the frames are malformed or do not determine the unknowns.
     """
@@ -146,44 +157,73 @@ def survey(
     start = _start_bundle(frames, leds_start, lever_start, camera_start, 7 if fit_distortion else 3)
     start = replace(start, map_sigma_m=leds_sigma_m)
     gauge = Gauge(known_length, reference_frame, start.map_m, start.R_body_from_lab)
-    subset, keep, converged, covariances = _fit(start, sightings, gauge, LOSSES[loss])
-    status = "converged" if converged else f"stopped after {ba.STEPS} steps without convergence"
+    fit = _fit(start, sightings, gauge, LOSSES[loss], fit_noise)
+    status = "converged" if fit.converged else f"stopped after {ba.STEPS} steps without convergence"
     row = np.concatenate([np.arange(len(frame.led)) for frame in frames])
-    outliers = np.column_stack([sightings.frame, row])[~keep]
-    return _report(
-        status,
-        subset,
-        subset.insert_into(start, subset.bundle),
-        covariances,
-        outliers,
-        leds_start,
-        camera_start,
-    )
+    outliers = np.column_stack([sightings.frame, row])[~fit.keep]
+    full = fit.subset.insert_into(start, fit.subset.bundle)
+    return _report(status, fit, full, outliers, leds_start, camera_start)
 
 
-def _fit(
-    start: Bundle, sightings: Sightings, gauge: Gauge, width: float
-) -> tuple[Subset, np.ndarray, bool, tuple[Floats, Floats, Floats]]:
+class _Fit(NamedTuple):
+    """A fitted subset, the (M,) mask of sightings kept, and what the report needs besides."""
+
+    subset: Subset
+    keep: np.ndarray
+    converged: bool
+    covariances: Covariances
+    misfit: float
+    noise_scale: float
+
+
+def _fit(start: Bundle, sightings: Sightings, gauge: Gauge, width: float, fit_noise: bool) -> _Fit:
     """Fit the connected subset of the observations in the given gauge.
 
-    Returns the fitted subset, the (M,) mask of sightings kept, whether it converged, and the covariances. Raises
-    ValueError if the lever or the lens is undetermined.
+    Raises ValueError if the lever or the lens is undetermined.
     """
-    covariances = None
+    covariances, scale = None, 1.0
     try:
         start, keep = _reject_misidentified(start, sightings, width)
-        subset = _connected_subset(start, sightings, keep)
+        subset = connected_subset(start, sightings, keep)
         gauge.check(subset)
-        fitted, converged = ba.adjust(subset.bundle, subset.sightings, np.inf)
-        fitted = gauge.transform(fitted, subset)
-        subset = replace(subset, bundle=fitted)
-        terms = ba.normal_equations(fitted, subset.sightings, np.ones(len(subset.index)))
-        covariances = ba.covariance(terms, fitted, *gauge.constraints(fitted, subset))
+        for _ in range(NOISE_ROUNDS if fit_noise else 1):
+            scaled = replace(subset.sightings, sigma_px=scale * sightings.sigma_px[subset.index])
+            fitted, converged = ba.adjust(subset.bundle, scaled, np.inf)
+            subset = replace(subset, bundle=gauge.transform(fitted, subset), sightings=scaled)
+            covariances = _covariances(subset, gauge)
+            misfit = _misfit(subset, covariances)
+            if not fit_noise or abs(misfit - 1) < NOISE_TOLERANCE or not misfit > 0:
+                break
+            scale *= misfit
     except LinAlgError:
         pass  # a singular matrix raises the same ValueError below as a nearly singular one
-    if covariances is None or not _determined(fitted, covariances[2]):
+    if covariances is None or not _determined(subset.bundle, covariances.shared):
         raise ValueError("survey: the frames do not determine the lever or the lens; take more tilts and yaws")
-    return subset, keep, converged, covariances
+    return _Fit(subset, keep, converged, covariances, misfit, scale)
+
+
+def _covariances(subset: Subset, gauge: Gauge) -> Covariances:
+    """The covariances of a fitted subset: of total errors if its map fixes the gauge, else relative to the gauge."""
+    bundle = subset.bundle
+    terms = ba.normal_equations(bundle, subset.sightings, np.ones(len(subset.index)))
+    if gauge.is_map and np.isfinite(bundle.map_sigma_m):
+        return ba.covariance(terms, bundle)
+    return ba.covariance_in_gauge(terms, bundle, *gauge.constraints(bundle, subset))
+
+
+def _misfit(subset: Subset, covariances: Covariances) -> float:
+    """Square root of chi-square of the pixels over their redundancy.
+
+    With the map as a measurement the pixels determine U - tr(C) / sigma_map^2 of the U unknowns, C the covariance of
+    the lights, and the map the rest; without it U less the four gauge freedoms.
+    """
+    bundle, sightings = subset.bundle, subset.sightings
+    unknowns = 3.0 * (len(subset.led) + len(subset.frame) + 1) + bundle.free_lens - 4
+    if np.isfinite(bundle.map_sigma_m):
+        by_map = float(np.einsum("nii->", covariances.by_led)) / bundle.map_sigma_m**2
+        unknowns -= max(by_map - 4, 0.0)
+    chi2 = np.sum(ba.residuals(bundle, sightings) ** 2)
+    return float(np.sqrt(chi2 / max(2 * len(sightings.led) - unknowns, 1)))
 
 
 def _collect(frames: Sequence[DomeFrame], lights: int) -> Sightings:
@@ -230,13 +270,13 @@ def _reject_misidentified(full: Bundle, sightings: Sightings, width: float) -> t
     Returns the bundle and the (M,) mask of sightings kept.
     """
     keep = np.ones(len(sightings.led), dtype=bool)
-    subset = _connected_subset(full, sightings, keep)
+    subset = connected_subset(full, sightings, keep)
     fitted = ba.fit_attitudes(subset.bundle, subset.sightings, 12)
     full = subset.insert_into(full, fitted)
     if np.isinf(width):
         return full, keep
     keep[subset.index] = _inliers(fitted, subset.sightings, GROSS_GATE)
-    subset = _connected_subset(full, sightings, keep)
+    subset = connected_subset(full, sightings, keep)
     # Graduated robust fit: each round shrinks the width with the residuals, until it shrinks by less than 10 %.
     fitted, previous = subset.bundle, np.inf
     while (current := width * ba.robust_scale(fitted, subset.sightings)) < 0.9 * previous:
@@ -251,7 +291,7 @@ def _inliers(bundle: Bundle, sightings: Sightings, gate: float) -> np.ndarray:
     return length < gate * ba.robust_scale(bundle, sightings)
 
 
-def _connected_subset(full: Bundle, sightings: Sightings, keep: np.ndarray) -> Subset:
+def connected_subset(full: Bundle, sightings: Sightings, keep: np.ndarray) -> Subset:
     """The subset that the sightings determine.
 
     It holds lights seen in two or more frames with crossing rays, and frames that see two or more such lights. Raises
@@ -331,24 +371,15 @@ def _determined(fitted: Bundle, shared: Floats) -> bool:
     return bool(np.isfinite(sigma).all() and sigma[:3].max() < 0.1 * nearest_m and sigma[3] < 0.1 * fitted.lens[0])
 
 
-def _report(
-    status: str,
-    subset: Subset,
-    full: Bundle,
-    covariances: tuple[Floats, Floats, Floats],
-    outliers: Ints,
-    leds: LedMap,
-    camera: Camera,
-) -> DomeSurvey:
+def _report(status: str, fit: _Fit, full: Bundle, outliers: Ints, leds: LedMap, camera: Camera) -> DomeSurvey:
+    subset, sightings = fit.subset, fit.subset.sightings
     lights, frames = len(full.position_m), len(full.R_body_from_lab)
     surveyed, tied = np.zeros(lights, dtype=bool), np.zeros(frames, dtype=bool)
     surveyed[subset.led] = tied[subset.frame] = True
     by_led, by_rotation = np.full((lights, 3, 3), np.nan), np.full((frames, 3, 3), np.nan)
-    by_led[subset.led], by_rotation[subset.frame], shared = covariances
-    sightings = subset.sightings
+    by_led[subset.led], by_rotation[subset.frame], shared = fit.covariances
     residual = ba.residuals(subset.bundle, sightings)
     lens = [float(value) for value in full.lens]
-    unknowns = 3 * len(subset.led) + 3 * len(subset.frame) + 3 + full.free_lens - 4
     return DomeSurvey(
         status,
         replace(leds, position_m=full.position_m),
@@ -368,5 +399,6 @@ def _report(
         shared[:3, :3],
         shared[3:, 3:],
         rms_px=float(np.sqrt(np.mean((residual * sightings.sigma_px[:, None]) ** 2))),
-        misfit=float(np.sqrt(np.sum(residual**2) / max(2 * len(sightings.led) - unknowns, 1))),
+        misfit=fit.misfit,
+        noise_scale=fit.noise_scale,
     )

@@ -64,6 +64,11 @@ class Gauge:
         if self.frame is not None and not 0 <= self.frame < frames:
             raise ValueError(f"survey: reference_frame is {self.frame}; allowed: 0 to {frames - 1}")
 
+    @property
+    def is_map(self) -> bool:
+        """Whether the start map alone fixes rotation and scale."""
+        return self.length is None and self.frame is None
+
     def check(self, subset: Subset) -> None:
         """Raise ValueError if the gauge uses a light or a frame that is not surveyed."""
         if self.length is not None:

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from estimator.attitude.solvers import rotation
 from estimator.attitude.wahba import wahba
 from estimator.catalog.pair_index import PairIndex
 from estimator.catalog.spatial_grid import nearest
@@ -40,7 +40,7 @@ def to_star_match(match: DirectMatch) -> StarMatch | None:
     """The match as a StarMatch, or None if it is not significant (ACCEPT_LOG10_CHANCE, MIN_MATCHES)."""
     if len(match.observed) < MIN_MATCHES or match.log10_chance > ACCEPT_LOG10_CHANCE:
         return None
-    return StarMatch(match.observed, match.star, Rotation.from_matrix(match.R_cam_from_ref), match.log10_chance)
+    return StarMatch(match.observed, match.star, rotation(match.R_cam_from_ref), match.log10_chance)
 
 
 @jit

@@ -7,6 +7,7 @@ reject blended LEDs, and solve.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from functools import partial
 
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude import systematic
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, on_sphere, project
-from estimator.attitude.nearfield import SOLVERS, fitted_sigma_rad
+from estimator.attitude.nearfield import SOLVERS, fit_focal_ratio, fitted_sigma_rad
 from estimator.catalog import pair_index
 from estimator.core import checks
 from estimator.core.arrays import Floats
@@ -42,6 +43,10 @@ from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_strea
 from estimator.trackers.star_tracker import NO_STARS
 
 MIN_ERROR_PX = 0.3  # least centroid error of an LED, for effects outside of survey and calibration
+FOCAL_UNCERTAINTY = 0.12  # greatest relative error of a focal length that is not calibrated
+FOCAL_CHECKS = 10_000_000  # effort of its search: a second at most
+MAX_FOCAL_SIGMA = 0.5  # of a `Camera`
+FITS_FOCAL = ("non_dimensional",)  # identifiers after which the focal length is fitted with the attitude
 SETTINGS = Settings(identifier="led_pairs", solver="rotation_only")
 Identify = Callable[[Floats, Floats, Floats | None], StarMatch | str]
 
@@ -52,6 +57,22 @@ def led_pairs(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) ->
     least_rad = MIN_ERROR_PX / camera.focal_px
     return lambda rays_cam, sigma_rad, flux_s: search.identify(
         rays_cam, np.hypot(sigma_rad, least_rad), sight, flux_s=flux_s
+    )
+
+
+def non_dimensional(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
+    """LEDs for a focal length that is known to FOCAL_UNCERTAINTY, or to three standard deviations if they are more.
+
+    See `identification.leds.search`. The index holds the pairs of the widest field that the camera may have, and the
+    field of the assumed one, in whose tangents the detections are.
+    """
+    uncertainty = min(max(FOCAL_UNCERTAINTY, 3 * camera.focal_sigma), 0.5)
+    nominal = build_dome_index(leds, lever, camera)
+    sight = build_dome_index(leds, lever, camera.zoomed(1 - uncertainty))
+    sight = sight._replace(field_tan=nominal.field_tan, field_area=nominal.field_area)
+    least_rad = MIN_ERROR_PX / camera.focal_px
+    return lambda rays_cam, sigma_rad, flux_s: search.identify(
+        rays_cam, np.hypot(sigma_rad, least_rad), sight, FOCAL_CHECKS, uncertainty, flux_s
     )
 
 
@@ -88,6 +109,7 @@ def star_identifier(name: str, camera: Camera, leds: LedMap, lever: Lever, setti
 # exposure is known, (N,) fluxes per second: it returns the match, or the reason for a refusal.
 IDENTIFIERS: dict[str, Callable[[Camera, LedMap, Lever, Settings], Identify]] = {
     "led_pairs": led_pairs,
+    "non_dimensional": non_dimensional,
     "pyramid": partial(star_identifier, "pyramid"),
     "saa": partial(star_identifier, "saa"),
 }
@@ -134,6 +156,7 @@ class DomeTracker:
         self.camera, self.leds, self.lever, self.settings = camera, leds, lever, settings
         self.identify = IDENTIFIERS[settings.identifier](camera, leds, lever, settings)
         self.led_sigma_rad = led_sigma_rad(leds, lever)
+        self.focal_fitted = False  # whether the camera's focal length is one that this frame's lights gave
 
     def solve(
         self,
@@ -201,8 +224,9 @@ class DomeTracker:
         """Identify and solve centroids of one time."""
         bright = brightest(centroids, self.settings)
         rays = self.camera.rays(bright.xy_px)
-        focal_rad = focal_error_rad(rays, self.camera)
-        sigma_rad = np.hypot(direction_sigma_rad(bright, self.camera, self.settings), focal_rad)
+        sigma_rad = direction_sigma_rad(bright, self.camera, self.settings)
+        if self.settings.identifier not in FITS_FOCAL:
+            sigma_rad = np.hypot(sigma_rad, focal_error_rad(rays, self.camera))
         match = self.identify(rays, sigma_rad, bright.flux / exposure_s if exposure_s else None)
         return self._solve_identified(centroids, match, clock)
 
@@ -218,15 +242,55 @@ class DomeTracker:
     def solve_match(self, centroids: Centroids, match: StarMatch) -> Attitude:
         """Match every centroid with the exact geometry, then solve these matches with the solver of the settings.
 
+        Where the focal length is uncertain (FITS_FOCAL), it is first fitted with the attitude to the identified LEDs,
+        and once more to all that match, with the distortion at the new scale. The answer's camera has it, with its
+        standard deviation, which counts in the covariance.
+        """
+        if self.settings.identifier not in FITS_FOCAL:
+            return self._solve_calibrated(centroids, match)
+        tracker, attitude = self, Attitude(NO_MATCH)
+        for _ in range(2):
+            try:
+                tracker = tracker._with_fitted_focal(centroids, match)
+            except (ValueError, np.linalg.LinAlgError) as error:
+                return Attitude(f"no attitude: {error}")
+            attitude = tracker._solve_calibrated(centroids, match)
+            if attitude.match is None:
+                break
+            match = attitude.match
+        return attitude
+
+    def _with_fitted_focal(self, centroids: Centroids, match: StarMatch) -> DomeTracker:
+        """This tracker with the focal length that fits the matches, and its error by centroids and map."""
+        observed, star = match.observed, match.star
+        rays = self.camera.rays(centroids.xy_px[observed])
+        pixel_rad = direction_sigma_rad(centroids, self.camera, self.settings)[observed]
+        sigma_rad = np.hypot(pixel_rad, self.led_sigma_rad[star])
+        body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
+        ratio = fit_focal_ratio(rays, sigma_rad, self.leds.position_m[star], self.lever, body_from_lab)
+        fitted = copy(self)
+        fitted.camera, fitted.focal_fitted = self.camera.zoomed(ratio), True
+        view, common_rad = fitted._common_rad(match.cam_from_ref, star)
+        view = systematic.with_focal(view)
+        variance = systematic.from_independent(view, sigma_rad, systematic.isotropic(sigma_rad))[3, 3]
+        variance += systematic.from_common(view, sigma_rad, common_rad)[3, 3]
+        fitted.camera = replace(fitted.camera, focal_sigma=min(float(np.sqrt(variance)), MAX_FOCAL_SIGMA))
+        return fitted
+
+    def _focal_rad(self, rays: Floats) -> Floats:
+        """(N,) `focal_error_rad` of rays; 0 where the focal length is fitted: its error is then of the fit."""
+        return np.zeros(len(rays)) if self.focal_fitted else focal_error_rad(rays, self.camera)
+
+    def _solve_calibrated(self, centroids: Centroids, match: StarMatch) -> Attitude:
+        """The attitude for a known focal length.
+
         The matching always uses the exact solver: an approximate one could lose matches. All solvers are therefore
         compared on the same matches.
         """
         observed, star = match.observed, match.star
         body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
         rays = self.camera.rays(centroids.xy_px)
-        pixel_rad = np.hypot(
-            direction_sigma_rad(centroids, self.camera, self.settings), focal_error_rad(rays, self.camera)
-        )
+        pixel_rad = np.hypot(direction_sigma_rad(centroids, self.camera, self.settings), self._focal_rad(rays))
         radius_px = max(4.0, 4 * self.camera.focal_px * float(np.median(np.hypot(pixel_rad, self.led_sigma_rad.max()))))
         try:
             for factor in (3.0, 1.0):
@@ -278,7 +342,7 @@ class DomeTracker:
         misfit     : factor of `_reject_blends` on all but the common errors
         sigma_rad  : (K,) errors on which it is based, (K, 3) rays and (K,) LEDs
         """
-        led_rad, focal_rad = self.led_sigma_rad[star], focal_error_rad(rays, self.camera)
+        led_rad, focal_rad = self.led_sigma_rad[star], self._focal_rad(rays)
         if self.leds.covariance_m2 is None and self.leds.common_m is None and not self.camera.focal_sigma:
             # The LEDs' share of the error variance of a ray: of the covariance too, if it is the same for all rays.
             return misfit * covariance, float(np.mean(led_rad**2 / sigma_rad**2)) * misfit * covariance
@@ -288,16 +352,18 @@ class DomeTracker:
             by_place = view.gradient @ cam_from_lab.as_matrix()
             own_rad2 = by_place @ self.leds.covariance_m2[star] @ np.moveaxis(by_place, 1, 2)
         noise_rad2 = systematic.isotropic(np.sqrt(np.maximum(sigma_rad**2 - led_rad**2 - focal_rad**2, 0)))
-        return systematic.with_survey(covariance, view, sigma_rad, misfit * noise_rad2, misfit * own_rad2, common_rad)
+        errors = misfit * noise_rad2, misfit * own_rad2, common_rad
+        return systematic.with_survey(covariance, view, sigma_rad, *errors, self.focal_fitted)
 
     def _common_rad(self, cam_from_lab: Rotation, star: NDArray) -> tuple[systematic.Geometry, Floats]:
         """K LEDs as the camera sees them, and the (M, K, 2) change of their tangents by the errors that all share.
 
-        Each is changed by one standard deviation: of the focal length first, then of the map's common errors.
+        Each is changed by one standard deviation: of the focal length first, unless it is fitted, then of the map's
+        common errors.
         """
         place_cam = cam_from_lab.apply(self.leds.position_m[star])
         view = systematic.geometry(place_cam, place_cam - self.lever.cam_from_body.apply(self.lever.camera_body_m))
-        common_rad = self.camera.focal_sigma * view.tangent[None]
+        common_rad = self.camera.focal_sigma * view.tangent[None][int(self.focal_fitted) :]
         if self.leds.common_m is not None:
             by_place = view.gradient @ cam_from_lab.as_matrix()
             moved = np.einsum("kij,mkj->mki", by_place, self.leds.common_m[:, star])
@@ -321,21 +387,24 @@ class DomeTracker:
 
         Two LEDs whose images touch form one blob at neither's position. Residual lengths are divided by their sigmas;
         those above 5 times the median (above 5 if the median is below 1) are rejected. The rest has 2 K - 3 degrees of
-        freedom; its chi-square has that mean, and more by what the attitude cannot absorb of the common errors. If it
-        exceeds its mean by more than 3 standard deviations, their ratio is the factor, else 1.
+        freedom, one less if the focal length is fitted; its chi-square has that mean, and more by what the fit cannot
+        absorb of the common errors. If it exceeds its mean by more than 3 standard deviations, their ratio is the
+        factor, else 1.
         """
         residual = self._residual_px(centroids, observed, star, body_from_lab)
         length = np.linalg.norm(residual, axis=1) / (sigma_rad * self.camera.focal_px)
         inlier = length <= 5 * max(float(np.median(length)), 1.0)
         if inlier.sum() < max(MIN_EVIDENCE_MATCHES, len(inlier) / 2):
             inlier[:] = True
-        dof = 2 * int(inlier.sum()) - 3
+        dof = 2 * int(inlier.sum()) - (4 if self.focal_fitted else 3)
         mean, spread = float(dof), np.sqrt(2 * dof)
         if self.leds.common_m is not None or self.camera.focal_sigma:
             view, common_rad = self._common_rad(self.lever.cam_from_body * body_from_lab, star[inlier])
-            left = systematic.residual_products(view, sigma_rad[inlier], common_rad)
+            fit = systematic.with_focal(view) if self.focal_fitted else view
+            left = systematic.residual_products(fit, sigma_rad[inlier], common_rad)
             # The focal length's error is in the sigmas too, as if it were independent.
-            focal_rad = self.camera.focal_sigma * np.linalg.norm(view.tangent, axis=1) / np.sqrt(2)
+            focal_sigma = 0.0 if self.focal_fitted else self.camera.focal_sigma
+            focal_rad = focal_sigma * np.linalg.norm(view.tangent, axis=1) / np.sqrt(2)
             noise = 1 - float(np.mean(focal_rad**2 / sigma_rad[inlier] ** 2))
             mean = noise * dof + float(np.trace(left))
             spread = np.sqrt(2 * noise**2 * dof + 4 * noise * np.trace(left) + 2 * np.trace(left @ left))

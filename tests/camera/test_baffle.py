@@ -123,6 +123,7 @@ def test_a_frame_has_the_stray_light_in_every_pixel() -> None:
     assert e_s > 1
 
 
+@pytest.mark.slow
 def test_the_light_follows_the_orbit_and_the_date() -> None:
     """The Sun's is none behind the Earth; the Earth's is strongest over the day side; both change with the season."""
     testbed = in_space(90.0, 60.0, light__bodies="{}", orbit=ORBIT)

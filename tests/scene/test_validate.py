@@ -13,8 +13,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from skysim.apps.cli import main
-from skysim.apps.cli.commands import json_schema
+from skysim.apps.cli import json_schema, main
 from skysim.apps.cli.commands.validate import check_file
 from skysim.core.errors import InputError
 from skysim.core.io import yaml_reader

@@ -113,6 +113,7 @@ def test_the_imu_is_wrong_for_good_by_the_turn_it_missed(bumped: Testbed) -> Non
     assert caught.sum() == telemetry.saturated.sum()  # and at no other time
 
 
+@pytest.mark.slow
 def test_the_filter_knows_what_it_does_not_know(bumped: Testbed) -> None:
     """Within four of its own sigma always: no surer than it may be before the star tracker has seen anything, while
     turns are missed, and after.

@@ -53,7 +53,7 @@ def test_layouts_that_cannot_have_them_are_refused(layout: str, reason: str) -> 
 
 def test_too_few_levels_or_leds_are_refused() -> None:
     rng = np.random.default_rng(2)
-    with pytest.raises(InputError, match=r"6 with 2 levels leave some of 300 LEDs alike; allowed: more levels"):
-        unique_levels(2, 6, cap(300, 0.6), rng)
+    with pytest.raises(InputError, match=r"3 with 2 levels leave some of 60 LEDs alike; allowed: more levels"):
+        unique_levels(2, 3, cap(60, 0.6), rng)
     with pytest.raises(InputError, match=r"unique_neighbors: 6 of 6 LEDs; allowed: fewer"):
         unique_levels(3, 6, cap(6, 0.6), rng)

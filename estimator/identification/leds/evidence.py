@@ -2,12 +2,13 @@
 
 `evaluate` projects the LEDs at a candidate attitude, matches them to the detections, refines the attitude, and returns
 log10 of the Bayes factor ("dex") of this attitude over detections at random positions; see `_evidence` for its terms.
-Unlike stars, LEDs are near: the projection includes the lever from the bearing to the camera's entrance pupil.
+Unlike stars, LEDs are near: the projection includes the lever from the bearing to the camera's entrance pupil. If the
+focal length is uncertain, it is refined with the attitude: `focal_ratio` is the true one over the assumed one.
 """
 
 from __future__ import annotations
 
-from math import log, log10, pi, sqrt
+from math import exp, log, log10, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,7 @@ class LedDetections(NamedTuple):
     direction_per_m : (N, 3) derivative of `direction` with respect to that radius, 1 / m
     log_flux  : (N,) logarithm of the flux per second of exposure; of length 0 where brightness is not used
     light_density : (N,) density of that brightness, per unit of the logarithm, if the light may be any LED or none
+    focal_uncertainty : greatest relative error of the focal length; 0 for a calibrated camera
     """
 
     ray: Floats
@@ -40,6 +42,7 @@ class LedDetections(NamedTuple):
     direction_per_m: Floats
     log_flux: Floats
     light_density: Floats
+    focal_uncertainty: float = 0.0
 
 
 class LedHypothesis(NamedTuple):
@@ -57,7 +60,7 @@ def light_dex(detections: LedDetections, dome: DomeIndex, n: int, star: int) -> 
     if len(detections.log_flux) == 0 or len(dome.log_flux) == 0:
         return 0.0
     z = (detections.log_flux[n] - dome.log_flux[star]) / dome.flux_sigma
-    as_led = np.exp(-z * z / 2) / (sqrt(2 * pi) * dome.flux_sigma)
+    as_led = exp(-z * z / 2) / (sqrt(2 * pi) * dome.flux_sigma)
     return log10(((1 - STRAY) * as_led + STRAY * STRAY_DENSITY) / detections.light_density[n])
 
 
@@ -73,25 +76,37 @@ def same_identification(first: LedHypothesis, second: LedHypothesis) -> bool:
 
 @jit
 def evaluate(
-    detections: LedDetections, dome: DomeIndex, R_cam_from_lab: Floats, center: int, a: int, b: int
+    detections: LedDetections,
+    dome: DomeIndex,
+    R_cam_from_lab: Floats,
+    center: int,
+    a: int,
+    b: int,
+    focal_ratio: float = 1.0,
 ) -> LedHypothesis:
     """Evaluate the attitude of a pair of detections a, b: match, fit and match again (twice), compute the evidence.
 
-    R_cam_from_lab is changed in place by the fit. The evidence is -inf if fewer than MIN_EVIDENCE_MATCHES LEDs match.
-    center : row of the LED whose neighborhood is matched
+    R_cam_from_lab is changed in place by the fit. The evidence is -inf if fewer than MIN_EVIDENCE_MATCHES LEDs match,
+    or if the focal length is out of its range.
+    center : row of the LED whose neighborhood is matched;  focal_ratio : of the pair, if it is uncertain
     """
     # Error of the pair's attitude, in units of a detection's variance: 1/2 from its midpoint (beside the detection's
-    # own 1), and 2 / separation^2 per squared distance from the midpoint from its direction.
+    # own 1), and 2 / separation^2 per squared distance from the midpoint from its direction; a focal length from the
+    # pair adds the same along that distance.
     midpoint = middle(detections.tangent, a, b)
     direction_variance = 2 / separation(detections.tangent, a, b) ** 2
-    observed, star, missing = _match(detections, dome, R_cam_from_lab, center, midpoint, 1.5, direction_variance)
+    observed, star, missing = _match(
+        detections, dome, R_cam_from_lab, focal_ratio, center, midpoint, 1.5, direction_variance
+    )
     dex = -np.inf
     for _ in range(2):
         if len(observed) < MIN_EVIDENCE_MATCHES:
             return LedHypothesis(observed, star, R_cam_from_lab, -np.inf)
-        info = _fit(detections, dome, R_cam_from_lab, observed, star)
-        observed, star, missing = _match(detections, dome, R_cam_from_lab, center, midpoint, 1.0, 0.0)
-        dex = _evidence(detections, dome, R_cam_from_lab, observed, star, missing, info)
+        info, focal_ratio = _fit(detections, dome, R_cam_from_lab, focal_ratio, observed, star)
+        if abs(focal_ratio - 1) > 1.2 * detections.focal_uncertainty + 1e-12:
+            return LedHypothesis(observed, star, R_cam_from_lab, -np.inf)
+        observed, star, missing = _match(detections, dome, R_cam_from_lab, focal_ratio, center, midpoint, 1.0, 0.0)
+        dex = _evidence(detections, dome, R_cam_from_lab, focal_ratio, observed, star, missing, info)
     return LedHypothesis(observed, star, R_cam_from_lab, dex if len(observed) >= MIN_EVIDENCE_MATCHES else -np.inf)
 
 
@@ -107,6 +122,7 @@ def _match(
     detections: LedDetections,
     dome: DomeIndex,
     R_cam_from_lab: Floats,
+    focal_ratio: float,
     center: int,
     midpoint: tuple[float, float],
     base_variance: float,
@@ -126,6 +142,7 @@ def _match(
     for entry in range(first[center] - 1, first[center + 1]):
         s = center if entry < first[center] else dome.pairs.neighbor[entry]
         qx, qy, qz = _vector_from_pupil(dome, R_cam_from_lab, s)
+        qx, qy = focal_ratio * qx, focal_ratio * qy
         if not (qz > 0 and 1.1 * left * qz < qx < 1.1 * right * qz and 1.1 * top * qz < qy < 1.1 * bottom * qz):
             continue
         x, y = qx / qz, qy / qz
@@ -153,44 +170,57 @@ def _match(
 
 @jit
 def _fit(
-    detections: LedDetections, dome: DomeIndex, R_cam_from_lab: Floats, observed: NDArray, star: NDArray
-) -> Floats:
+    detections: LedDetections,
+    dome: DomeIndex,
+    R_cam_from_lab: Floats,
+    focal_ratio: float,
+    observed: NDArray,
+    star: NDArray,
+) -> tuple[Floats, float]:
     """One Gauss-Newton step of R_cam_from_lab about the bearing, in place, with exact near-field projection.
 
     With b = R P, q = b - r (r the pupil) and R <- exp([w]) R, a tangent changes by d . (w x b) = w . (b x d), d its
-    gradient with respect to q. Returns the (3, 3) Fisher information of w, in camera axes.
+    gradient with respect to q. An uncertain focal length multiplies all tangents: its logarithm is the fourth unknown.
+    Returns the Fisher information of w, in camera axes, and of that logarithm, (3, 3) or (4, 4), and the focal ratio.
     """
-    info, factor, step, slopes = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3), np.empty(3)
+    count = 4 if detections.focal_uncertainty > 0 else 3
+    info, factor, step, slopes = np.zeros((count, count)), np.empty((count, count)), np.zeros(count), np.empty(4)
     for k in range(len(observed)):
         q = _vector_from_pupil(dome, R_cam_from_lab, star[k])
         bx, by, bz = q[0] + dome.pupil_m[0], q[1] + dome.pupil_m[1], q[2] + dome.pupil_m[2]
         weight = 1 / detections.sigma[observed[k]] ** 2
         for axis in range(2):
-            by_component, by_depth = 1 / q[2], -q[axis] / q[2] ** 2
+            by_component, by_depth = focal_ratio / q[2], -focal_ratio * q[axis] / q[2] ** 2
             slopes[0] = by * by_depth - axis * bz * by_component
             slopes[1] = (1 - axis) * bz * by_component - bx * by_depth
             slopes[2] = axis * bx * by_component - (1 - axis) * by * by_component
-            residual = detections.tangent[observed[k], axis] - q[axis] / q[2]
-            for i in range(3):
+            slopes[3] = focal_ratio * q[axis] / q[2]
+            residual = detections.tangent[observed[k], axis] - slopes[3]
+            for i in range(count):
                 step[i] += weight * slopes[i] * residual
-                for j in range(3):
+                for j in range(count):
                     info[i, j] += weight * slopes[i] * slopes[j]
     _factorize(info, factor)
     least_squares.cholesky_solve(factor, step)
     vectors.rotate_in_place(step, R_cam_from_lab)
-    return info
+    return info, focal_ratio * exp(step[3]) if count == 4 else focal_ratio
 
 
 @jit
 def _factorize(info: Floats, factor: Floats) -> float:
-    """Cholesky factor of a (3, 3) matrix, in the lower triangle of `factor`; returns the root of its determinant.
+    """Cholesky factor of a square matrix, in the lower triangle of `factor`; returns the root of its determinant.
 
     The root is 0 for a singular matrix.
     """
-    for i in range(3):
+    for i in range(len(info)):
         for j in range(i + 1):
             factor[i, j] = info[i, j]
-    return factor[0, 0] * factor[1, 1] * factor[2, 2] if least_squares.cholesky(factor) else 0.0
+    if not least_squares.cholesky(factor):
+        return 0.0
+    root = 1.0
+    for i in range(len(info)):
+        root *= factor[i, i]
+    return root
 
 
 @jit
@@ -198,6 +228,7 @@ def _evidence(
     detections: LedDetections,
     dome: DomeIndex,
     R_cam_from_lab: Floats,
+    focal_ratio: float,
     observed: NDArray,
     star: NDArray,
     missing: int,
@@ -208,21 +239,24 @@ def _evidence(
     Each match contributes N(residual) / rho, rho the density of detections on the sensor, and the evidence of its
     brightness (`light_dex`). The counts of matched (m)
     and missing (k) LEDs contribute B(m + 1, k + 1), a uniform prior on the fraction of dead LEDs. The attitude
-    contributes (2 pi)^1.5 / sqrt(det info) over the prior volume (Laplace's approximation). By Markov's inequality,
-    random detections reach 10^x for any attitude in at most one of 10^x frames.
+    contributes (2 pi)^1.5 / sqrt(det info) over the prior volume (Laplace's approximation), an uncertain focal length
+    the root of another 2 pi over the width of its range. By Markov's inequality, random detections reach 10^x for any
+    attitude in at most one of 10^x frames.
 
     All patch boards have the same pattern, so that further matches on one board are not independent: the second LED of
     a board counts at most a factor of 10 (it fixes the orientation of the lattice), each further one at most a factor
     of 2 (it is lit or not).
     """
     density, group = len(detections.ray) / dome.field_area, dome.pairs.group
-    root_det = _factorize(info, np.empty((3, 3)))
-    total = 1.5 * log10(2 * pi) - log10(max(root_det, 1e-150)) - log10(dome.prior_volume)
+    root_det = _factorize(info, np.empty_like(info))
+    total = len(info) / 2 * log10(2 * pi) - log10(max(root_det, 1e-150)) - log10(dome.prior_volume)
+    if detections.focal_uncertainty > 0:
+        total -= log10(2 * detections.focal_uncertainty)
     for k in range(len(observed)):
         qx, qy, qz = _vector_from_pupil(dome, R_cam_from_lab, star[k])
         variance = detections.sigma[observed[k]] ** 2
         x, y = detections.tangent[observed[k], 0], detections.tangent[observed[k], 1]
-        residual2 = (x - qx / qz) ** 2 + (y - qy / qz) ** 2
+        residual2 = (x - focal_ratio * qx / qz) ** 2 + (y - focal_ratio * qy / qz) ** 2
         match_dex = -residual2 / variance / 2 / log(10.0) - log10(2 * pi * variance * density)
         match_dex += light_dex(detections, dome, observed[k], star[k])
         same_board = 0

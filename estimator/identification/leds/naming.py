@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from estimator.attitude.solvers import rotation
 from estimator.core.arrays import Floats, Ints
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
@@ -74,7 +74,7 @@ def identify(lights: NamedLights, sphere: Sphere) -> StarMatch | str:
     by_code = excess[rows[matched], star[best][matched]]
     if by_code.sum() > TRUSTED * np.sqrt(matched.sum()) or matched.sum() < max(2, 2 * len(rows) / 3):
         return CONTRADICTED
-    return StarMatch(rows[matched], star[best][matched], Rotation.from_matrix(R_cam_from_lab[best]), -MARGIN_DEX)
+    return StarMatch(rows[matched], star[best][matched], rotation(R_cam_from_lab[best]), -MARGIN_DEX)
 
 
 def _best_pair(ray: Floats, excess: Floats) -> tuple[int, int]:

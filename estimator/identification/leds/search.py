@@ -7,6 +7,12 @@ without knowledge of the attitude. A pair of detections and a pair of LEDs must 
 bearing, and determine an attitude. A quick check counts the other detections that have an LED at the predicted
 direction; if enough do, the candidate is fitted to the whole field and its Bayes factor is computed
 (`evidence.evaluate`).
+
+If the focal length is uncertain, an angle alone says little. Angles of triangles in the focal plane hardly depend on
+it (Samaan, Mortari & Junkins 2003, AAS 03-131: non-dimensional star identification; Leake, Arnas & Mortari 2020,
+arXiv:2003.13736). A pair of detections is then compared with all LED pairs of any length in its range. Each gives an
+attitude and a focal length, that is, the frame of a similarity in which the places of the other detections are
+invariants: with each of them the pair makes a triangle, whose angles the quick check compares with the LEDs'.
 """
 
 from __future__ import annotations
@@ -15,9 +21,9 @@ from math import log10, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import on_sphere
+from estimator.attitude.solvers import rotation
 from estimator.catalog.pair_index import pair_range
 from estimator.catalog.spatial_grid import cell_of
 from estimator.core import vectors
@@ -57,12 +63,14 @@ def identify(
     sigma_rad: Floats,
     dome: DomeIndex,
     max_checks: int = 4_000_000,
+    focal_uncertainty: float = 0.0,
     flux_s: Floats | None = None,
 ) -> StarMatch | str:
     """Identify the LEDs of (N, 3) rays in camera axes: the matches and the attitude, or the reason for a refusal.
 
     sigma_rad  : (N,) standard deviation of a ray about each axis; `dome` holds the survey's own errors
     max_checks : LED pairs tested, plus detections times LEDs compared, before giving up
+    focal_uncertainty : greatest relative error of the focal length; `dome` must hold the pairs of the widest field
     flux_s     : (N,) flux of the lights per second of exposure, for LEDs that differ in brightness; None: unknown
 
     Detection pairs are tested against all LED pairs of the same angle (`_test_pair`), the pairs with the fewest first.
@@ -72,18 +80,21 @@ def identify(
     """
     if len(rays_cam) < MIN_EVIDENCE_MATCHES:
         return NO_MATCH
-    hypothesis, rival_dex = _search(build_detections(rays_cam, sigma_rad, dome, flux_s), dome, max_checks)
+    detections = build_detections(rays_cam, sigma_rad, dome, focal_uncertainty, flux_s)
+    hypothesis, rival_dex = _search(detections, dome, max_checks)
     if hypothesis.dex > AMBIGUOUS_DEX and hypothesis.dex - rival_dex < MARGIN_DEX:
         return AMBIGUOUS
     if hypothesis.dex < ACCEPT_DEX:
         return NO_MATCH
-    return StarMatch(
-        hypothesis.observed, hypothesis.star, Rotation.from_matrix(hypothesis.R_cam_from_lab), -hypothesis.dex
-    )
+    return StarMatch(hypothesis.observed, hypothesis.star, rotation(hypothesis.R_cam_from_lab), -hypothesis.dex)
 
 
 def build_detections(
-    rays_cam: Floats, sigma_rad: Floats, dome: DomeIndex, flux_s: Floats | None = None
+    rays_cam: Floats,
+    sigma_rad: Floats,
+    dome: DomeIndex,
+    focal_uncertainty: float = 0.0,
+    flux_s: Floats | None = None,
 ) -> LedDetections:
     """Detections for the search: rays with their total errors, which include those of the LED map and of the lever.
 
@@ -104,6 +115,7 @@ def build_detections(
         point_m / dome.median_radius_m,
         rays_cam / along_m - point_m / dome.median_radius_m**2,
         *_brightness(flux_s, dome),
+        float(focal_uncertainty),
     )
 
 
@@ -170,7 +182,8 @@ def _pair_range(detections: LedDetections, dome: DomeIndex, a: int, b: int) -> t
     gate = GATE_SIGMA * sqrt(detections.sigma[a] ** 2 + detections.sigma[b] ** 2) * _bearing_angle_ratio(dome)
     direction_a, direction_b = vectors.row(detections.direction, a), vectors.row(detections.direction, b)
     angle = 2 * np.arcsin(min(vectors.chord(direction_a, direction_b) / 2, 1.0))
-    begin, end = pair_range(dome.pairs, angle - gate - dome.scaling_error_rad, angle + gate + dome.scaling_error_rad)
+    slack, uncertainty = gate + dome.scaling_error_rad, detections.focal_uncertainty
+    begin, end = pair_range(dome.pairs, angle / (1 + uncertainty) - slack, angle / (1 - uncertainty) + slack)
     return begin, end, gate
 
 
@@ -226,9 +239,12 @@ def _test_pair(
     for p in range(begin, end):
         for flip in range(2):
             i, j = index.pair[p, flip], index.pair[p, 1 - flip]
-            direction_a = _direction_from_bearing(detections.ray[a], dome, radius[i])
-            direction_b = _direction_from_bearing(detections.ray[b], dome, radius[j])
             led_i, led_j = vectors.row(index.vectors, i), vectors.row(index.vectors, j)
+            focal_ratio = _fit_focal_ratio(detections, dome, a, b, radius[i], radius[j], vectors.chord(led_i, led_j))
+            if abs(focal_ratio - 1) > detections.focal_uncertainty:
+                continue
+            direction_a = _direction_from_bearing(_ray(detections, a, focal_ratio), dome, radius[i])
+            direction_b = _direction_from_bearing(_ray(detections, b, focal_ratio), dome, radius[j])
             # The index holds angles scaled to the median radius; here each ray meets the LED's own radius.
             if abs(vectors.chord(direction_a, direction_b) - vectors.chord(led_i, led_j)) > gate:
                 continue
@@ -236,10 +252,11 @@ def _test_pair(
             vectors.pair_frame(led_i, led_j, in_lab)
             vectors.multiply_transposed(in_cam, in_lab, R_cam_from_lab)
             vectors.multiply_transposed(dome.grid.R_grid_from_lab, R_cam_from_lab, R_grid_from_cam)
-            if _quick_check(detections, dome, R_grid_from_cam, radius[i], a, b, gates, required) < required:
+            counted = _quick_check(detections, dome, R_grid_from_cam, focal_ratio, radius[i], a, b, gates, required)
+            if counted < required:
                 continue
             checks[0] += len(detections.ray) * (index.first[i + 1] - index.first[i]) // 4
-            hypothesis = evaluate(detections, dome, R_cam_from_lab.copy(), i, a, b)
+            hypothesis = evaluate(detections, dome, R_cam_from_lab.copy(), i, a, b, focal_ratio)
             same = same_identification(hypothesis, best)
             if hypothesis.dex > best.dex:
                 rival_dex = rival_dex if same else max(rival_dex, best.dex)
@@ -250,7 +267,34 @@ def _test_pair(
 
 
 @jit
-def _direction_from_bearing(ray: Floats, dome: DomeIndex, radius_m: float) -> Vector:
+def _ray(detections: LedDetections, n: int, focal_ratio: float) -> Vector:
+    """Unit ray of a detection in camera axes, if the focal length is `focal_ratio` times the assumed one."""
+    if focal_ratio == 1:
+        return vectors.row(detections.ray, n)
+    x, y = detections.tangent[n, 0] / focal_ratio, detections.tangent[n, 1] / focal_ratio
+    inverse = 1 / sqrt(x * x + y * y + 1)
+    return x * inverse, y * inverse, inverse
+
+
+@jit
+def _fit_focal_ratio(
+    detections: LedDetections, dome: DomeIndex, a: int, b: int, radius_a_m: float, radius_b_m: float, chord: float
+) -> float:
+    """The focal ratio at which two detections are two LEDs with this chord of directions from the bearing.
+
+    By fixed-point iteration: a chord is nearly proportional to 1 / focal length. 1 for a calibrated camera.
+    """
+    focal_ratio = 1.0
+    if detections.focal_uncertainty > 0:
+        for _ in range(3):
+            direction_a = _direction_from_bearing(_ray(detections, a, focal_ratio), dome, radius_a_m)
+            direction_b = _direction_from_bearing(_ray(detections, b, focal_ratio), dome, radius_b_m)
+            focal_ratio *= vectors.chord(direction_a, direction_b) / chord
+    return focal_ratio
+
+
+@jit
+def _direction_from_bearing(ray: Vector, dome: DomeIndex, radius_m: float) -> Vector:
     """Unit vector from the bearing to the point where a camera ray meets the sphere of radius_m, in camera axes."""
     px, py, pz = dome.pupil_m
     along = ray[0] * px + ray[1] * py + ray[2] * pz
@@ -275,10 +319,14 @@ def _most_light_dex(detections: LedDetections, dome: DomeIndex) -> float:
 def _attitude_dex(detections: LedDetections, dome: DomeIndex, a: int, b: int) -> float:
     """Contribution of a pair's attitude alone to the evidence, for `required_matches`.
 
-    The uncertainty is sqrt(2) sigma / separation about the boresight, sigma / sqrt(2) across it.
+    The uncertainty is sqrt(2) sigma / separation about the boresight, sigma / sqrt(2) across it; that of the focal
+    length, if the pair has to tell it too, is sqrt(2) sigma / separation.
     """
-    sigma_volume = least(detections.sigma) ** 3 / sqrt(2.0) / separation(detections.tangent, a, b)
-    return 1.5 * log10(2 * pi) - log10(dome.prior_volume) + log10(sigma_volume)
+    sigma, length = least(detections.sigma), separation(detections.tangent, a, b)
+    attitude_dex = 1.5 * log10(2 * pi) - log10(dome.prior_volume) + log10(sigma**3 / sqrt(2.0) / length)
+    if detections.focal_uncertainty > 0:
+        attitude_dex += log10(sqrt(2 * pi) * sqrt(2.0) * sigma / length / (2 * detections.focal_uncertainty))
+    return attitude_dex
 
 
 @jit
@@ -302,6 +350,7 @@ def _quick_check(
     detections: LedDetections,
     dome: DomeIndex,
     R_grid_from_cam: Floats,
+    focal_ratio: float,
     radius_m: float,
     a: int,
     b: int,
@@ -311,7 +360,7 @@ def _quick_check(
     """Quick check: number of detections with an LED at the predicted direction, the pair included.
 
     Stops as soon as `required` is reached or out of reach. Every ray is taken to the radius of the hypothetical LED
-    (radius_m) by a first-order step from the median radius.
+    (radius_m) by a first-order step from the median radius, or exactly if the focal length is another one.
     """
     count, total, radius_offset_m = 2, len(detections.ray), radius_m - dome.median_radius_m
     for n in range(total):
@@ -319,9 +368,12 @@ def _quick_check(
             break
         if n in (a, b):
             continue
-        x = detections.direction[n, 0] + radius_offset_m * detections.direction_per_m[n, 0]
-        y = detections.direction[n, 1] + radius_offset_m * detections.direction_per_m[n, 1]
-        z = detections.direction[n, 2] + radius_offset_m * detections.direction_per_m[n, 2]
+        if focal_ratio != 1:
+            x, y, z = _direction_from_bearing(_ray(detections, n, focal_ratio), dome, radius_m)
+        else:
+            x = detections.direction[n, 0] + radius_offset_m * detections.direction_per_m[n, 0]
+            y = detections.direction[n, 1] + radius_offset_m * detections.direction_per_m[n, 1]
+            z = detections.direction[n, 2] + radius_offset_m * detections.direction_per_m[n, 2]
         count += _has_led_near(dome.grid, vectors.rotate(R_grid_from_cam, (x, y, z)), gates[n])
     return count
 

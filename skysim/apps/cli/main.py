@@ -17,9 +17,10 @@ from skysim.apps.cli.commands.files import catalog_app, export, scenes_app
 from skysim.apps.cli.commands.gui import gui
 from skysim.apps.cli.commands.reproduce import reproduce
 from skysim.apps.cli.commands.run import compare, render, run, trackers
-from skysim.apps.cli.commands.solve import solve, survey
+from skysim.apps.cli.commands.solve import solve
 from skysim.apps.cli.commands.stream import stream
 from skysim.apps.cli.commands.study import app as studies
+from skysim.apps.cli.commands.survey import survey
 from skysim.apps.cli.commands.validate import check, validate
 from skysim.apps.cli.examples import add_examples
 from skysim.apps.cli.options import with_location

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 WIDE = 240  # characters in a line of a file
 ANIMATION_FRAMES = 60
-SURVEY_COLUMNS = ("believed", "found", "sigma", "truth")
 
 
 def eager_first(items: Iterable[T]) -> Iterator[T]:
@@ -258,36 +257,6 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
         for status, count in line.refusals.items():
             print(f"{line.tracker}: {count} × {status}")
     print_wrapped(f"scoreboard.ecsv, solutions.NAME.ecsv and the frames are in {folder}")
-
-
-def print_survey(survey: dict[str, Any]) -> None:
-    lines = [
-        [row["what"], *(f"{row[key]:.5g}" if row["what"][0] in "kp" else f"{row[key]:.3f}" for key in SURVEY_COLUMNS)]
-        for row in survey["values"]
-        if row["sigma"]
-    ]
-    print_table("", ["what", *SURVEY_COLUMNS], lines)
-    print()
-    print_wrapped(
-        f"{survey['surveyed']} of {survey['leds']} LEDs surveyed in {survey['tied']} of {survey['frames']} "
-        f"frames, {survey['renamed']} with a corrected identity; {survey['status']}, {survey['outliers']} outliers, "
-        f"{survey['rms_px']:.2g} px rms, misfit {survey['misfit']:.2g}"
-    )
-    print_wrapped(
-        f"LEDs: sigma median {survey['led_sigma_mm_median']:.2g} mm worst {survey['led_sigma_mm_worst']:.2g} mm; "
-        f"true error {survey['led_mm_before']:.2g} mm rms before, {survey['led_mm_after']:.2g} mm after"
-    )
-    for when in ("before", "after"):
-        result = survey[when]
-        errors = [
-            f"{name} median {result[f'{name}_arcsec_median']:.3g}″ worst {result[f'{name}_arcsec_worst']:.3g}″"
-            for name in ("cross", "roll")
-            if result["solved"]
-        ]
-        print_wrapped(
-            f"{when}: " + ", ".join([f"{result['solved']} of {result['stops']} test attitudes solved", *errors])
-        )
-    print_wrapped(f"{survey['map']}: for tracker.map; plot of the errors: {survey['picture']}")
 
 
 def print_solutions(solutions: list[dict[str, Any]], out: Path) -> None:

@@ -114,7 +114,7 @@ def dome_draws_nothing(scene: Scene) -> bool:
     led, layout = scene.light.led, scene.light.layout
     if led.scatter or led.color_scatter_m or (led.aging and led.aging.scatter):
         return False
-    if isinstance(layout, FibersConfig) and layout.radius_variation:
+    if isinstance(layout, FibersConfig) and (layout.radius_variation or layout.aiming):
         return False
     points = layout.points if isinstance(layout, FibersConfig | LcdConfig) else layout
     if isinstance(points, FibonacciConfig):
@@ -231,9 +231,9 @@ RULES = (
     ),
     Rule(
         ("tracker.brightness_sigma",),
-        lambda scene: scene.tracker.identifier not in (None, "led_pairs"),
+        lambda scene: scene.tracker.identifier not in (None, "led_pairs", "non_dimensional"),
         "this identifier does not use brightness",
-        "tracker.identifier: led_pairs",
+        "tracker.identifier: led_pairs or non_dimensional",
     ),
     Rule(
         ("tracker.brightness_sigma",),

@@ -298,16 +298,44 @@ Points = Annotated[
 ]
 
 
+class AimingConfig(ConfigModel):
+    """A laser on a two-axis mount that marks each place on the shell, where a hole is drilled (JHU/APL's dome).
+
+    laser : where its axes meet, in the lab
+    pointing_sigma_arcsec    : of its line about two axes across it, or its tolerance; of each hole
+    orientation_sigma_arcsec : of the mount about each axis of the lab, or its tolerance; common to all holes
+    drill_sigma : of a hole off its mark, along two axes in the surface, or its tolerance; of each hole
+    """
+
+    laser_m: tuple[Length, Length, Length]
+    pointing_sigma_arcsec: NumberError = 0.0
+    orientation_sigma_arcsec: NumberError = 0.0
+    drill_sigma_m: LengthError = 0.0
+
+
 class FibersConfig(ConfigModel):
     """Ends of optical fibers through the shell (JHU/APL's dome), at the points of any layout of single LEDs.
 
     radius_variation : greatest error of the dome's radius at a fiber, as a fraction of the distance from the bearing,
         uniformly distributed: the end is displaced along the surface's normal, inward or outward
+    aiming : a laser that marked the places, with its errors; the shell's error is then along its line. The places are
+        as designed, but for the shell's error, if left out
     """
 
     kind: Literal["fibers"]
     points: Points
     radius_variation: Annotated[Number, Field(ge=0, le=0.1)] = 0.0
+    aiming: AimingConfig | None = None
+
+    @model_validator(mode="after")
+    def check_aiming(self) -> FibersConfig:
+        laser = self.aiming
+        if laser and not (self.radius_variation or laser.pointing_sigma_arcsec or laser.orientation_sigma_arcsec):
+            raise ValueError(
+                "aiming: the laser's place has no effect; allowed: an error of its pointing or orientation, or a"
+                " radius_variation"
+            )
+        return self
 
     @property
     def cap_deg(self) -> float:

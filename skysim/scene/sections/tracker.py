@@ -108,7 +108,8 @@ class TrackerConfig(ConfigModel):
     catalog : its stars under the sky, not the simulator's: a name in data/catalogs, or a file of `skysim catalog build`
     map : a file that `skysim survey` wrote: LEDs, lever, focal length and distortion as measured
     detector, centroider, identifier, solver : if left out, under a dome local, cog, led_pairs and rotation_only, and
-        under the stars all of them `default`
+        under the stars all of them `default`. The dome's identifier `non_dimensional` takes an assumed focal length
+        that is wrong by up to 12 %, and the tracker then fits it with the attitude
     assumed_distortion : k1, k2, p1, p2, k3 of the lens; as it is if left out
     assumed_row_time : of a rolling shutter; 0 for a tracker that takes all rows as exposed at once
     gyro : whether the tracker gets the mean rate that `vehicle.imu` measures during each exposure, unless saturated,

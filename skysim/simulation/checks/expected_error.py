@@ -41,6 +41,7 @@ from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.nearfield import SOLVERS
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
 from estimator.identification.stars.search import WRONG_FOCAL
+from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY
 from skysim.camera.optics import Optics
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
@@ -202,13 +203,13 @@ EXACT_SOLVERS = ("rotation_only", "pnp")  # without an error of their own
 # Propagation to the attitude.
 
 
-def gains(view: View, sigma_px: Floats, fits_place: bool = False) -> Floats:
+def gains(view: View, sigma_px: Floats, fitted: Floats | None = None) -> Floats:
     """(n, 3, 2) K_i: the rotation by a unit error of each image position, for weights 1 / sigma^2.
 
-    fits_place : the camera's place is fitted too
+    fitted : (n, 2, k) derivatives of the image positions by what is fitted beside the rotation
     Raises LinAlgError if the lights do not determine the rotation.
     """
-    jacobian = np.concatenate([view.jacobian, view.gradient], axis=2) if fits_place else view.jacobian
+    jacobian = view.jacobian if fitted is None else np.concatenate([view.jacobian, fitted], axis=2)
     weighted = jacobian / sigma_px[:, None, None] ** 2
     # Columns are scaled, because a rotation and a shift in meters have different sizes.
     size = np.sqrt(np.einsum("nij,nij->j", jacobian, jacobian))
@@ -250,9 +251,16 @@ class Mismatch(NamedTuple):
     by_cause: dict[str, float]
 
 
+def fits_focal_length(context: Context) -> bool:
+    """Whether the tracker fits the focal length with the attitude: under a dome some identifiers do."""
+    return context.surface is not None and context.settings.identifier in FITS_FOCAL
+
+
 def finds_focal_length(context: Context) -> bool:
     """Whether the tracker solves with the right focal length instead: the default identifier does under the stars."""
     scene = context.testbed.scene
+    if fits_focal_length(context):
+        return abs(context.beliefs.focal_error) < FOCAL_UNCERTAINTY
     under_stars = isinstance(scene.light, StarsConfig) and (scene.tracker.identifier or "default") == "default"
     return under_stars and abs(context.beliefs.focal_error) < WRONG_FOCAL
 
@@ -318,11 +326,15 @@ def expected(views: list[View], attitudes: Attitudes, context: Context) -> Expec
 def causes_at(view: View, lab_from_cam: Rotation, context: Context) -> dict[str, Floats]:
     """(3,) variances about the camera's axes at one attitude by cause, rad^2; NaN if the lights are too few."""
     noise = Independent(centroid_variance(view, context))
-    fits_place = context.surface is not None and context.settings.solver == "pnp"
+    fitted = None
+    if fits_focal_length(context):
+        fitted = (view.xy_px - np.array(context.camera.optics.camera.center_px))[:, :, None]
+    elif context.surface is not None and context.settings.solver == "pnp":
+        fitted = view.gradient
     try:
         if len(view) < MIN_EVIDENCE_MATCHES:
             raise np.linalg.LinAlgError("too few lights")
-        gain = gains(view, believed_sigma_px(view, noise, context), fits_place)
+        gain = gains(view, believed_sigma_px(view, noise, context), fitted)
     except np.linalg.LinAlgError:
         return {CENTROIDS: np.full(3, np.nan)}
     causes = {name: cause(view, lab_from_cam, context) for name, cause in CAUSES.items()} | {CENTROIDS: noise}

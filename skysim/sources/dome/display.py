@@ -1,4 +1,4 @@
-"""Stars shown by other devices than LEDs: optical fibers in a shell (APL), an LCD panel, a collimated micro-display.
+"""Stars shown by displays instead of LEDs: an LCD panel, a collimated micro-display.
 
 A display rounds places to its pixels and levels to its gray levels (`draw_blocks`). On an LCD panel each star is a
 block of pixels at a finite distance; behind a collimator it is a parallel beam, a source at infinity.
@@ -31,24 +31,7 @@ from skysim.sources.dome.led import (
 from skysim.sources.dome.shell.surface import Plane
 from skysim.sources.photometry import SUN, Band, star_chromatic, star_flux_e_s_m2
 
-SHELL_STREAM = 2  # spawn key of the shell's own random stream, which leaves the fibers' places unchanged
-
 Ints = NDArray[np.int64]
-
-
-def displace_ends(config: layouts.FibersConfig, fibers: Sources) -> Sources:
-    """Displace each fiber's end along the surface's normal by v R, the radius error of a stretched shell.
-
-    v is uniform in +-config.radius_variation, R the end's distance from the bearing; positive is outward. A camera
-    that is r off the center and assumes a perfect dome sees an end displaced by up to (r / R) v rad (JHU/APL's .4 %
-    of 4 ft, 50 mm off: 34"). Normals are unchanged. The random stream is that of config.points.hardware_seed.
-    """
-    rng = random_stream(config.points.hardware_seed, SHELL_STREAM)
-    place_m = fibers.place[:, :3]
-    fraction = config.radius_variation * rng.uniform(-1, 1, len(fibers))
-    offset_m = fraction * np.linalg.norm(place_m, axis=1)
-    moved = place_m - offset_m[:, None] * fibers.normal
-    return dataclasses.replace(fibers, place=np.column_stack([moved, fibers.place[:, 3]]))
 
 
 class PixelBlocks(NamedTuple):

@@ -14,7 +14,7 @@ from skysim.apps.cli.options import complete_scene, complete_study
     ("typed", "completed"),
     [
         ("skysim run ptase", ["ptase_2003"]),
-        ("skysim study run led", ["led_count"]),
+        ("skysim study run led_c", ["led_count"]),
         ("skysim camera imx2", ["imx250", "imx264"]),
         ("skysim camera show imx2", ["imx250", "imx264"]),
         ("skysim camera ne", ["new"]),
@@ -41,4 +41,4 @@ def test_files_and_folders_complete_beside_names(tmp_path: Path, monkeypatch: py
     assert complete_scene("she") == ["shed/", "shefex2", "shefex_mine.yaml"]
     assert complete_scene("shed/") == ["shed/lab.yaml"]
     assert complete_scene("no") == []
-    assert complete_study("led") == ["led_count"]
+    assert complete_study("led_c") == ["led_count"]

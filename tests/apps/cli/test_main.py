@@ -115,6 +115,7 @@ def test_export_writes_a_scene_that_mujoco_s_own_loader_takes(skysim: Skysim, tm
     assert "nothing: no such scene" in skysim("scenes", "export", "nothing").one_line()
 
 
+@pytest.mark.slow
 def test_export_writes_the_list_of_leds_that_a_scene_takes(skysim: Skysim, tmp_path: Path) -> None:
     path = tmp_path / "leds.csv"
     done = skysim("scenes", "export", "afit_simsat", "--out", path)

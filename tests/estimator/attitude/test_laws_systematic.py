@@ -75,6 +75,27 @@ def test_a_rotation_is_found_and_leaves_no_residual(rng: np.random.Generator) ->
     assert (np.diag(products)[1:] <= ((other / sigma[:, None]) ** 2).sum(axis=(1, 2))).all()  # a fit adds no residual
 
 
+@law(systematic.with_focal)
+@given(rng=SEEDS)
+def test_a_fitted_focal_length_takes_a_change_of_scale_to_itself_and_no_rotation(rng: np.random.Generator) -> None:
+    """And the covariances with it are those of the inverse of the whole information, a rotation's block of it."""
+    view, sigma = systematic.geometry(*places(rng)), sigmas(rng)
+    joint = systematic.with_focal(view)
+    scaled = 1e-3 * view.tangent
+    answer = np.einsum("kai,ki->a", systematic.response(joint, sigma), scaled)
+    assert_allclose(answer, [0, 0, 0, 1e-3], rtol=0, atol=1e-9)
+    assert_allclose(systematic.residual_products(joint, sigma, scaled[None]), 0, rtol=0, atol=1e-9)
+    weighted = (joint.jacobian / sigma[:, None, None]).reshape(-1, 4)
+    wanted = np.linalg.inv(weighted.T @ weighted)
+    errors = systematic.isotropic(sigma)
+    found = systematic.from_independent(joint, sigma, errors)
+    assert_allclose(found, wanted, rtol=1e-6, atol=1e-12)
+    plain = systematic.from_independent(view, sigma, errors)
+    total, part = systematic.with_survey(plain, view, sigma, 0 * errors, errors, scaled[None], True)
+    assert_allclose(total, wanted[:3, :3], rtol=1e-6, atol=1e-12)
+    assert_allclose(part, total, rtol=1e-9)
+
+
 @law(systematic.isotropic, systematic.from_independent)
 @given(rng=SEEDS)
 def test_the_weights_own_errors_have_the_inverse_of_the_information(rng: np.random.Generator) -> None:

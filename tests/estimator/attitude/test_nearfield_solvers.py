@@ -150,6 +150,7 @@ def nees(errors: np.ndarray, claimed: np.ndarray) -> np.ndarray:
     return np.einsum("ni,nij,nj->n", errors, np.linalg.inv(claimed), errors)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trials", [400, pytest.param(2000, marks=pytest.mark.long)])
 def test_the_exact_solve_s_covariance_holds_within_ten_per_cent(trials: int) -> None:
     errors, claimed = noise_alone("rotation_only", "measured ellipsoid", 15, trials, seed=75)

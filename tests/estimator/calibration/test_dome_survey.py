@@ -484,7 +484,7 @@ def test_the_three_weak_moves_are_conformal_maps() -> None:
     frames = filmed(rng, turned, place, AFIT_LEVER, AFIT, 0.1, imu_deg=0.0)
     seen = dome_survey._collect(frames, 700)
     whole = dome_survey._start_bundle(frames, leds_of(place), AFIT_LEVER, AFIT, 3)
-    part = dome_survey._connected_subset(whole, seen, np.ones(len(seen.led), dtype=bool))
+    part = dome_survey.connected_subset(whole, seen, np.ones(len(seen.led), dtype=bool))
     terms = ba.normal_equations(part.bundle, part.sightings, np.ones(len(part.index)))
     reduced = ba.eliminate_lights(terms, ba.gauge_freedoms(part.bundle)[1], 0.0)
     spread = ba.cho_solve(reduced.factor, np.diag(reduced.scale)) * reduced.scale[:, None]

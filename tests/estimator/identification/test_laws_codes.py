@@ -40,6 +40,7 @@ def test_a_template_is_the_mean_level_of_an_exposure(rng: np.random.Generator, b
     assert triggered.templates(17, 0.0, 1.0)[1].max() == 0
 
 
+@pytest.mark.slow
 @law(codes.misfits, codes.expected_misfit, codes.likely)
 @given(rng=SEEDS, gross=some.integers(0, 2))
 def test_a_misfit_is_the_least_over_the_brightness(rng: np.random.Generator, gross: int) -> None:

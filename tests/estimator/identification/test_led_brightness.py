@@ -43,7 +43,7 @@ def test_the_evidence_of_a_brightness_is_a_bayes_factor() -> None:
     dome = build_dome_index(grid(LEVELS), LEVER, CAMERA)
     log_flux = np.linspace(np.log(FLUX_S) - 5, np.log(FLUX_S) + 5, 4001)
     rays = np.tile([0.0, 0.0, 1.0], (len(log_flux), 1))
-    detections = search.build_detections(rays, np.full(len(rays), 1e-5), dome, np.exp(log_flux))
+    detections = search.build_detections(rays, np.full(len(rays), 1e-5), dome, flux_s=np.exp(log_flux))
     as_any = np.mean([norm.pdf(log_flux, np.log(flux), SIGMA) for flux in grid(LEVELS).flux_s], axis=0)
     as_any = (1 - STRAY) * as_any + STRAY * STRAY_DENSITY
     np.testing.assert_allclose(detections.light_density, as_any, rtol=1e-9)
@@ -60,7 +60,7 @@ def test_without_brightness_the_evidence_is_that_of_the_places(known: str) -> No
     evidence = interpreted("estimator.identification.leds.evidence")
     dome = build_dome_index(grid(LEVELS if known == "map" else None), LEVER, CAMERA)
     flux_s = np.full(3, FLUX_S) if known == "exposure" else None
-    detections = search.build_detections(CAMERA.rays(np.eye(3, 2) * 100), np.full(3, 1e-5), dome, flux_s)
+    detections = search.build_detections(CAMERA.rays(np.eye(3, 2) * 100), np.full(3, 1e-5), dome, flux_s=flux_s)
     assert evidence.light_dex(detections, dome, 1, 2) == 0.0
 
 

@@ -74,18 +74,37 @@ def test_two_fits_of_the_attitude_come_to_the_truth(axis: tuple[float, float, fl
     assert error < 1e-6
 
 
-def test_the_information_is_that_of_the_projection_s_slopes() -> None:
-    """J' J / sigma^2, J the tangents' derivatives by a rotation of the camera about the bearing, by differences."""
+@pytest.mark.parametrize("uncertainty", [0.0, 0.1])
+def test_the_information_is_that_of_the_projection_s_slopes(uncertainty: float) -> None:
+    """J' J / sigma^2, J the tangents' derivatives by a rotation of the camera about the bearing, by differences.
+
+    And by the logarithm of the focal length, if that is uncertain.
+    """
     dome, detections, R_cam_from_lab = wide_field(Rotation.from_euler("xyz", [5, -8, 30], degrees=True))
     rows, step = np.arange(6), 1e-6
 
-    def tangents(rotvec: Floats) -> Floats:
-        q = dome.position_m @ (Rotation.from_rotvec(rotvec).as_matrix() @ R_cam_from_lab).T - dome.pupil_m
-        return (q[:, :2] / q[:, 2:]).ravel()
+    def tangents(change: Floats) -> Floats:
+        q = dome.position_m @ (Rotation.from_rotvec(change[:3]).as_matrix() @ R_cam_from_lab).T - dome.pupil_m
+        return 1.07 * np.exp(change[3]) * (q[:, :2] / q[:, 2:]).ravel()
 
-    slopes = np.array([(tangents(step * e) - tangents(-step * e)) / (2 * step) for e in np.eye(3)])
-    info = evidence._fit(detections, dome, R_cam_from_lab.copy(), rows, rows)
+    unknowns = np.eye(4)[: 4 if uncertainty else 3]
+    slopes = np.array([(tangents(step * e) - tangents(-step * e)) / (2 * step) for e in unknowns])
+    detections = detections._replace(focal_uncertainty=uncertainty)
+    info, _ = evidence._fit(detections, dome, R_cam_from_lab.copy(), 1.07, rows, rows)
     np.testing.assert_allclose(info, slopes @ slopes.T / 0.01**2, rtol=0, atol=1e-7 * np.abs(info).max())
+
+
+@pytest.mark.slow
+def test_two_fits_of_attitude_and_focal_length_come_to_the_truth() -> None:
+    """Tangents of a lens 8 % longer than assumed; the start is 0.3 deg and 1 % off."""
+    dome, detections, R_cam_from_lab = wide_field(Rotation.from_euler("xyz", [5, -8, 30], degrees=True))
+    zoomed = detections._replace(tangent=1.08 * detections.tangent, focal_uncertainty=0.1)
+    off = Rotation.from_rotvec(np.radians([0.2, -0.1, 0.2])).as_matrix() @ R_cam_from_lab
+    hypothesis = evidence.evaluate(zoomed, dome, off, 0, 0, 3, 1.07)
+    assert len(hypothesis.star) == 6
+    assert Rotation.from_matrix(hypothesis.R_cam_from_lab @ R_cam_from_lab.T).magnitude() < 1e-5
+    beyond = zoomed._replace(focal_uncertainty=0.05)  # to 6 % at most
+    assert evidence.evaluate(beyond, dome, off.copy(), 0, 0, 3, 1.07).dex == -np.inf
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from estimator.core.types import Centroids, StarMatch
 from estimator.identification.leds import search
 from estimator.identification.leds.index import DomeIndex, build_dome_index
 from estimator.trackers.dome_tracker import DomeTracker
+from estimator.trackers.pipeline import Settings
 
 # AFIT's SimSat focused on its LEDs at 33 in; the camera is a little askew.
 CAMERA = Camera(1600, 1200, 8698.0, (799.5, 599.5))
@@ -333,7 +334,26 @@ def test_the_quick_check_counts_until_it_knows(dead: list[int], required: int, f
     rays = camera.rays(project(Rotation.identity(), position_m, lever, camera))
     detections = search.build_detections(rays, np.full(5, 1e-5), dome)
     gates, R_grid_from_cam = np.full(5, 1e-4), dome.grid.R_grid_from_lab
-    assert PLAIN._quick_check(detections, dome, R_grid_from_cam, dome.median_radius_m, 0, 1, gates, required) == found
+    median_m = dome.median_radius_m
+    assert PLAIN._quick_check(detections, dome, R_grid_from_cam, 1.0, median_m, 0, 1, gates, required) == found
+    zoomed = search.build_detections(camera.zoomed(1 / 1.08).rays(camera.pixels(rays)), np.full(5, 1e-5), dome, 0.1)
+    assert PLAIN._quick_check(zoomed, dome, R_grid_from_cam, 1.08, median_m, 0, 1, gates, required) == found
+    if found > 2:
+        assert PLAIN._quick_check(zoomed, dome, R_grid_from_cam, 1.0, median_m, 0, 1, gates, required) < found
+
+
+@pytest.mark.parametrize("ratio", [0.89, 1.0, 1.11])
+def test_a_pair_tells_the_focal_length_at_which_it_is_two_leds(ratio: float) -> None:
+    """At the exact chord, radii of 1.1 m and 1.3 m; the error left by three iterations is below 1e-6."""
+    rays = CAMERA.rays(np.array([[100.0, 300.0], [1500.0, 900.0]]))
+    dome = build_dome_index(spread(60, OVAL, seed=1), LEVER, CAMERA)
+    ends = [np.array(PLAIN._direction_from_bearing(*one)) for one in ((rays[0], dome, 1.1), (rays[1], dome, 1.3))]
+    pixels = CAMERA.pixels(rays)
+    seen = search.build_detections(CAMERA.zoomed(1 / ratio).rays(pixels), np.full(2, 1e-5), dome, 0.12)
+    chord = float(np.linalg.norm(ends[0] - ends[1]))
+    assert PLAIN._fit_focal_ratio(seen, dome, 0, 1, 1.1, 1.3, chord) == pytest.approx(ratio, abs=1e-6)
+    known = seen._replace(focal_uncertainty=0.0)
+    assert PLAIN._fit_focal_ratio(known, dome, 0, 1, 1.1, 1.3, chord) == 1
 
 
 def test_a_second_pair_is_the_first_that_shares_the_fewest_detections_with_the_best() -> None:
@@ -358,3 +378,82 @@ def test_a_pair_s_attitude_is_worth_its_volume_among_all_attitudes() -> None:
     covariance = np.diag([across, across, np.sqrt(2) * detections.sigma.min() / apart]) ** 2
     wanted = np.log10(np.sqrt(np.linalg.det(2 * np.pi * covariance)) / dome.prior_volume)
     assert PLAIN._attitude_dex(detections, dome, 0, 1) == pytest.approx(wanted, abs=1e-9)
+    # A length errs relatively as a direction does; a uniform prior of the focal length over +-12 %.
+    focal = np.log10(np.sqrt(2 * np.pi) * np.sqrt(covariance[2, 2]) / 0.24)
+    uncertain = detections._replace(focal_uncertainty=0.12)
+    assert PLAIN._attitude_dex(uncertain, dome, 0, 1) == pytest.approx(wanted + focal, abs=1e-9)
+
+
+# ---- a focal length that is known to a tenth
+
+
+def uncalibrated(leds: LedMap, ratio: float) -> DomeTracker:
+    """A tracker that assumes a focal length `ratio` times too short, and knows no better."""
+    settings = Settings(identifier="non_dimensional", solver="rotation_only", centroid_sigma_px=NOISE_PX)
+    return DomeTracker(CAMERA.zoomed(1 / ratio), leds, LEVER, settings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("error_m", "surface_m", "least"), [(0.2e-3, 0.0, 0.98), (1e-3, 0.0, 0.7), (3e-2, 0.0, 0.0), (0.2e-3, 3e-2, 0.95)]
+)
+def test_an_unknown_focal_length_is_found_with_the_attitude_or_nothing_is(
+    error_m: float, surface_m: float, least: float
+) -> None:
+    """Every answer has the right LEDs; attitude and focal length err as claimed (chi-square of 3 and of 1).
+
+    surface_m : an error that all LEDs share, along the normals, whose scale goes into the focal length
+    """
+    rng, truth, tries = np.random.default_rng(20), spread(1400, OVAL, 21), 60 if error_m < 1e-2 else 5
+    nees, focal = [], []
+    for n in range(tries):
+        if n % 3 == 0:
+            outward = (truth.position_m - truth.center_m) / truth.semi_axes_m**2
+            shift_m = surface_m * outward / np.linalg.norm(outward, axis=1, keepdims=True)
+            believed_m = truth.position_m + error_m * rng.standard_normal(truth.position_m.shape)
+            believed_m += rng.standard_normal() * shift_m
+            leds = replace(truth, position_m=believed_m, sigma_m=error_m, common_m=shift_m[None] if surface_m else None)
+            tracker = uncalibrated(leds, 1 + rng.uniform(-0.1, 0.1))
+        body_from_lab = pose(rng, 25)
+        pixels, names = lights(truth, body_from_lab, rng)
+        answer = tracker.solve_centroids(Centroids(pixels, np.full(len(pixels), 1e-3), np.ones(len(pixels))))
+        if answer.solved:
+            assert np.array_equal(names[answer.match.observed], answer.match.star)
+            error = (answer.cam_from_ref * (LEVER.cam_from_body * body_from_lab).inv()).as_rotvec()
+            nees.append(error @ np.linalg.solve(answer.covariance_rad2, error))
+            focal.append((answer.camera.focal_px / CAMERA.focal_px - 1) / answer.camera.focal_sigma)
+    assert len(nees) >= least * tries
+    if nees:
+        # Frames in threes share a map's errors, in other fields of it, but the surface's in all.
+        draws = len(nees) / 3 if surface_m else len(nees)
+        assert np.mean(nees) == pytest.approx(3, abs=4 * np.sqrt(6 / draws))
+        assert np.mean(np.square(focal)) == pytest.approx(1, abs=4 * np.sqrt(2 / draws))
+
+
+@pytest.mark.slow
+def test_a_calibrated_tracker_finds_nothing_at_a_focal_length_ten_percent_off() -> None:
+    """What the search with a free focal length is for: the angles of all pairs are wrong."""
+    truth, rng = spread(1400, OVAL, 21), np.random.default_rng(22)
+    leds, solved = surveyed(truth, 23), []
+    for identifier in ("led_pairs", "non_dimensional"):
+        settings = Settings(identifier=identifier, solver="rotation_only", centroid_sigma_px=NOISE_PX)
+        tracker = DomeTracker(CAMERA.zoomed(1.1), leds, LEVER, settings)
+        seen = [lights(truth, pose(rng, 25), rng)[0] for _ in range(10)]
+        answers = [tracker.solve_centroids(Centroids(one, np.full(len(one), 1e-3), np.ones(len(one)))) for one in seen]
+        solved.append(sum(answer.solved for answer in answers))
+    assert solved[0] == 0
+    assert solved[1] >= 9
+
+
+@pytest.mark.long
+def test_lights_that_fell_anywhere_have_no_attitude_at_any_focal_length() -> None:
+    """As for a calibrated camera: evidence of x powers of ten is met in one frame of 10^x at most."""
+    dome = build_dome_index(surveyed(spread(1400, OVAL, 6), 7), LEVER, CAMERA.zoomed(0.88))
+    rng, dex = np.random.default_rng(8), []
+    for _ in range(200):
+        rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (8, 2)))
+        fallen = search.build_detections(rays, np.full(8, NOISE_PX / CAMERA.focal_px), dome, 0.12)
+        best, _ = search._search(fallen, dome, 10**7)
+        dex.append(best.dex)
+    assert np.mean(np.array(dex) > 1) <= 0.1 + 3 * np.sqrt(0.09 / 200)
+    assert max(dex) < search.ACCEPT_DEX

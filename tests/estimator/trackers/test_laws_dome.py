@@ -103,6 +103,20 @@ def test_exact_solves_find_the_truth(rng: np.random.Generator, count: int, off_r
     assert_covariance(covariance)
 
 
+@law(nearfield.fit_focal_ratio)
+@given(rng=SEEDS, count=some.integers(4, 20), ratio=some.floats(0.85, 1.15), sigma=some.floats(1e-5, 1e-2))
+def test_a_focal_length_is_fitted_with_the_attitude(
+    rng: np.random.Generator, count: int, ratio: float, sigma: float
+) -> None:
+    """Exactly from exact rays, from 2 deg off, whatever the error that all rays have."""
+    arm, truth = lever(rng), turn(rng, 0.4)
+    leds, rays = seen_through(rng, OVAL, arm, truth, count)
+    seen = CAMERA.zoomed(1 / ratio).rays(CAMERA.pixels(rays))
+    start = turn(rng, 0.035) * truth
+    found = nearfield.fit_focal_ratio(seen, np.full(count, sigma), leds.position_m, arm, start)
+    assert found == pytest.approx(ratio, abs=1e-9)
+
+
 @law(nearfield.fitted_sigma_rad)
 @given(rng=SEEDS, name=some.sampled_from(sorted(SOLVERS)))
 def test_the_error_of_what_is_fitted_is_that_of_a_shifted_pixel(rng: np.random.Generator, name: str) -> None:
@@ -190,6 +204,29 @@ def test_no_lights_of_noise_have_an_attitude_under_a_dome(
     answered(lambda: eye.solve(xy_px), ImageError)
     identify = dome_tracker.star_identifier(name, CAMERA, eye.leds, eye.lever, eye.settings)
     assert isinstance(answered(lambda: identify(CAMERA.rays(xy_px), sigma)) or "refused", str)
+
+
+@law(dome_tracker.non_dimensional)
+@given(rng=SEEDS, ratio=some.floats(0.9, 1.1), false=some.integers(0, 3))
+def test_leds_are_named_rightly_at_any_focal_length_or_not_at_all(
+    eye: DomeTracker, rng: np.random.Generator, ratio: float, false: int
+) -> None:
+    truth, settings = turn(rng, 0.3), replace(eye.settings, identifier="non_dimensional")
+    px = np.nan_to_num(dome_map.project(truth, eye.leds.position_m, eye.lever, CAMERA), nan=-1e9)
+    star = np.flatnonzero(CAMERA.contains(px, 3))
+    xy = np.concatenate([px[star] + rng.normal(0, 0.1, (len(star), 2)), rng.uniform(0, [639, 479], (false, 2))])
+    star = np.concatenate([star, np.full(false, -1)])
+    camera = CAMERA.zoomed(1 / ratio)
+    identify = dome_tracker.non_dimensional(camera, eye.leds, eye.lever, settings)
+    match = identify(camera.rays(xy), np.full(len(xy), 1e-4))
+    named = np.zeros((0, 2), int) if isinstance(match, str) else np.column_stack([star[match.observed], match.star])
+    assert all(seen in (led, -1) for seen, led in named)
+    solved = DomeTracker(camera, eye.leds, eye.lever, settings).solve_centroids(
+        Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy)))
+    )
+    truth_cam = eye.lever.cam_from_body * truth
+    assert not solved.solved or (solved.cam_from_ref * truth_cam.inv()).magnitude() < 0.01
+    assert not solved.solved or abs(solved.camera.focal_px / CAMERA.focal_px - 1) < 0.01
 
 
 @law(DomeTracker.warm_up, slow=True)

@@ -63,7 +63,7 @@ def test_right_model_keeps_its_covariance(tracker: StarTracker) -> None:
     assert stats.kstest(nees, stats.chi2(3).cdf).pvalue > 1e-3
 
 
-@pytest.mark.parametrize("times", [2, 3, 5])
+@pytest.mark.parametrize("times", [3, *(pytest.param(times, marks=pytest.mark.slow) for times in (2, 5))])
 def test_noise_that_is_claimed_too_small_is_found(tracker: StarTracker, times: int) -> None:
     assert 2 < errors_squared(tracker, CAMERA, 1 / times).mean() < 4.5
 

@@ -289,6 +289,7 @@ def test_a_rounding_error_of_zero_is_zero() -> None:
     assert format_summary(Summary(4.5e-8, 3e-13, 4.6e-3, 9)) == "4.5e-08 (0..0.0046)"
 
 
+@pytest.mark.slow
 def test_findings_of_many_levels_are_few(tmp_path: Path) -> None:
     """Three widths of LEDs, all of them too wide: one warning, not three that differ in their numbers."""
     sizes = {"key": "light.led.disk_diameter", "values": ["20 mm", "25 mm", "30 mm"]}

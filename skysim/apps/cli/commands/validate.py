@@ -56,7 +56,7 @@ def validate(
 ) -> None:
     """Check files: keys, units, consistency, and whether a scene can be set up. Exit code 2 if one is invalid."""
     if schema is not None:
-        from skysim.apps.cli.commands import json_schema
+        from skysim.apps.cli import json_schema
 
         if schema not in KINDS:
             raise InputError(f"--schema {schema}: allowed: {', '.join(KINDS)}")

@@ -23,7 +23,7 @@ from estimator.identification.published.master_star import master_star
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments import dome_survey
+from skysim.experiments.dome_survey.frames import detect_lights
 from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, with_cause
 from skysim.experiments.papers.intervals import bootstrap_interval
 from skysim.results.metrics import Summary, proportion
@@ -95,7 +95,7 @@ def rays_body(testbed: Testbed, seed: int) -> Floats:
     """(N, 3) unit vectors in body axes to the stars of one frame from the level vehicle, brightest first."""
     frame, _ = exposure.render_frame(testbed.in_run(seed), 0)
     camera = onboard_model.assumed_camera(testbed.scene)
-    lights = dome_survey.detect_lights(settings.assumed_settings(testbed.scene), camera, frame.image_dn)
+    lights = detect_lights(settings.assumed_settings(testbed.scene), camera, frame.image_dn)
     return testbed.mount.cam_from_body.inv().apply(camera.rays(lights.xy_px))
 
 

@@ -21,7 +21,7 @@ from estimator.trackers.pipeline import Settings
 from skysim.core.paths import CATALOGS
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.dome_survey import detect_lights
+from skysim.experiments.dome_survey.frames import detect_lights
 from skysim.experiments.study.execution import detections
 from skysim.results.metrics import Summary
 from skysim.results.plots import INK, MARKS

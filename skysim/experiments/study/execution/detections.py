@@ -66,11 +66,8 @@ def simulate_detections(
     """
     # Draw noise for all sources, also the missing ones, so that the stream does not depend on which are missing.
     detected = np.flatnonzero(rng.random(len(xy_px)) >= trial.missing)
-    flux = (
-        electrons
-        / scene.camera.detector.gain_e_dn
-        * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
-    )
+    flux = electrons / scene.camera.detector.gain_e_dn
+    flux = flux * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
     xy_px = xy_px + trial.noise_px * rng.standard_normal(xy_px.shape)
     detected = detected[np.argsort(-flux[detected], kind="stable")][: trial.lights]
     false = trial.false_lights + round(len(detected) * trial.false_share / (1 - trial.false_share))

@@ -16,7 +16,8 @@ from skysim.sources.dome.led import full_strength_e_s_sr
 from skysim.sources.dome.shell.surface import Surface, build_surface
 from skysim.sources.photometry import Band
 
-BUILT = "glue_scatter_m", "glue_tilt_deg", "pitch_error"  # errors of a layout as built
+BUILT = {"glue_scatter_m": 0.0, "glue_tilt_deg": 0.0, "pitch_error": 0.0}  # errors of a layout as built
+AIMED = {"aiming": None, "radius_variation": 0.0}  # and of places that a laser marks
 HEADER = """\
 # LEDs of {name}: x_m, y_m, z_m from the center of the bearing in the lab (z up); azimuth from +x toward +y, and tilt
 # from the zenith, seen from there; level: nominal brightness, 1 at the full drive{tape}.
@@ -54,9 +55,9 @@ def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:
 
 
 def design_leds(config: DomeConfig, surface: Surface, band: Band) -> Sources:
-    """The LEDs of a dome as designed: without their scatter, and without errors of the glue and of the tape."""
-    errors = {key: 0.0 for key in BUILT if hasattr(config.layout, key)}
-    layout = config.layout.model_copy(update=errors)
+    """The LEDs of a dome as designed: without their scatter, and without errors of glue, tape and laser."""
+    errors = AIMED if getattr(config.layout, "aiming", None) else BUILT
+    layout = config.layout.model_copy(update={key: none for key, none in errors.items() if hasattr(config.layout, key)})
     return LAYOUTS[layout.kind](layout, surface, ideal_led(config.led), band)
 
 

@@ -18,6 +18,7 @@ from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome import celestial as celestial_dome
 from skysim.sources.dome import display
 from skysim.sources.dome.layouts.boards import patch_boards
+from skysim.sources.dome.layouts.fibers import displace_ends
 from skysim.sources.dome.layouts.geodesic import geodesic
 from skysim.sources.dome.layouts.listed import listed
 from skysim.sources.dome.layouts.placing import Ints, PlacedLeds, led_sources
@@ -40,8 +41,8 @@ def celestial(config: CelestialConfig, surface: Surface, led: LedConfig, band: B
 
 
 def fibers(config: FibersConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
-    """Ends of optical fibers at another layout's points, with the shell's radius error: `display.displace_ends`."""
-    return display.displace_ends(config, LAYOUTS[config.points.kind](config.points, surface, led, band))
+    """Ends of optical fibers at another layout's points, with the errors of shell and holes: `displace_ends`."""
+    return displace_ends(config, surface, LAYOUTS[config.points.kind](config.points, surface, led, band))
 
 
 def lcd(config: LcdConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:

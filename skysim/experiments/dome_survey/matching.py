@@ -1,4 +1,4 @@
-"""Identification of the LEDs in the frames of a dome survey, and the prior model that it uses.
+"""Identification of the LEDs in the frames of a dome survey.
 
 The error of the IMU attitude shifts all lights of a frame together by more than the LED spacing. So `match_by_imu`
 first finds the most likely common shift, the minimum over candidate shifts t of
@@ -8,70 +8,20 @@ adjustment the predictions are good, and `match_by_survey` assigns directly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
-from estimator.attitude.dome_map import LedMap, Lever
-from estimator.core.camera import Camera
-from estimator.core.types import Centroids
 from skysim.core.types import Floats
+from skysim.experiments.dome_survey.frames import SurveyFrame
+from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty
 
 Ints = NDArray[np.int64]
 GATE_SIGMAS = 3.5  # sigmas of a two-dimensional error; Gaussian noise exceeds it once in 450
 ANCHOR_LIGHTS = 10  # number of central lights that are paired with every LED to find the common shift
-
-
-@dataclass(frozen=True, slots=True)
-class SurveyUncertainty:
-    """Uncertainty before the survey: standard deviations per axis, and a focal length error.
-
-    imu_sigma_rad : attitude from the IMU at each frame;  led_sigma_m : position of each LED
-    lever_sigma_m : position of the camera in the body;  focal_error : relative error of the assumed focal length
-    """
-
-    imu_sigma_rad: float
-    led_sigma_m: float
-    lever_sigma_m: float
-    focal_error: float
-
-
-@dataclass(frozen=True, slots=True)
-class CalibrationPrior:
-    """Assumed model of dome and camera, before a survey or from it.
-
-    floor_px : added in quadrature to each centroid's sigma, for errors that its noise does not cover
-    """
-
-    camera: Camera
-    leds: LedMap
-    lever: Lever
-    floor_px: float
-
-    @property
-    def px_per_m(self) -> float:
-        """Image scale in pixels per meter perpendicular to the line of sight, at the least distance of an LED."""
-        nearest_m = np.linalg.norm(self.leds.position_m, axis=1).min()
-        return float(self.camera.focal_px / (nearest_m - np.linalg.norm(self.lever.camera_body_m)))
-
-    def pixels(self, body_from_lab: Rotation) -> Floats:
-        """(N, 2) pixel positions of the LEDs; a value far outside the image for LEDs behind the camera."""
-        in_body = body_from_lab.apply(self.leds.position_m) - self.lever.camera_body_m
-        xy_px = self.camera.pixels(self.lever.cam_from_body.apply(in_body))
-        return np.nan_to_num(xy_px, nan=-1e9)
-
-
-@dataclass(frozen=True, slots=True)
-class SurveyFrame:
-    """One frame of a survey: its detections, and the vehicle's attitude from the IMU or a previous adjustment."""
-
-    lights: Centroids
-    body_from_lab: Rotation
 
 
 class Correspondences(NamedTuple):

@@ -1,0 +1,199 @@
+"""Plan of a dome survey: the errors that a set of attitudes will leave, and the attitudes that leave the smallest.
+
+The errors are those of the inverse normal matrix of the bundle adjustment (`bundle_adjustment`) at the assumed model:
+the Cramer-Rao bound of an unbiased survey with the start map as a measurement. No frame is needed, only which LEDs
+each attitude shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, project
+from estimator.calibration import bundle_adjustment as ba
+from estimator.calibration.bundle_adjustment import Bundle, Sightings
+from estimator.calibration.dome_survey import connected_subset
+from estimator.core.arrays import Floats, Ints
+from estimator.core.camera import Camera
+
+Mask = NDArray[np.bool_]
+MIN_SHARED = 8  # LEDs that an attitude shares with those before it
+ATTITUDE_SIGMA_RAD = 0.05  # of an attitude before its frame is adjusted: next to nothing is known
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyModel:
+    """What is assumed before a survey, or known from one so far.
+
+    sigma_px     : standard deviation of a centroid's coordinates
+    leds_sigma_m : standard deviation of the LEDs' assumed places about each axis
+    """
+
+    camera: Camera
+    leds: LedMap
+    lever: Lever
+    sigma_px: float
+    leds_sigma_m: float
+
+    def __post_init__(self) -> None:
+        check_map(self.leds)
+        check_lever(self.leds, self.lever)
+        for name in ("sigma_px", "leds_sigma_m"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"survey: {name} is {getattr(self, name)}; allowed: finite, above 0")
+
+    def visible(self, body_from_lab: Rotation, margin_px: float = 0.0) -> Mask:
+        """(F, N) LEDs on the chip at each of F attitudes, at least `margin_px` from its edge."""
+        rows = [project(one, self.leds.position_m, self.lever, self.camera) for one in body_from_lab]
+        return np.array([self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), margin_px) for xy_px in rows])
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyAccuracy:
+    """Standard deviations that a survey leaves, or will leave.
+
+    measured       : (N,) LEDs that are surveyed
+    led_sigma_m    : (N,) rms of the three axes; the map's for LEDs that are not measured
+    lever_sigma_m  : (3,);  lens_sigma : of focal_px, center x and y, and of k1, k2, p1, p2 if they are fitted
+    """
+
+    measured: Mask
+    led_sigma_m: Floats
+    lever_sigma_m: Floats
+    lens_sigma: Floats
+
+    @property
+    def led_rms_m(self) -> float:
+        """Root mean square of the errors of the measured LEDs along an axis."""
+        return float(np.sqrt(np.mean(self.led_sigma_m[self.measured] ** 2)))
+
+
+def predict(model: SurveyModel, body_from_lab: Rotation, seen: Mask, free_lens: int = 3) -> SurveyAccuracy:
+    """The errors that a survey will leave, from the Fisher information of the LEDs seen (F, N) at F attitudes.
+
+    free_lens : number of lens elements that it fits: 3, or 7 with the distortion
+    Raises ValueError if the attitudes do not determine the unknowns.
+    """
+    bundle, sightings = _bundle(model, body_from_lab, seen, free_lens)
+    subset = connected_subset(bundle, sightings, np.ones(len(sightings.led), dtype=bool))
+    terms = ba.normal_equations(subset.bundle, subset.sightings, np.ones(len(subset.index)))
+    try:
+        covariance = ba.covariance(terms, subset.bundle)
+    except LinAlgError:
+        raise ValueError("survey: the attitudes do not determine the unknowns; take more of them") from None
+    measured = np.zeros(len(bundle.position_m), dtype=bool)
+    measured[subset.led] = True
+    led_sigma_m = np.full(len(measured), model.leds_sigma_m)
+    led_sigma_m[subset.led] = np.sqrt(np.einsum("nii->n", covariance.by_led) / 3)
+    shared = np.sqrt(np.diag(covariance.shared))
+    return SurveyAccuracy(measured, led_sigma_m, shared[:3], shared[3:])
+
+
+def _bundle(model: SurveyModel, body_from_lab: Rotation, seen: Mask, free_lens: int) -> tuple[Bundle, Sightings]:
+    """The assumed model as a bundle, with sightings exactly where it predicts them."""
+    camera, lever, position_m = model.camera, model.lever, model.leds.position_m
+    lens = np.array([camera.focal_px, *camera.center_px, *camera.distortion])
+    matrices = body_from_lab.as_matrix().reshape(-1, 3, 3), lever.cam_from_body.as_matrix()
+    arm_m = np.array(lever.camera_body_m)
+    bundle = Bundle(position_m, matrices[0], arm_m, matrices[1], lens, free_lens, position_m, model.leds_sigma_m)
+    frame, led = np.nonzero(seen)
+    sightings = Sightings(frame, led, np.zeros((len(led), 2)), np.full(len(led), model.sigma_px))
+    xy_px = -ba.residuals(bundle, sightings) * model.sigma_px
+    return bundle, Sightings(frame, led, xy_px, sightings.sigma_px)
+
+
+def choose(
+    model: SurveyModel,
+    candidates: Rotation,
+    shown: Mask,
+    count: int,
+    held: Rotation | None = None,
+    seen: Mask | None = None,
+) -> list[int]:
+    """Rows of up to `count` candidate attitudes to hold next, the most useful first.
+
+    candidates, shown : C attitudes body_from_lab, and the (C, N) LEDs that each shows
+    held, seen        : F attitudes of frames taken before, and the (F, N) LEDs identified in them
+
+    Greedy: each attitude is the one that most reduces the sum of the variances of all LEDs, the unseen ones included
+    (A-optimality: Pukelsheim 2006, Optimal Design of Experiments, chapter 6). With P_i the covariance of LED i, B_i its
+    2 x 3 rows of the Jacobian and A those of the attitude, the reduction is the sum over i of tr(P_i B_i' W_ii B_i
+    P_i), W = (B P B' + s^2 A A' + I)^-1. Correlations between LEDs are left out, which is thirty times faster and no
+    worse: 40 attitudes under a dome of 390 LEDs leave 0.66 mm rms, against 0.69 mm with all correlations. An attitude
+    must share MIN_SHARED LEDs with those before it, if any does, so that the frames are connected at any time. The
+    reductions hardly grow from choice to choice, so that a candidate is evaluated again only while its last value is
+    above the best (lazy greedy: Minoux 1978).
+    """
+    if np.shape(shown) != (len(candidates), len(model.leds.id)):
+        raise ValueError(f"survey: shown has shape {np.shape(shown)}; allowed: {len(candidates), len(model.leds.id)}")
+    blocks = np.tile(np.eye(3) * model.leds_sigma_m**2, (len(model.leds.id), 1, 1))
+    covered: Mask = np.zeros(len(blocks), dtype=bool)
+    if held is not None and seen is not None:
+        for row in _rows(model, held, seen):
+            blocks[row.led] -= _reduction(row, blocks)
+        covered = np.asarray(seen.any(axis=0))
+    rows = _rows(model, candidates, shown)
+    bound = np.array([np.inf if len(row.led) >= MIN_SHARED else 0.0 for row in rows])
+    chosen: list[int] = []
+    while len(chosen) < count:
+        shared = (shown & covered).sum(axis=1) if covered.any() else shown.sum(axis=1)
+        best = _best(rows, blocks, bound, shared >= min(MIN_SHARED, shared[bound > 0].max(initial=0)))
+        if best is None:
+            break
+        blocks[rows[best].led] -= _reduction(rows[best], blocks)
+        covered |= shown[best]
+        chosen.append(best)
+    return chosen
+
+
+def _best(rows: Sequence[_Row], blocks: Floats, bound: Floats, allowed: Mask) -> int | None:
+    """The allowed candidate of the greatest reduction, None if none has any; updates the bounds of those evaluated."""
+    best, greatest = None, 0.0
+    for k in np.argsort(-bound, kind="stable").tolist():
+        if bound[k] <= greatest:
+            break
+        if not allowed[k]:
+            continue
+        bound[k] = np.einsum("kii->", _reduction(rows[k], blocks))
+        if bound[k] > greatest:
+            best, greatest = k, float(bound[k])
+    return best
+
+
+class _Row(NamedTuple):
+    """Derivatives of the pixels of one attitude, divided by sigma_px: led (K,), by_led and by_rotation (K, 2, 3)."""
+
+    led: Ints
+    by_led: Floats
+    by_rotation: Floats
+
+
+def _rows(model: SurveyModel, body_from_lab: Rotation, shown: Mask) -> list[_Row]:
+    bundle, sightings = _bundle(model, body_from_lab, shown, 3)
+    terms = ba.linearize(bundle, sightings)
+    ends = np.cumsum(np.sum(shown, axis=1))[:-1]
+    return [
+        _Row(*parts)
+        for parts in zip(
+            *(np.split(one, ends) for one in (sightings.led, terms.by_led, terms.by_rotation)), strict=True
+        )
+    ]
+
+
+def _reduction(row: _Row, blocks: Floats) -> Floats:
+    """(K, 3, 3) by which the covariances of the LEDs of an attitude shrink."""
+    count = len(row.led)
+    gain = row.by_led @ blocks[row.led]  # B P
+    turned = ATTITUDE_SIGMA_RAD * row.by_rotation.reshape(-1, 3)
+    matrix = turned @ turned.T + np.eye(2 * count)
+    own = np.arange(2 * count).reshape(count, 2)
+    matrix[own[:, :, None], own[:, None, :]] += np.einsum("kaj,kbj->kab", gain, row.by_led)
+    weight = np.linalg.inv(matrix)[own[:, :, None], own[:, None, :]]
+    return np.asarray(np.einsum("kai,kab,kbj->kij", gain, weight, gain))

@@ -1,0 +1,317 @@
+"""Command `skysim survey`: plan the survey of a dome, simulate it, or make it from images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from skysim.apps.cli import survey_summary
+from skysim.apps.cli.options import Json, Out, Overrides, SceneArg, Seed, load, output_folder
+from skysim.apps.cli.terminal import print_json, progress, progress_callback
+from skysim.core.errors import InputError
+
+if TYPE_CHECKING:
+    from estimator.core.camera import Camera
+    from skysim.experiments.dome_survey.adjust import SurveyRun
+    from skysim.experiments.dome_survey.findings import Coverage
+    from skysim.experiments.dome_survey.frames import SurveyFrame
+    from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty
+    from skysim.scene.scene import Scene
+    from skysim.simulation.testbed import Testbed
+
+FRAMES, NEXT, CHECKS = 150, 12, 40
+
+
+class Attitudes(StrEnum):
+    """How the attitudes of a survey are chosen."""
+
+    PLAN = "plan"
+    RANDOM = "random"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the command line asks for."""
+
+    scene: Scene
+    uncertainty: SurveyUncertainty
+    folder: Path
+    tilt_deg: float
+    attitudes: str
+    frames: int
+    distortion: bool
+    next_stops: int
+
+
+def survey(
+    scene: SceneArg,
+    frames: Annotated[
+        int | None, typer.Option(min=2, help=f"Number of attitudes, with one frame at each; default: {FRAMES}.")
+    ] = None,
+    plan: Annotated[
+        bool, typer.Option("--plan", help="Print the attitudes to hold and the predicted errors; simulate nothing.")
+    ] = False,
+    images: Annotated[
+        Path | None,
+        typer.Option(help="Survey from the images of a folder, with the IMU's attitudes in its attitudes.csv if any."),
+    ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(help="Camera of the images: a scene (file or name), camera file or OpenCV calibration."),
+    ] = None,
+    repeat: Annotated[
+        int | None, typer.Option(min=2, help="Simulate so many surveys, and compare their errors with the prediction.")
+    ] = None,
+    attitudes: Annotated[Attitudes | None, typer.Option(help="Attitudes: by the plan (default), or random.")] = None,
+    next_: Annotated[
+        int | None, typer.Option("--next", min=1, help=f"Number of attitudes to propose next; default: {NEXT}.")
+    ] = None,
+    frames_to: Annotated[
+        Path | None, typer.Option(help="Write the simulated frames and attitudes to a folder, for --images.")
+    ] = None,
+    seed: Seed = None,
+    out: Out = None,
+    set_: Overrides = None,
+    tilt: Annotated[float, typer.Option(help="Maximum tilt of the attitudes, degrees.")] = 25.0,
+    imu_sigma: Annotated[str, typer.Option(help="Standard error of the IMU's attitude about each axis.")] = "0.5 deg",
+    led_sigma: Annotated[
+        str, typer.Option(help="Standard error of an LED's assumed position along each axis.")
+    ] = "2 mm",
+    lever_sigma: Annotated[str, typer.Option(help="Standard error of the camera's assumed position.")] = "5 mm",
+    focal_error: Annotated[str, typer.Option(help="Error of the assumed focal length.")] = "1%",
+    distortion: Annotated[bool, typer.Option("--distortion", help="Also fit the distortion k1, k2, p1, p2.")] = False,
+    checks: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help=f"Further attitudes at which the tracker is tested before and after; default: {CHECKS}."
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Survey a dome from frames at many attitudes: LED positions, lever arm and lens, to a file for `tracker.map`.
+
+    It says which attitudes to hold, what they will reach, which LEDs are measured, and which are dark, displaced or
+    exchanged.
+    """
+    from skysim.experiments.dome_survey.prior import survey_uncertainty
+
+    given = {"frames": frames, "attitudes": attitudes, "next": next_, "frames-to": frames_to, "checks": checks}
+    mode = survey_mode(plan, images, camera, repeat, {name for name, value in given.items() if value is not None})
+    loaded = load(scene, None, seed, set_)
+    request = Request(
+        loaded,
+        survey_uncertainty(imu_sigma, led_sigma, lever_sigma, focal_error),
+        output_folder(out, loaded.name),
+        tilt,
+        (attitudes or Attitudes.PLAN).value,
+        frames or FRAMES,
+        distortion,
+        next_ or NEXT,
+    )
+    if images is not None and camera is not None:
+        statistics = from_images(request, images, camera)
+    elif plan:
+        statistics = plan_only(request)
+    elif repeat:
+        statistics = repeated(request, repeat)
+    else:
+        statistics = simulated(request, checks or CHECKS, frames_to)
+    if json:
+        print_json(statistics)
+    else:
+        survey_summary.PRINTERS[mode](statistics)
+
+
+# What each mode of the command does not use.
+UNUSED = {
+    "images": ("frames", "attitudes", "frames-to", "checks"),
+    "plan": ("next", "frames-to", "checks"),
+    "repeat": ("next", "frames-to", "checks"),
+    "simulate": (),
+}
+
+
+def survey_mode(plan: bool, images: Path | None, camera: Path | None, repeat: int | None, given: set[str]) -> str:
+    """The mode that the options choose. Raises InputError for options that exclude one another or have no effect."""
+    modes = [name for name, on in (("images", images), ("plan", plan), ("repeat", repeat)) if on]
+    if len(modes) > 1:
+        raise InputError(f"--{modes[1]}: has no effect with --{modes[0]}; allowed: one of them")
+    if images is not None and camera is None:
+        raise InputError("--images: no camera; allowed: with --camera FILE, a scene, camera file or OpenCV calibration")
+    if camera is not None and images is None:
+        raise InputError("--camera: has no effect without --images; allowed: the scene's camera is used")
+    mode = modes[0] if modes else "simulate"
+    for name in UNUSED[mode]:
+        if name in given:
+            raise InputError(f"--{name}: has no effect with --{mode}; allowed: none")
+    return mode
+
+
+def assumed_testbed(request: Request) -> tuple[Testbed, CalibrationPrior]:
+    """The test bed with the onboard model before a survey, whose errors are drawn, and that model."""
+    from skysim.experiments.dome_survey import prior
+    from skysim.simulation.testbed import build_testbed
+
+    testbed = build_testbed(prior.with_survey_errors(request.scene, request.uncertainty))
+    return testbed, prior.calibration_prior(testbed)
+
+
+def plan_only(request: Request) -> dict[str, Any]:
+    """The attitudes of a plan and the errors predicted."""
+    from skysim.core.io import files
+    from skysim.experiments.dome_survey import findings, procedure
+
+    testbed, prior = assumed_testbed(request)
+    uncertainty = request.uncertainty
+    plan = procedure.make_plan(testbed, prior, uncertainty, request.frames, request.tilt_deg, request.attitudes)
+    path = files.make_folder(request.folder) / "plan.csv"
+    procedure.write_plan(path, plan)
+    return {
+        "scene": request.scene.name,
+        "attitudes": findings.stop_rows(plan.lab_from_body, plan.shown),
+        "leds": plan.shown.shape[1],
+        "noise_px": plan.model.sigma_px,
+        "predicted": [{"frames": n, **findings.accuracy_statistics(one)} for n, one in plan.steps()],
+        "plan": str(path),
+    }
+
+
+def repeated(request: Request, repeat: int) -> dict[str, Any]:
+    """The errors predicted and those of simulated surveys, side by side."""
+    from skysim.experiments.dome_survey import procedure
+
+    testbed, prior = assumed_testbed(request)
+    uncertainty = request.uncertainty
+    plan = procedure.make_plan(testbed, prior, uncertainty, request.frames, request.tilt_deg, request.attitudes)
+    surveys = procedure.repeat_survey(testbed, uncertainty, plan, repeat)
+    errors = list(progress(surveys, repeat, "surveys"))
+    return {
+        "scene": request.scene.name,
+        "frames": len(plan.shown),
+        "surveys": repeat,
+        "rows": procedure.comparison(plan, errors),
+        "measured": [one.measured for one in errors],
+        "false_alarms": sum(one.false_alarms for one in errors),
+    }
+
+
+def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str, Any]:
+    """A simulated survey, compared with the truth."""
+    from skysim.experiments.dome_survey import adjust, findings, frames, prior, procedure, report, stops
+    from skysim.simulation.testbed import build_tracker
+    from skysim.tracking import factory
+
+    testbed, before = assumed_testbed(request)
+    uncertainty, tilt_deg = request.uncertainty, request.tilt_deg
+    first_tracker = build_tracker(testbed)
+    plan = procedure.make_plan(testbed, before, uncertainty, request.frames, tilt_deg, request.attitudes)
+    taken = procedure.simulated_frames(testbed, uncertainty, plan.lab_from_body, frames_to)
+    observations = list(progress(taken, len(plan.shown), "rendering"))
+    with progress_callback("adjusting") as update, coverage_shown(request, observations, before, plan.model.sigma_px):
+        run = adjust.run_survey(observations, before, uncertainty, request.distortion, update)
+    statistics = write_results(request, run, before, testbed)
+    tracker = factory.build_tracker(prior.with_map(testbed.scene, statistics["map"]), testbed.mount, testbed.sources)
+    tests = frames.render_stops(
+        testbed, stops.stop_attitudes(testbed.scene, "checks", checks, tilt_deg), len(plan.shown)
+    )
+    statistics |= report.truth_statistics(run, before, testbed)
+    statistics |= report.compare_trackers(
+        {"before": first_tracker, "after": tracker}, progress(tests, checks, "comparing")
+    )
+    return statistics | {
+        "frames": len(plan.shown),
+        "predicted": findings.accuracy_statistics(plan.first(len(plan.shown))),
+    }
+
+
+def from_images(request: Request, images: Path, camera_file: Path) -> dict[str, Any]:
+    """A survey from the images of a folder, with the LEDs of the scene as the list before it."""
+    from skysim.experiments.dome_survey import images as survey_images
+    from skysim.experiments.dome_survey import prior, procedure
+    from skysim.simulation.testbed import build_testbed
+    from skysim.tracking import settings
+
+    camera, gain_and_saturation = image_camera(camera_file)
+    testbed = build_testbed(prior.as_listed(request.scene))
+    before = prior.listed_prior(testbed, camera)
+    stages = settings.assumed_settings(testbed.scene)
+    if gain_and_saturation is not None:
+        gain_e_dn, saturation = gain_and_saturation
+        stages = replace(stages, gain_e_dn=gain_e_dn, saturation=saturation)
+    total = len(survey_images.image_files(images))
+    pictures = list(progress(survey_images.read_images(images, camera, stages), total, "reading"))
+    found = survey_images.frames_with_attitude(pictures, before, request.uncertainty, stages)
+    with progress_callback("adjusting") as update, coverage_shown(request, found, before, None):
+        run = procedure.survey_images(pictures, found, before, request.uncertainty, stages, request.distortion, update)
+    return write_results(request, run, before, None) | {"frames": total}
+
+
+def image_camera(path: Path) -> tuple[Camera, tuple[float, float] | None]:
+    """The camera of a file, and its gain (e-/DN) and saturation (DN) if the file has them. Raises InputError."""
+    from estimator.core.camera import Camera
+    from skysim.apps.plate_solver.solver import read_camera
+    from skysim.tracking.onboard_model import calibration
+
+    config, lens, stages = read_camera(path)
+    if config is not None:
+        return calibration(config), (stages.gain_e_dn, stages.saturation)
+    assert lens is not None
+    return Camera(lens.width_px, lens.height_px, lens.focal_px, lens.center_px, lens.distortion), None
+
+
+@contextmanager
+def coverage_shown(
+    request: Request, frames: list[SurveyFrame], prior: CalibrationPrior, noise_px: float | None
+) -> Iterator[None]:
+    """Print which LEDs the frames show, and the attitudes to hold next, if they are too few for a survey."""
+    from skysim.experiments.dome_survey import findings
+
+    try:
+        yield
+    except InputError:
+        if frames:
+            so_far = findings.coverage_before(frames, prior, request.uncertainty, noise_px or prior.floor_px)
+            survey_summary.print_coverage(with_next(request, so_far, prior))
+        raise
+
+
+def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> dict[str, Any]:
+    """Statistics of a coverage with the attitudes to hold next, and what they will reach."""
+    from skysim.experiments.dome_survey import findings
+    from skysim.experiments.dome_survey.prior import image_sizes
+
+    margin_px = image_sizes(request.scene, prior).margin_px
+    further = findings.next_stops(request.scene, so_far, margin_px, request.next_stops, request.tilt_deg)
+    shown = so_far.model.visible(further.lab_from_body.inv(), margin_px)
+    return {
+        "coverage": findings.coverage_statistics(so_far),
+        "next": findings.stop_rows(further.lab_from_body, shown),
+        "next_reaches": findings.accuracy_statistics(further.accuracy),
+    }
+
+
+def write_results(
+    request: Request, run: SurveyRun, before: CalibrationPrior, testbed: Testbed | None
+) -> dict[str, Any]:
+    """Write map, picture and statistics of a survey; a simulated one (with a test bed) is drawn with its errors."""
+    from skysim.core.io import files
+    from skysim.experiments.dome_survey import adjust, findings, report, stops
+    from skysim.tracking import dome_map_file
+
+    folder = files.make_folder(request.folder)
+    path, picture = folder / "leds.ecsv", folder / "survey.png"
+    dome_map_file.write_dome_map(path, adjust.dome_map(run.survey, request.uncertainty))
+    so_far, faults = findings.coverage(run), findings.find_faults(run, request.scene)
+    statistics = report.survey_statistics(run, before) | with_next(request, so_far, before)
+    statistics |= {"scene": request.scene.name, "faults": asdict(faults), "map": str(path), "picture": str(picture)}
+    further = stops.from_rows(statistics["next"])
+    errors = report.led_errors(run.survey, before, testbed) if testbed else None
+    files.write_image(picture, report.survey_figure(so_far, faults, further, errors, report.list_shifts(run)))
+    files.write_text(folder / "survey.json", files.to_json(statistics))
+    return statistics

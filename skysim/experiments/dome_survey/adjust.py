@@ -1,0 +1,341 @@
+"""Identification of a survey's LEDs and adjustment of everything, in rounds.
+
+The IMU gives the attitude of each frame to about half a degree. At first the detections are matched to LEDs with it.
+Its error shifts all lights of a frame together by more than the LED spacing, so the most likely common shift is found
+first (`matching`). Then `estimator.calibration.dome_survey.survey` adjusts LED positions, lever arm, lens and attitudes
+together by least squares. Both are repeated with the improved values. LEDs that turn out to be far from their place in
+the list start the last rounds where they were found. The result is a `DomeMap`, the file that `tracker.map` reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.attitude.dome_map import LedMap
+from estimator.calibration import dome_survey, survey_faults
+from estimator.calibration.dome_survey import DomeFrame, DomeSurvey
+from estimator.calibration.survey_faults import HeldFrames, StrayLight
+from estimator.calibration.survey_plan import Mask, SurveyAccuracy
+from skysim.core.errors import InputError
+from skysim.core.types import Floats
+from skysim.experiments.dome_survey.frames import SurveyFrame
+from skysim.experiments.dome_survey.matching import Correspondences, match_by_imu, match_by_survey
+from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty
+from skysim.tracking.dome_map_file import DomeMap
+
+# Lights that a frame must share with others: two determine its attitude; a misidentified patch board accounts for six.
+MIN_SHARED_LEDS = (3, 8)
+
+# Minimum rms angle between an LED's rays for its distance: twice the minimum that the adjustment requires.
+MIN_RAY_ANGLE_RAD = 2 * dome_survey.CROSSING_RAD
+
+ROUNDS = 3  # rounds of identification and adjustment; from the second on with the adjusted values
+MOVED_ROUNDS = 2  # further rounds if LEDs are far from their places in the list
+
+MIN_MATCHED = 0.5  # share of a frame's lights that are matched; if only chance matches them it is far less
+STRAY_SIGMA_PX = 0.3  # of a ray to a stray light, for the errors of the attitude and of blends
+STRAY_REACH_M = 0.005  # on the dome, within which stray lights of two frames may be one
+MAX_DISPLACEMENT_M = 0.1  # of an LED from its place in the list
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyRun:
+    """A survey with the frames and correspondences of its last round.
+
+    taken  : all frames, with the IMU's attitudes;  rows : those of `taken` that are in the survey
+    listed : the LEDs before the survey
+    prior  : the model before the last round; its LEDs are the listed ones, those moved at the places found
+    """
+
+    survey: DomeSurvey
+    taken: Sequence[SurveyFrame]
+    rows: list[int]
+    matches: list[Correspondences]
+    listed: LedMap
+    prior: CalibrationPrior
+    uncertainty: SurveyUncertainty
+
+    @property
+    def frames(self) -> list[SurveyFrame]:
+        """The frames of the survey, with their adjusted attitudes."""
+        pairs = zip(self.rows, self.survey.body_from_lab, strict=True)
+        return [replace(self.taken[row], body_from_lab=attitude) for row, attitude in pairs]
+
+    @property
+    def held(self) -> HeldFrames:
+        """The frames with their adjusted attitudes and the model found."""
+        survey = self.survey
+        return HeldFrames(survey.camera, survey.leds, survey.lever, survey.body_from_lab)
+
+    @property
+    def inliers(self) -> list[Correspondences]:
+        """The correspondences without those that the adjustment rejected."""
+        keep = [np.ones(len(match.led), dtype=bool) for match in self.matches]
+        for frame, row in self.survey.outliers.tolist():
+            keep[frame][row] = False
+        return [Correspondences(m.light[k], m.led[k]) for m, k in zip(self.matches, keep, strict=True)]
+
+    @property
+    def seen(self) -> Mask:
+        """(F, N) LEDs identified in each frame."""
+        return identified(self.inliers, len(self.listed.id))
+
+    @property
+    def noise_px(self) -> float:
+        """Standard deviation of a centroid's coordinates, as the residuals have it; of the mean information."""
+        pairs = zip(self.frames, self.inliers, strict=True)
+        sigma_px = np.concatenate([frame.lights.sigma_px[match.light] for frame, match in pairs])
+        return self.survey.noise_scale / float(np.sqrt(np.mean(sigma_px**-2.0)))
+
+    @property
+    def accuracy(self) -> SurveyAccuracy:
+        """The standard deviations of the survey."""
+        survey = self.survey
+        return SurveyAccuracy(
+            survey.surveyed,
+            led_sigma_m(survey, self.uncertainty),
+            np.sqrt(np.diag(survey.lever_covariance_m2)),
+            np.sqrt(np.diag(survey.lens_covariance)),
+        )
+
+    @property
+    def uncertainty_after(self) -> SurveyUncertainty:
+        """The uncertainty of the IMU and of LEDs that are not measured, and that of the lever and the lens found."""
+        accuracy, before = self.accuracy, self.uncertainty
+        lever_m = float(np.sqrt(np.mean(accuracy.lever_sigma_m**2)))
+        focal = float(accuracy.lens_sigma[0] / self.survey.camera.focal_px)
+        return replace(before, lever_sigma_m=lever_m, focal_error=focal)
+
+
+def identified(matches: Sequence[Correspondences], leds: int) -> Mask:
+    """(F, N) LEDs that the correspondences of each frame have."""
+    out = np.zeros((len(matches), leds), dtype=bool)
+    for row, match in zip(out, matches, strict=True):
+        row[match.led] = True
+    return out
+
+
+def run_survey(
+    frames: Sequence[SurveyFrame],
+    prior: CalibrationPrior,
+    uncertainty: SurveyUncertainty,
+    fit_distortion: bool = False,
+    watch: Callable[[float, float], None] | None = None,
+) -> SurveyRun:
+    """Survey LEDs, lever arm, lens and attitudes from all frames, starting from `prior` with errors of `uncertainty`.
+
+    fit_distortion : fit k1, k2, p1, p2 as well. A narrow field hardly determines them, and they correlate with the
+        focal length: on the AFIT dome its sigma grows from 10 to 80 px, while the attitude does not change
+    watch(rounds done, rounds) is called after each round of identification and adjustment
+    Raises InputError if the frames do not determine the unknowns.
+    """
+
+    def adjusted(rows: list[int], matches: list[Correspondences], prior: CalibrationPrior) -> SurveyRun:
+        pairs = [
+            (replace(frames[row], body_from_lab=start[row]), match) for row, match in zip(rows, matches, strict=True)
+        ]
+        selected, survey = adjust_connected(pairs, prior, uncertainty, fit_distortion)
+        rows, matches = [rows[k] for k in selected], [matches[k] for k in selected]
+        start.update(zip(rows, survey.body_from_lab, strict=True))
+        return SurveyRun(survey, frames, rows, matches, listed, prior, uncertainty)
+
+    listed, total = prior.leds, ROUNDS + MOVED_ROUNDS
+    start = {row: frame.body_from_lab for row, frame in enumerate(frames)}
+    run = adjusted(list(start), [match_by_imu(frame, prior, uncertainty) for frame in frames], prior)
+    for completed in range(1, total):
+        if watch:
+            watch(completed, total)
+        if completed == ROUNDS:
+            moved = displaced_leds(run)
+            if not moved:
+                break
+            run = with_places(run, moved)
+        run = adjusted(*rematched(run))
+    if watch:
+        watch(total, total)
+    return run
+
+
+def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], CalibrationPrior]:
+    """Rows of the frames that are identified, their lights matched anew with the adjusted model, and that model.
+
+    A frame that is not tied, or has too few matches with its adjusted attitude, was misidentified as a whole: it is
+    matched with the IMU's attitude again, now that lever and lens are known better.
+    """
+    survey, prior = run.survey, run.prior
+    model = replace(prior, camera=survey.camera, leds=survey.leds, lever=survey.lever)
+    # The attitudes are adjusted now, so only the map's and the residual error remain in the predictions.
+    map_px = led_sigma_m(survey, run.uncertainty) * model.px_per_m
+    sigma_px = np.hypot(map_px, max(survey.rms_px, prior.floor_px))
+    tied = {row: frame for row, frame, ok in zip(run.rows, run.frames, survey.tied, strict=True) if ok}
+    rows, matches = [], []
+    for row, frame in enumerate(run.taken):
+        match = match_by_survey(tied[row], model, sigma_px) if row in tied else None
+        if match is None or not is_identified(tied[row], match, model):
+            match = match_by_imu(frame, model, run.uncertainty_after)
+            if not is_identified(frame, match, model):
+                continue
+        rows.append(row)
+        matches.append(match)
+    # Keep the map from before the survey: it enters each adjustment as a measurement.
+    return rows, matches, replace(model, leds=prior.leds)
+
+
+def is_identified(frame: SurveyFrame, match: Correspondences, model: CalibrationPrior) -> bool:
+    """Whether at least MIN_MATCHED of the lights of a frame, or of the LEDs in it if they are fewer, are matched."""
+    visible = int(np.count_nonzero(model.camera.contains(model.pixels(frame.body_from_lab))))
+    return len(match.led) > 0 and len(match.led) >= MIN_MATCHED * min(len(frame.lights), visible)
+
+
+def displaced_leds(run: SurveyRun) -> dict[int, Floats]:
+    """Rows and places of the LEDs that are far from those in the list: measured ones, and stray lights with a name."""
+    survey = run.survey
+    rows, _ = survey_faults.displaced(run.listed.position_m, survey.leds.position_m, survey.led_covariance_m2)
+    places = {int(row): survey.leds.position_m[row] for row in rows}
+    strays = stray_lights(run)
+    missing = np.flatnonzero(~run.seen.any(axis=0))
+    named = survey_faults.name_strays(strays, missing, run.listed.position_m, MAX_DISPLACEMENT_M)
+    return places | {led: strays[k].position_m for led, k in named}
+
+
+def stray_lights(run: SurveyRun) -> list[StrayLight]:
+    """Lights at rest in the lab that are no known LED."""
+    frame, xy_px = [np.zeros(0, np.int64)], [np.zeros((0, 2))]
+    for k, match in enumerate(run.inliers):
+        if run.survey.tied[k]:
+            lights = run.frames[k].lights.xy_px
+            xy_px.append(np.delete(lights, match.light, axis=0))
+            frame.append(np.full(len(xy_px[-1]), k))
+    return survey_faults.stray_lights(
+        run.held, np.concatenate(frame), np.concatenate(xy_px), STRAY_SIGMA_PX, STRAY_REACH_M
+    )
+
+
+def with_places(run: SurveyRun, places: dict[int, Floats]) -> SurveyRun:
+    """The run with these LEDs at other places, before the survey and after it."""
+
+    def moved(leds: LedMap) -> LedMap:
+        position_m = leds.position_m.copy()
+        for row, place_m in places.items():
+            position_m[row] = place_m
+        return replace(leds, position_m=position_m)
+
+    prior, survey = run.prior, run.survey
+    return replace(run, prior=replace(prior, leds=moved(prior.leds)), survey=replace(survey, leds=moved(survey.leds)))
+
+
+def adjust_connected(
+    pairs: Sequence[tuple[SurveyFrame, Correspondences]],
+    prior: CalibrationPrior,
+    uncertainty: SurveyUncertainty,
+    fit_distortion: bool,
+) -> tuple[list[int], DomeSurvey]:
+    """Adjust the largest group of connected frames. Returns its rows and the survey.
+
+    A frame may be connected only by misidentified lights. The adjustment rejects these and then fails, so it is tried
+    again with a larger minimum number of shared lights (MIN_SHARED_LEDS). Raises InputError if the last attempt fails.
+    """
+    visible = led_visibility(pairs, prior)
+    for min_shared in MIN_SHARED_LEDS:
+        selected = largest_connected_group(visible, min_shared)
+        try:
+            # A robust loss, and the prior map as a measurement.
+            survey = dome_survey.survey(
+                [dome_frame(*pairs[k]) for k in selected],
+                prior.leds,
+                prior.lever,
+                prior.camera,
+                fit_distortion=fit_distortion,
+                loss="cauchy",
+                leds_sigma_m=uncertainty.led_sigma_m,
+                fit_noise=True,
+            )
+        except ValueError as error:
+            if min_shared == MIN_SHARED_LEDS[-1]:
+                raise InputError(str(error)) from None
+        else:
+            break
+    return selected, survey
+
+
+def led_visibility(pairs: Sequence[tuple[SurveyFrame, Correspondences]], prior: CalibrationPrior) -> NDArray[np.bool_]:
+    """(F, N) mask of the LEDs in each frame, without LEDs whose rays are nearly parallel in all frames.
+
+    Such an LED, seen from camera positions close together, has no measurable distance and connects no frames.
+    """
+    visible = identified([match for _, match in pairs], len(prior.leds.id))
+    # RMS spread of the camera positions over the frames that show an LED, as an angle seen from the nearest LED.
+    arm_m = prior.lever.camera_body_m
+    camera_m = np.array([frame.body_from_lab.inv().apply(arm_m) for frame, _ in pairs])
+    count = np.maximum(visible.sum(axis=0), 1)[:, None]
+    spread_m2 = np.sum((visible.T @ camera_m**2) / count - ((visible.T @ camera_m) / count) ** 2, axis=1)
+    angle_rad = np.sqrt(np.maximum(spread_m2, 0)) * prior.px_per_m / prior.camera.focal_px
+    return visible & (angle_rad > MIN_RAY_ANGLE_RAD)
+
+
+def largest_connected_group(visible: NDArray[np.bool_], min_shared: int) -> list[int]:
+    """Indices of the largest group of frames connected by shared LEDs.
+
+    visible : (F, N) mask of the LEDs in each frame
+    min_shared : minimum number of LEDs that a frame shares with the rest of the group
+
+    Frames outside the group have an undetermined position relative to it, which `dome_survey.survey` rejects. A group
+    grows from the frame with the most LEDs, adding connected frames until none is left.
+    """
+    n_frames = len(visible)
+    remaining, best = np.ones(n_frames, dtype=bool), np.zeros(n_frames, dtype=bool)
+    while remaining.any():
+        group = np.zeros(n_frames, dtype=bool)
+        group[np.argmax(remaining * (1 + visible.sum(axis=1)))] = True
+        # Add frames that share enough LEDs with the group until it no longer grows.
+        while True:
+            group_leds = visible[group].any(axis=0)
+            grown = group | (remaining & ((visible & group_leds).sum(axis=1) >= min_shared))
+            if (grown == group).all():
+                break
+            group = grown
+        remaining &= ~group
+        best = group if group.sum() > best.sum() else best
+    return np.flatnonzero(best).tolist()
+
+
+def led_sigma_m(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> Floats:
+    """(N,) standard deviation of each LED's position, RMS of three axes; that before the survey if not surveyed."""
+    variance_m2 = np.einsum("nii->n", survey.led_covariance_m2) / 3
+    return np.sqrt(np.where(survey.surveyed, variance_m2, uncertainty.led_sigma_m**2))
+
+
+def lens_sigma(survey: DomeSurvey) -> Floats:
+    """(8,) standard deviations of focal_px, center x and y, k1, k2, p1, p2, k3; 0 for those not fitted."""
+    fitted = np.sqrt(np.maximum(np.diag(survey.lens_covariance), 0))
+    return np.concatenate([fitted, np.zeros(8 - len(fitted))])
+
+
+def dome_map(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> DomeMap:
+    """The map file of a survey for the tracker: surveyed LEDs, lever arm, lens, and their standard deviations."""
+    surveyed = survey.surveyed
+    focal_sigma_px, x_sigma_px, y_sigma_px, *k_sigma = lens_sigma(survey).tolist()
+    return DomeMap(
+        id=survey.leds.id[surveyed],
+        position_m=survey.leds.position_m[surveyed],
+        sigma_m=led_sigma_m(survey, uncertainty)[surveyed],
+        camera_body_m=survey.lever.camera_body_m,
+        lever_sigma_m=float(np.sqrt(np.trace(survey.lever_covariance_m2) / 3)),
+        size_px=(survey.camera.width_px, survey.camera.height_px),
+        focal_px=survey.camera.focal_px,
+        focal_sigma_px=focal_sigma_px,
+        center_px=survey.camera.center_px,
+        center_sigma_px=(x_sigma_px, y_sigma_px),
+        distortion=survey.camera.distortion,
+        distortion_sigma=tuple(k_sigma),
+    )
+
+
+def dome_frame(frame: SurveyFrame, match: Correspondences) -> DomeFrame:
+    """Input frame of the adjustment: matched detections with their LEDs, and the start attitude."""
+    lights = frame.lights
+    return DomeFrame(match.led, lights.xy_px[match.light], lights.sigma_px[match.light], frame.body_from_lab)

@@ -1,0 +1,208 @@
+"""What a survey has found: which LEDs are measured and how well, the attitudes to hold next, and faults of the dome."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.calibration import survey_faults, survey_plan
+from estimator.calibration.survey_faults import Exchange, LightTable
+from estimator.calibration.survey_plan import Mask, SurveyAccuracy, SurveyModel
+from skysim.core.types import Floats
+from skysim.experiments.dome_survey import stops
+from skysim.experiments.dome_survey.adjust import SurveyRun, identified, stray_lights
+from skysim.experiments.dome_survey.frames import SurveyFrame
+from skysim.experiments.dome_survey.matching import GATE_SIGMAS, Ints, match_by_imu
+from skysim.experiments.dome_survey.prior import (
+    CalibrationPrior,
+    ImageSizes,
+    SurveyUncertainty,
+    image_sizes,
+    survey_model,
+)
+from skysim.scene.scene import Scene
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """The frames held so far, and which LEDs they measure.
+
+    model : by which further attitudes are chosen;  held, seen : body_from_lab of F frames, and (F, N) LEDs in them
+    accuracy : that of the survey; None before there is one
+    """
+
+    model: SurveyModel
+    held: Rotation
+    seen: Mask
+    accuracy: SurveyAccuracy | None
+
+    @property
+    def measured(self) -> Mask:
+        """(N,) LEDs that are surveyed."""
+        return np.zeros(len(self.model.leds.id), dtype=bool) if self.accuracy is None else self.accuracy.measured
+
+
+def coverage(run: SurveyRun) -> Coverage:
+    """The coverage of a survey."""
+    survey = run.survey
+    model = SurveyModel(survey.camera, survey.leds, survey.lever, run.noise_px, run.uncertainty.led_sigma_m)
+    return Coverage(model, survey.body_from_lab, run.seen, run.accuracy)
+
+
+def coverage_before(
+    frames: Sequence[SurveyFrame], prior: CalibrationPrior, uncertainty: SurveyUncertainty, noise_px: float
+) -> Coverage:
+    """The coverage of frames that are too few for a survey: LEDs by the IMU's attitudes, none measured."""
+    matches = [match_by_imu(frame, prior, uncertainty) for frame in frames]
+    held = Rotation.concatenate([frame.body_from_lab for frame in frames])
+    model = survey_model(prior, uncertainty.led_sigma_m, noise_px)
+    return Coverage(model, held, identified(matches, len(prior.leds.id)), None)
+
+
+@dataclass(frozen=True, slots=True)
+class NextStops:
+    """Attitudes to hold next, and what the survey with them will reach (None if that does not determine it)."""
+
+    lab_from_body: Rotation
+    accuracy: SurveyAccuracy | None
+
+
+def next_stops(scene: Scene, so_far: Coverage, margin_px: float, count: int, tilt_deg: float) -> NextStops:
+    """Up to `count` attitudes after those held so far."""
+    model = so_far.model
+    further = stops.planned_stops(scene, model, margin_px, count, tilt_deg, so_far.held, so_far.seen)
+    attitudes = Rotation.concatenate([so_far.held, further.inv()])
+    seen = np.vstack([so_far.seen, model.visible(further.inv(), margin_px)])
+    return NextStops(further, predicted(model, attitudes, seen))
+
+
+def predicted(model: SurveyModel, body_from_lab: Rotation, seen: Mask) -> SurveyAccuracy | None:
+    """The accuracy predicted; None if the frames do not determine the unknowns."""
+    try:
+        return survey_plan.predict(model, body_from_lab, seen)
+    except ValueError:
+        return None
+
+
+# --- faults -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class DomeFaults:
+    """Faults of the dome by LED number.
+
+    dark      : LEDs that no frame shows though it must
+    displaced : LED and its distance from the list's place, m;  list_sigma_m : error of the other places about each axis
+    exchanged : LED at whose place another one shines, that other one, and others that would do as well
+    unlisted  : places, m, of lights at rest that are no LED of the list
+    exchange_share : share of the pairs of LEDs whose exchange would be found; 0 if all are alike
+    """
+
+    dark: list[int]
+    displaced: dict[int, float]
+    list_sigma_m: float
+    exchanged: list[tuple[int, int, list[int]]]
+    unlisted: list[list[float]]
+    exchange_share: float
+
+    @property
+    def count(self) -> int:
+        """Number of faults."""
+        return len(self.dark) + len(self.displaced) + len(self.exchanged) + len(self.unlisted)
+
+
+def find_faults(run: SurveyRun, scene: Scene) -> DomeFaults:
+    """The faults that a survey shows."""
+    survey, leds = run.survey, run.listed
+    seen = run.seen
+    index = np.array([frame.index for frame in run.frames])
+    expected = run.prior.expected_light(index)
+    shown = run.held.shown(*margins(run, image_sizes(scene, run.prior)))
+    rows, sigma_m = survey_faults.displaced(leds.position_m, survey.leds.position_m, survey.led_covariance_m2)
+    off_m = np.linalg.norm(survey.leds.position_m - leds.position_m, axis=1)
+    exchanges, share = _exchanged(run, shown, expected)
+    strays = stray_lights(run)
+    return DomeFaults(
+        leds.id[survey_faults.dark(shown & (expected > 0), seen)].tolist(),
+        {int(leds.id[row]): float(off_m[row]) for row in rows},
+        sigma_m,
+        [(int(leds.id[x.led]), int(leds.id[x.shows]), leds.id[list(x.or_any_of)].tolist()) for x in exchanges],
+        [stray.position_m.tolist() for stray in strays],
+        share,
+    )
+
+
+def margins(run: SurveyRun, sizes: ImageSizes) -> tuple[Floats, float]:
+    """Margin of the chip for each LED, and distance between LEDs, by the errors of the places as well."""
+    place_px = run.accuracy.led_sigma_m * run.prior.px_per_m
+    return sizes.margin_px + GATE_SIGMAS * place_px, sizes.apart_px
+
+
+def _exchanged(run: SurveyRun, shown: Mask, expected: Floats) -> tuple[list[Exchange], float]:
+    """LEDs that are exchanged; none can be found if a code runs freely, since then its time is unknown."""
+    code = run.prior.code
+    if code is not None and code.bit_time_s is not None:
+        return [], 0.0
+    return survey_faults.exchanged(LightTable(light_at_unit_distance(run), shown, expected))
+
+
+def light_at_unit_distance(run: SurveyRun) -> Floats:
+    """(F, N) light of each LED in each frame, multiplied with its squared distance; NaN if it is not identified."""
+    out = np.full(run.seen.shape, np.nan)
+    survey = run.survey
+    camera_m = survey.body_from_lab.inv().apply(np.tile(survey.lever.camera_body_m, (len(out), 1)))
+    for k, (frame, match) in enumerate(zip(run.frames, run.inliers, strict=True)):
+        squared_m2 = np.sum((survey.leds.position_m[match.led] - camera_m[k]) ** 2, axis=1)
+        out[k, match.led] = np.maximum(frame.lights.flux[match.light], 1e-9) * squared_m2
+    return out
+
+
+# --- as numbers ---------------------------------------------------------------------------------------------
+
+
+def coverage_statistics(so_far: Coverage) -> dict[str, Any]:
+    """Counts and errors of a coverage, one row for each LED."""
+    frames = so_far.seen.sum(axis=0)
+    measured = so_far.measured
+    sigma_m = so_far.accuracy.led_sigma_m if so_far.accuracy else np.full(len(measured), so_far.model.leds_sigma_m)
+    sigma_mm = (1e3 * sigma_m).tolist()
+    columns = so_far.model.leds.id.tolist(), frames.tolist(), measured.tolist(), sigma_mm
+    keys = ("led", "frames", "measured", "sigma_mm")
+    return {
+        "leds": len(frames),
+        "measured": int(measured.sum()),
+        "seen_once": int(np.sum(frames == 1)),
+        "unseen": int(np.sum(frames == 0)),
+        "by_led": [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)],
+    }
+
+
+def accuracy_statistics(accuracy: SurveyAccuracy | None) -> dict[str, float | int | None]:
+    """Measured LEDs, their rms error in mm, that of the lever, and of the focal length in px; None if undetermined."""
+    if accuracy is None:
+        return {"measured": 0, "led_mm": None, "lever_mm": None, "focal_px": None}
+    return {
+        "measured": int(accuracy.measured.sum()),
+        "led_mm": 1e3 * accuracy.led_rms_m,
+        "lever_mm": 1e3 * float(np.sqrt(np.mean(accuracy.lever_sigma_m**2))),
+        "focal_px": float(accuracy.lens_sigma[0]),
+    }
+
+
+def stop_rows(lab_from_body: Rotation, shown: Mask) -> list[dict[str, float | int]]:
+    """Attitudes as rows: roll, pitch, yaw and tilt in degrees, and the number of LEDs that each shows."""
+    up = lab_from_body.apply([0.0, 0.0, 1.0])
+    tilt_deg = np.degrees(np.arctan2(np.hypot(up[:, 0], up[:, 1]), up[:, 2]))
+    columns = *stops.angles_deg(lab_from_body).T.tolist(), tilt_deg.tolist(), shown.sum(axis=1).tolist()
+    keys = ("roll_deg", "pitch_deg", "yaw_deg", "tilt_deg", "leds")
+    return [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
+
+
+def rows_of(numbers: Sequence[int], ids: Ints) -> Ints:
+    """Rows of LEDs by their numbers."""
+    order = np.argsort(ids)
+    return np.asarray(order[np.searchsorted(ids[order], np.array(numbers, dtype=np.int64))])

@@ -1,0 +1,151 @@
+"""Frames of a survey from images on disk.
+
+A folder has one image for each attitude, in the order of their names, and may have `attitudes.csv` with the IMU's
+attitudes: columns file, roll_deg, pitch_deg, yaw_deg (`motion` of a scene has the same angles). Images that it does not
+name are identified by the tracker with the list of LEDs, or with the survey of the other images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.dome_map import LedMap, Lever
+from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
+from estimator.core.types import Centroids
+from estimator.trackers.dome_tracker import DomeTracker
+from estimator.trackers.pipeline import Settings
+from skysim.core.errors import InputError
+from skysim.core.io import images
+from skysim.core.io.files import atomic_file
+from skysim.core.io.text import excerpt, read_lines, to_numbers
+from skysim.experiments.dome_survey import stops
+from skysim.experiments.dome_survey.frames import SurveyFrame, detect_lights
+from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty
+
+ATTITUDES = "attitudes.csv"
+FRAME = "frame_{:04d}.fits"
+COLUMNS = ("file", "roll_deg", "pitch_deg", "yaw_deg")
+MIN_IMAGES = 3
+FORMATS = (".fits", ".fit", ".fits.gz", ".tif", ".tiff", ".png")  # of several images of one name the first is read
+
+
+class SurveyImage(NamedTuple):
+    """An image of a survey: its name, its detections, and the IMU's lab_from_body, None if there is none."""
+
+    name: str
+    lights: Centroids
+    lab_from_body: Rotation | None
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The images of a folder by name, one of each stem. Raises InputError for too few, or no folder."""
+    if not folder.is_dir():
+        raise InputError(f"--images {folder}: no such folder")
+    best: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        suffix = images.image_suffix(path.name)
+        if suffix and not path.name.startswith("."):
+            stem = path.name[: -len(suffix)]
+            if stem not in best or rank(suffix) < rank(images.image_suffix(best[stem].name)):
+                best[stem] = path
+    if len(best) < MIN_IMAGES:
+        raise InputError(f"--images {folder}: {len(best)} images; allowed: {MIN_IMAGES} or more, typically tens")
+    return [best[stem] for stem in sorted(best)]
+
+
+def rank(suffix: str) -> int:
+    """Place of an image format in the order in which images of one name are preferred."""
+    return FORMATS.index(suffix) if suffix in FORMATS else len(FORMATS)
+
+
+def read_images(folder: Path, camera: Camera, settings: Settings) -> Iterator[SurveyImage]:
+    """The images of a folder with their detections. Raises InputError for an image that cannot be used."""
+    paths = image_files(folder)
+    attitudes = read_attitudes(folder / ATTITUDES) if (folder / ATTITUDES).exists() else {}
+    names = {path.name for path in paths}
+    for name in attitudes:
+        if name not in names:
+            raise InputError(f"{folder / ATTITUDES}: {excerpt(name)} is no image of the folder")
+    for path in paths:
+        lights = detect_lights(settings, camera, pixels_of(path, camera))
+        yield SurveyImage(path.name, lights, attitudes.get(path.name))
+
+
+def pixels_of(path: Path, camera: Camera) -> NDArray:
+    """The pixels of an image of the camera, the highest row first. Raises InputError for another size."""
+    pixels = images.monochrome(images.read_picture(path).pixels)
+    if pixels.shape != (camera.height_px, camera.width_px):
+        raise InputError(
+            f"{path}: {pixels.shape[1]} x {pixels.shape[0]} pixels; allowed: {camera.width_px} x {camera.height_px},"
+            " as --camera has them"
+        )
+    return pixels
+
+
+def read_attitudes(path: Path) -> dict[str, Rotation]:
+    """lab_from_body of each image by its name, from a CSV file. Raises InputError with one line."""
+    lines = [(n, line) for n, line in read_lines(path) if not line.startswith("#")]
+    names = [cell.strip() for cell in lines[0][1].split(",")] if lines else []
+    if len(lines) < 2 or len({*names}) < len(names) or not {*COLUMNS} <= {*names}:
+        raise InputError(f"{path}: no attitudes; allowed: columns {', '.join(COLUMNS)}, and others, which are not used")
+    rows = [[cell.strip() for cell in line.split(",")] for _, line in lines[1:]]
+    places = [n for n, _ in lines[1:]]
+    for place, row in zip(places, rows, strict=True):
+        if len(row) != len(names):
+            raise InputError(f"{path}, line {place}: {len(row)} values; allowed: {len(names)}, as the first line has")
+    columns = [names.index(name) for name in COLUMNS]
+    numbers = to_numbers(str(path), places, [[row[k] for k in columns[1:]] for row in rows], 3)
+    files = [row[columns[0]] for row in rows]
+    repeated = next((name for n, name in enumerate(files) if name in files[:n]), None)
+    if repeated is not None:
+        raise InputError(f"{path}: {excerpt(repeated)} occurs twice; allowed: once")
+    return dict(zip(files, stops.from_angles(numbers), strict=True))
+
+
+def write_attitudes(
+    path: Path, names: Sequence[str], lab_from_body: Rotation, leds: NDArray[np.int64] | None = None
+) -> None:
+    """Write attitudes as `read_attitudes` reads them; leds : number of LEDs in view, for a plan."""
+    lines = [",".join((*COLUMNS, "leds") if leds is not None else COLUMNS)]
+    for n, (name, angles) in enumerate(zip(names, stops.angles_deg(lab_from_body), strict=True)):
+        cells = [name, *(f"{angle:.4f}" for angle in angles)] + ([f"{leds[n]}"] if leds is not None else [])
+        lines.append(",".join(cells))
+    with atomic_file(path) as temporary:
+        temporary.write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+
+def frames_with_attitude(
+    pictures: Sequence[SurveyImage], model: CalibrationPrior, uncertainty: SurveyUncertainty, settings: Settings
+) -> list[SurveyFrame]:
+    """The images whose attitude is known or is found by the tracker, lost in space, with this model."""
+    tracker: DomeTracker | None = None
+    out = []
+    for index, picture in enumerate(pictures):
+        attitude = picture.lab_from_body
+        if attitude is None:
+            tracker = tracker or lost_in_space(model, uncertainty, settings)
+            cam_from_lab = tracker.solve_centroids(picture.lights).cam_from_ref
+            if cam_from_lab is None:
+                continue
+            attitude = cam_from_lab.inv() * model.lever.cam_from_body
+        out.append(SurveyFrame(picture.lights, attitude.inv(), index))
+    return out
+
+
+def lost_in_space(model: CalibrationPrior, uncertainty: SurveyUncertainty, settings: Settings) -> DomeTracker:
+    """A tracker that knows how uncertain the model is. Raises InputError for LEDs that it cannot use."""
+    camera = replace(model.camera, focal_sigma=abs(uncertainty.focal_error))
+    leds: LedMap = replace(model.leds, sigma_m=uncertainty.led_sigma_m, covariance_m2=None, common_m=None)
+    lever = Lever(model.lever.camera_body_m, model.lever.cam_from_body, uncertainty.lever_sigma_m)
+    try:
+        return DomeTracker(camera, leds, lever, settings)
+    except ImageError as error:
+        raise InputError(f"light: the star tracker cannot use this dome: {error}") from None

@@ -1,0 +1,160 @@
+"""Laws of the survey's plan and of its faults."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as some
+from laws import SEEDS, answered, law
+from surveyed_dome import attitudes, model, pixels
+
+from estimator.calibration import bundle_adjustment as ba
+from estimator.calibration import survey_faults, survey_plan
+from estimator.calibration.dome_survey import connected_subset
+from estimator.calibration.gauge import Gauge
+from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
+from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
+from estimator.core.camera import Camera
+
+
+@pytest.mark.slow
+@law(*(survey_plan.predict, SurveyAccuracy.led_rms_m, SurveyModel.visible, ba.covariance, connected_subset), slow=True)
+@given(rng=SEEDS, factor=some.floats(0.1, 10))
+def test_errors_grow_with_noise_and_list_and_shrink_with_frames(rng: np.random.Generator, factor: float) -> None:
+    assumed, held = model(50), attitudes(rng, 30)
+    seen = assumed.visible(held)
+    first = answered(lambda: survey_plan.predict(assumed, held[:25], seen[:25]))
+    larger = replace(assumed, sigma_px=factor * assumed.sigma_px, leds_sigma_m=factor * assumed.leds_sigma_m)
+    scaled = answered(lambda: survey_plan.predict(larger, held[:25], seen[:25]))
+    every = answered(lambda: survey_plan.predict(assumed, held, seen))
+    if first is None or every is None or scaled is None:
+        return
+    np.testing.assert_array_equal(first.measured, scaled.measured)
+    np.testing.assert_allclose(scaled.led_sigma_m, factor * first.led_sigma_m, rtol=1e-6)
+    np.testing.assert_allclose(scaled.lens_sigma, factor * first.lens_sigma, rtol=1e-6)
+    assert (every.led_sigma_m <= first.led_sigma_m * (1 + 1e-9)).all()
+    assert (every.lever_sigma_m <= first.lever_sigma_m * (1 + 1e-9)).all()
+    assert 0 < every.led_rms_m <= assumed.leds_sigma_m
+    assert not seen[:, ~every.measured].sum(axis=0).max(initial=0) > len(held)
+
+
+@law(survey_plan.choose)
+@given(rng=SEEDS, count=some.integers(1, 12))
+def test_a_longer_plan_begins_as_a_shorter_one(rng: np.random.Generator, count: int) -> None:
+    assumed, candidates = model(80), attitudes(rng, 60)
+    shown = assumed.visible(candidates)
+    plan = survey_plan.choose(assumed, candidates, shown, 12)
+    assert survey_plan.choose(assumed, candidates, shown, count) == plan[:count]
+    least = survey_plan.MIN_SHARED
+    covered = shown[plan[0]]
+    for row in plan[1:]:
+        reachable = (shown & covered).sum(axis=1)
+        assert reachable[row] >= min(least, reachable.max())
+        covered = covered | shown[row]
+    assert answered(lambda: survey_plan.choose(assumed, candidates, shown[:, :-1], count)) is None
+
+
+@law(HeldFrames.shown, HeldFrames.rays)
+@given(rng=SEEDS)
+def test_rays_of_pixels_lead_to_the_leds(rng: np.random.Generator) -> None:
+    assumed, held = model(60), attitudes(rng, 6)
+    frames = HeldFrames(assumed.camera, assumed.leds, assumed.lever, held)
+    shown = frames.shown(5.0, 10.0)
+    assert not (shown & ~assumed.visible(held)).any()
+    frame, led = np.nonzero(shown)
+    xy_px = np.array(
+        [pixels(assumed, assumed.leds.position_m, held[int(k)])[n] for k, n in zip(frame, led, strict=True)]
+    )
+    origins, directions = frames.rays(frame, xy_px.reshape(-1, 2))
+    toward = assumed.leds.position_m[led] - origins
+    np.testing.assert_allclose(np.cross(toward, directions), 0, atol=1e-9)
+
+
+@law(survey_faults.dark)
+@given(rng=SEEDS)
+def test_what_was_seen_or_rarely_shown_is_not_dark(rng: np.random.Generator) -> None:
+    shown = rng.random((30, 40)) < rng.random()
+    seen = shown & (rng.random((30, 40)) < 0.99)
+    seen[:, :2] = False
+    found = survey_faults.dark(shown, seen)
+    assert not seen[:, found].any()
+    assert (shown[:, found].sum(axis=0) >= survey_faults.MIN_FRAMES).all()
+
+
+@law(survey_faults.displaced)
+@given(rng=SEEDS, size=some.floats(1e-5, 1e-1), far=some.floats(12, 1e3))
+def test_an_led_far_from_the_list_is_displaced(rng: np.random.Generator, size: float, far: float) -> None:
+    listed = rng.normal(0, 1, (60, 3))
+    found = listed + size * rng.normal(0, 1, (60, 3))
+    found[7] = listed[7] + [far * size, 0, 0]
+    covariance = np.tile(np.eye(3) * (size / 10) ** 2, (60, 1, 1))
+    covariance[50:] = np.nan
+    rows, sigma = survey_faults.displaced(listed, found, covariance)
+    assert 7 in rows
+    assert rows.max() < 50
+    assert 0.5 * size < sigma < 1.6 * size
+    none = survey_faults.displaced(listed, found, np.full((60, 3, 3), np.nan))
+    assert (len(none[0]), none[1]) == (0, 0.0)
+
+
+@law(survey_faults.stray_lights)
+@given(rng=SEEDS)
+def test_a_light_at_rest_is_found_and_a_pixel_s_fault_is_not(rng: np.random.Generator) -> None:
+    assumed, held = model(60), attitudes(rng, 40)
+    frames = HeldFrames(assumed.camera, assumed.leds, assumed.lever, held)
+    place_m = assumed.leds.position_m[3] * 1.003
+    xy_px = np.array([pixels(assumed, place_m[None], one)[0] for one in held])
+    frame = np.flatnonzero(assumed.camera.contains(xy_px))
+    hot = np.tile([400.0, 100.0], (len(held), 1))  # moves over the dome with the camera
+    rows = np.concatenate([frame, np.arange(len(held))])
+    strays = survey_faults.stray_lights(frames, rows, np.vstack([xy_px[frame], hot]), 0.1, 0.004)
+    near = [stray for stray in strays if np.linalg.norm(stray.position_m - place_m) < 2e-3]
+    assert len(near) == (len(frame) >= survey_faults.MIN_FRAMES)
+    assert survey_faults.stray_lights(frames, rows[:0], hot[:0], 0.1, 0.004) == []
+
+
+@law(survey_faults.name_strays)
+@given(rng=SEEDS, count=some.integers(0, 5))
+def test_strays_are_named_by_the_nearest_places(rng: np.random.Generator, count: int) -> None:
+    listed = 10 * rng.normal(0, 1, (8, 3))
+    chosen = rng.permutation(8)[:count]
+    strays = [StrayLight(listed[k] + 0.001 * rng.normal(0, 1, 3), 3) for k in chosen]
+    pairs = survey_faults.name_strays(strays, np.arange(8), listed, 0.1)
+    assert sorted(pairs) == sorted((int(k), n) for n, k in enumerate(chosen))
+    assert survey_faults.name_strays(strays, np.arange(0), listed, 0.1) == []
+
+
+@law(survey_faults.exchanged)
+@given(rng=SEEDS, gain=some.floats(0.1, 10))
+def test_exchanged_lights_are_named_whatever_the_gain(rng: np.random.Generator, gain: float) -> None:
+    levels = np.exp(np.linspace(0, -3, 12))[rng.permutation(12)]
+    shown = np.ones((10, 12), dtype=bool)
+    light = gain * levels * np.exp(0.03 * rng.normal(0, 1, (10, 12)))
+    expected = np.tile(levels, (10, 1))
+    none, observable = survey_faults.exchanged(LightTable(light, shown, expected))
+    assert none == []
+    assert observable > 0.5
+    light[:, [2, 9]] = light[:, [9, 2]]
+    found, _ = survey_faults.exchanged(LightTable(light, shown, expected))
+    far_apart = abs(np.log(levels[2] / levels[9])) > 0.5
+    assert ([(one.led, one.shows) for one in found] == [(2, 9), (9, 2)]) or not far_apart
+    alike, share = survey_faults.exchanged(LightTable(light, shown, np.ones((10, 12))))
+    assert (alike, share) == ([], 0.0)
+
+
+@law(Gauge.is_map)
+@given(rng=SEEDS)
+def test_a_gauge_is_the_map_s_unless_a_length_or_a_frame_is_given(rng: np.random.Generator) -> None:
+    place_m, held = rng.normal(0, 1, (4, 3)), attitudes(rng, 2).as_matrix()
+    assert Gauge(None, None, place_m, held).is_map
+    assert not Gauge((0, 1, 1.0), None, place_m, held).is_map
+    assert not Gauge(None, 1, place_m, held).is_map
+
+
+def test_a_model_of_no_noise_is_refused() -> None:
+    assert answered(lambda: replace(model(20), sigma_px=0.0)) is None
+    assert answered(lambda: replace(model(20), leds_sigma_m=np.inf)) is None
+    assert isinstance(model(20).camera, Camera)

@@ -1,0 +1,150 @@
+"""The survey's predicted errors against simulated surveys, its plan against random attitudes, and injected faults."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from surveyed_dome import LIST_SIGMA_M, NOISE_PX, attitudes, model, pixels
+
+from estimator.attitude.dome_map import Lever
+from estimator.calibration import survey_faults, survey_plan
+from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
+from estimator.calibration.survey_faults import LightTable
+from estimator.calibration.survey_plan import SurveyModel
+
+LEDS, FRAMES, SURVEYS = 120, 30, 60
+
+
+def planned(count: int, frames: int) -> tuple[SurveyModel, Rotation]:
+    """A dome as it is, and the attitudes of its plan."""
+    true, candidates = model(count), attitudes(np.random.default_rng(1), 300)
+    rows = survey_plan.choose(true, candidates, true.visible(candidates), frames)
+    return true, candidates[rows]
+
+
+def simulated(rng: np.random.Generator, true: SurveyModel, held: Rotation, sigma_factor: float = 1.0) -> DomeSurvey:
+    """A survey of noisy pixels with a list, a lever, a lens and start attitudes that are off.
+
+    sigma_factor : by which the noise is smaller than it is believed
+    """
+    frames = []
+    for attitude, seen in zip(held, true.visible(held), strict=True):
+        led = np.flatnonzero(seen)
+        xy_px = pixels(true, true.leds.position_m[led], attitude) + rng.normal(0, NOISE_PX, (len(led), 2))
+        start = Rotation.from_rotvec(0.005 * rng.normal(size=3)) * attitude
+        frames.append(DomeFrame(led, xy_px, np.full(len(led), sigma_factor * NOISE_PX), start))
+    listed = replace(true.leds, position_m=true.leds.position_m + rng.normal(0, LIST_SIGMA_M, (LEDS, 3)))
+    lever = Lever(true.lever.camera_body_m + rng.normal(0, 0.005, 3), true.lever.cam_from_body)
+    camera = replace(true.camera, focal_px=1.01 * true.camera.focal_px)
+    return survey(frames, listed, lever, camera, leds_sigma_m=LIST_SIGMA_M, fit_noise=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sigma_factor", [1.0, 3.0])
+def test_surveys_err_by_what_is_predicted(sigma_factor: float) -> None:
+    """Within 20 %, whatever noise is believed. The focal length has one error a survey: 9 % of chance with 60."""
+    true, held = planned(LEDS, FRAMES)
+    predicted = survey_plan.predict(true, held, true.visible(held))
+    rng, squares, claimed = np.random.default_rng(2), [], []
+    for _ in range(SURVEYS):
+        found = simulated(rng, true, held, sigma_factor)
+        assert abs(found.surveyed.sum() - predicted.measured.sum()) <= 2  # rays that hardly cross
+        led_m = (found.leds.position_m - true.leds.position_m)[found.surveyed]
+        lever_m = found.lever.camera_body_m - true.lever.camera_body_m
+        squares.append([np.mean(led_m**2), np.mean(lever_m**2), (found.camera.focal_px - true.camera.focal_px) ** 2])
+        claimed.append([np.nanmean(np.einsum("nii->n", found.led_covariance_m2)) / 3, found.misfit])
+        assert found.noise_scale * sigma_factor == pytest.approx(1, abs=5 / np.sqrt(2 * 150))
+    rms = np.sqrt(np.mean(squares, axis=0))
+    lever_m = np.sqrt(np.mean(predicted.lever_sigma_m**2))
+    np.testing.assert_allclose(rms / [predicted.led_rms_m, lever_m, predicted.lens_sigma[0]], 1, atol=0.2)
+    led_m2, misfit = np.mean(claimed, axis=0)
+    assert np.sqrt(led_m2) == pytest.approx(predicted.led_rms_m, rel=0.05)
+    assert misfit == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.slow
+def test_a_plan_needs_a_third_of_the_frames_of_random_attitudes() -> None:
+    """For the mean square error of all LEDs, of which those not seen keep the list's."""
+    true, held = planned(200, 40)
+    rng = np.random.default_rng(3)
+    random = attitudes(rng, 120)
+    errors = []
+    for some in (held, random):
+        led_m = survey_plan.predict(true, some, true.visible(some)).led_sigma_m
+        errors.append(np.sqrt(np.mean(led_m**2)))
+    assert errors[0] < errors[1]
+
+
+@pytest.mark.slow
+def test_a_plan_goes_on_from_the_frames_that_are_held() -> None:
+    """Of the same candidates the next choices are of LEDs that the first half of the dome does not show."""
+    true, candidates = model(200), attitudes(np.random.default_rng(4), 300)
+    shown = true.visible(candidates)
+    west = candidates[candidates.inv().apply(true.lever.cam_from_body.inv().apply([0, 0, 1.0]))[:, 0] < -0.15]
+    seen = true.visible(west)
+    further = survey_plan.choose(true, candidates, shown, 10, west, seen)
+    known = np.sum(seen, axis=0) >= 2
+    assert np.mean(shown[further][:, ~known].sum(axis=1)) > 1.3 * np.mean(shown[:, ~known].sum(axis=1))
+
+
+# --- false alarms -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_dome_without_a_fault_gives_few_alarms() -> None:
+    """One in a thousand surveys of each kind by design: 0.4 of 400, 5 by chance once in 16,000."""
+    rng, alarms = np.random.default_rng(5), np.zeros(2)
+    covariance = np.tile(0.01 * np.eye(3), (300, 1, 1))
+    for _ in range(400):
+        listed = rng.normal(0, 1, (300, 3))
+        found = listed + np.sqrt(1.01) * rng.normal(0, 1, (300, 3))
+        alarms[0] += len(survey_faults.displaced(listed, found, covariance)[0]) > 0
+        shown = rng.random((12, 300)) < 0.3
+        alarms[1] += len(survey_faults.dark(shown, shown & (rng.random((12, 300)) < 0.97))) > 0
+    assert (alarms <= 4).all()
+
+
+@pytest.mark.slow
+def test_exchanges_are_not_invented() -> None:
+    """LEDs that scatter by 8 % in four levels, 300 surveys of 100 of them: none."""
+    rng = np.random.default_rng(6)
+    alarms = 0
+    for _ in range(300):
+        levels = np.array([1.0, 0.7, 0.5, 0.35])[rng.integers(0, 4, 100)]
+        light = levels * np.exp(0.08 * rng.normal(size=100) + 0.02 * rng.normal(size=(8, 100)))
+        alarms += len(survey_faults.exchanged(LightTable(light, np.ones((8, 100), bool), np.tile(levels, (8, 1))))[0])
+    assert alarms == 0
+
+
+def test_a_dead_led_among_many_is_found_by_four_frames() -> None:
+    rng = np.random.default_rng(7)
+    shown = np.zeros((40, 600), dtype=bool)
+    for led in range(600):
+        shown[rng.permutation(40)[:4], led] = True
+    seen = shown & (rng.random(shown.shape) < 0.995)
+    seen[:, [17, 401]] = False
+    assert survey_faults.dark(shown, seen).tolist() == [17, 401]
+
+
+def test_codes_tell_exchanged_leds_of_one_brightness() -> None:
+    """Words of on and off that differ in half of the frames; two pairs at once, and a cycle of three."""
+    rng = np.random.default_rng(8)
+    words = rng.integers(0, 2, (60, 30)).T.astype(float)
+    truth = np.arange(60)
+    truth[[3, 9]] = [9, 3]
+    truth[[20, 30, 40]] = [30, 40, 20]
+    on = words[:, truth] > 0
+    light = np.where(on, np.exp(0.08 * rng.normal(size=60) + 0.03 * rng.normal(size=on.shape)), np.nan)
+    table = LightTable(light, np.ones_like(on), words)
+    found, observable = survey_faults.exchanged(table)
+    assert {(one.led, one.shows) for one in found} == {(3, 9), (9, 3), (20, 30), (30, 40), (40, 20)}
+    assert all(one.or_any_of == () for one in found)
+    assert observable > 0.8
+
+
+def test_the_median_of_a_chi_square_is_the_one_used() -> None:
+    assert pytest.approx(chi2.median(3), abs=1e-3) == survey_faults.CHI2_MEDIAN
