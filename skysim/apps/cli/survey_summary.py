@@ -126,7 +126,8 @@ def print_faults(faults: dict[str, Any]) -> None:
         print(f"LED {led} is {1e3 * distance_m:.1f} mm from its place in the list")
     for led, shows, others in faults["exchanged"]:
         alike = f" (or {', '.join(map(str, others))})" if others else ""
-        print(f"LED {shows}{alike} shines at the place of LED {led}: wires or numbers exchanged")
+        cause = "wires or numbers exchanged, or named wrongly by the IMU"
+        print(f"LED {shows}{alike} shines at the place of LED {led}: {cause}")
     for place_m in faults["unlisted"]:
         print(f"a light that is not in the list shines at {', '.join(f'{one:.3f}' for one in place_m)} m")
     print_wrapped(
