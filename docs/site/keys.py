@@ -72,6 +72,7 @@ TEXTS = {
     "tracker.solver": f"under stars {names(STAR_SOLVERS)}; under a dome {names(DOME_SOLVERS)}",
     "tracker.catalog": CATALOG,
     "tracker.map": "a file of `skysim survey`",
+    "optimize.cost.parts": "`assumed`, or a CSV file of prices",
     "light.catalog": CATALOG,
     "light.layout.catalog": CATALOG,
     "light.layout.file": "a CSV file",

@@ -352,7 +352,7 @@ def pareto_png(
         heights = [other.value, *(values[:, 1] for values in (also or {}).values())]
         axes.set_ylim(*layout.limits(heights, [other.low[marked], other.high[marked]], False, False))
         for name, values in (also or {}).items():
-            axes.plot(*values.T, "s:", color=INK, markerfacecolor="none", markersize=4, label=name)
+            axes.plot(*values.T, "s:", color=INK[0], markerfacecolor="none", markersize=4, label=name)
         low_m, high_m = drawn_interval(axes, Panel("", other.value, other.low, other.high, []))
         axes.vlines(one.value[marked], low_m[marked], high_m[marked], color=ORANGE, alpha=0.5, linewidth=1)
         axes.plot(one.value[marked], other.value[marked], "D--", color=ORANGE, label="front")
