@@ -168,3 +168,9 @@ def test_a_missing_price_and_a_missing_file_get_one_line(tmp_path: Path) -> None
         parts_list(loader.load("afit_simsat", SPHERE | {"tracker.survey.led_sigma": "0 mm"}), read_prices(path))
     with pytest.raises(InputError, match="cannot be read"):
         read_prices(tmp_path / "none.csv")
+
+
+def test_a_spreadsheet_s_byte_order_mark_is_no_part_of_the_table(tmp_path: Path) -> None:
+    path = tmp_path / "mine.csv"
+    path.write_bytes(b"\xef\xbb\xbf" + find_prices("assumed").read_bytes())
+    assert repr(read_prices(path).parts) == repr(read_prices(find_prices("assumed")).parts)  # NaN differs from NaN

@@ -73,7 +73,7 @@ def find_prices(name: str, folder: Path | None = None) -> Path:
 def read_prices(path: Path) -> Prices:
     """Read a table: comments begin with #, then the columns' names and one line a part. Raises InputError, one line."""
     try:
-        text = path.read_text(encoding="utf-8").splitlines()
+        text = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
         raise InputError(f"prices: {path} cannot be read ({error})") from None
     lines = [(n, line) for n, line in enumerate(text, 1) if line.strip() and not line.startswith("#")]
