@@ -16,7 +16,7 @@ from fuzz.__main__ import NAMES, seeds
 from fuzz.targets import TARGETS
 from skysim.core.paths import ROOT
 
-SEEDS = 6  # of each target: its readers are reached by any
+SEEDS = 12  # of each target: its readers are reached by any
 READER = re.compile(r"((read|load|unpack|parse)(e?d)?(_\w+)?|of_tree)$")  # by its name, if it is public
 PARSERS = {  # by what it calls, whatever its name
     *("json.loads", "np.loadtxt", "np.frombuffer", "np.load", "Table.read", "fits.open", "fits.getheader"),

@@ -183,7 +183,7 @@ def test_lights_are_named_as_they_are_or_not_at_all(eye: DomeTracker, rng: np.ra
     dome = index.build_dome_index(eye.leds, eye.lever, CAMERA)
     lights = search.build_detections(rays, sigma, dome)
     np.testing.assert_allclose(np.linalg.norm(lights.direction, axis=1), 1, rtol=0, atol=1e-9)
-    for match in (search.identify(rays, sigma, dome), eye.identify(rays, sigma)):
+    for match in (search.identify(rays, sigma, dome), eye.identify(rays, sigma, None)):
         named = [] if isinstance(match, str) else match.observed.tolist()
         assert len(set(named)) == len(named)
 
@@ -203,7 +203,7 @@ def test_no_lights_of_noise_have_an_attitude_under_a_dome(
     assert not eye.solve(noise.normal(100, 5, (480, 640))).attitude.solved
     answered(lambda: eye.solve(xy_px), ImageError)
     identify = dome_tracker.star_identifier(name, CAMERA, eye.leds, eye.lever, eye.settings)
-    assert isinstance(answered(lambda: identify(CAMERA.rays(xy_px), sigma)) or "refused", str)
+    assert isinstance(answered(lambda: identify(CAMERA.rays(xy_px), sigma, None)) or "refused", str)
 
 
 @law(dome_tracker.non_dimensional)
