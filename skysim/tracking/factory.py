@@ -68,13 +68,14 @@ def build_tracker(scene: Scene, mount: Mount, sources: Sources, programs: Mappin
         except ImageError as error:
             raise InputError(f"light: the star tracker cannot use this dome: {error}") from None
     stars = catalog.brighter_than(onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag)
-    directions = catalog.apparent(stars, assumed_observer(scene))
+    orbit = assumed_orbit(scene)
+    directions = catalog.apparent(stars, assumed_observer(scene, orbit))
     if isinstance(scene.light, CollimatedDisplayConfig):
         # The display's mounting defines where the stars are in the lab frame.
         directions = display.lab_from_icrs(scene.light).apply(directions)
     if scene.tracker.name != OWN:
         return ExternalTracker.start(scene, camera, settings, adapter.star_map(stars, directions), programs)
-    if orbit := assumed_orbit(scene):
+    if orbit:
         return OrbitStarTracker(camera, stars, directions, settings, orbit)
     return StarTracker(camera, stars, directions, settings, air=assumed_air(scene))
 

@@ -62,9 +62,11 @@ def assumed_orbit(scene: Scene) -> CameraOrbit | None:
     return build_orbit(scene.orbit, scene.start_time) if scene.tracker.orbit_velocity else None
 
 
-def assumed_observer(scene: Scene) -> catalog.Observer:
-    """The observer of the tracker's catalog at the scene's start: at the Earth's center, with the orbit's velocity."""
-    observer, orbit = catalog.on_earth(scene.start_time), assumed_orbit(scene)
+def assumed_observer(scene: Scene, orbit: CameraOrbit | None) -> catalog.Observer:
+    """The observer of the tracker's catalog at the scene's start: at the Earth's center, with the `assumed_orbit`'s
+    velocity.
+    """
+    observer = catalog.on_earth(scene.start_time)
     if orbit is None:
         return observer
     return replace(observer, velocity_m_s=observer.velocity_m_s + state_at(orbit, 0.0).velocity_m_s)

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.glow.background import pixel_directions, viewing_geometry
+from skysim.camera.glow.background import fill, pixel_directions, viewing_geometry
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats
 from skysim.scene.sections import layouts, leds, light
@@ -63,11 +63,9 @@ def projector_glow(
     view = viewing_geometry(*pixel_directions(nodes, optics), optics, cam_from_lab, band)
     white = projected_radiance_e_s_m2_sr(config, view.toward_lab, camera_m, band)
     glow = (black_transmission(config.layout) * white * view.etendue_m2_sr()).reshape(len(y), len(x))
-    along = np.array([np.interp(np.arange(camera.width_px), x, row) for row in glow])
-    line = np.arange(camera.height_px) / (camera.height_px - 1) * (len(y) - 1)
-    upper = np.minimum(line.astype(np.int64), len(y) - 2)
-    weight = (line - upper)[:, None]
-    return np.asarray(along[upper] * (1 - weight) + along[upper + 1] * weight)
+    out = np.empty((camera.height_px, camera.width_px))
+    fill(out, glow, 1.0)
+    return out
 
 
 @lru_cache(maxsize=2)

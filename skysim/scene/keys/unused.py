@@ -201,34 +201,22 @@ RULES = (
         "tracker.name: own, or tracker.options",
     ),
     Rule(
-        ("tracker.decoder",),
+        ("tracker.decoder", "tracker.brightness_sigma"),
         external,
         "an external tracker has its own algorithms",
         "tracker.name: own",
     ),
     Rule(
-        ("tracker.identifier",),
+        ("tracker.identifier", "tracker.brightness_sigma"),
         lambda scene: scene.tracker.decoder is not None,
         "the LEDs are identified by their codes",
         "no tracker.decoder",
-    ),
-    Rule(
-        ("tracker.brightness_sigma",),
-        external,
-        "an external tracker has its own algorithms",
-        "tracker.name: own",
     ),
     Rule(
         ("tracker.brightness_sigma",),
         lambda scene: not under_dome(scene),
         "stars are identified by their places",
         "a dome",
-    ),
-    Rule(
-        ("tracker.brightness_sigma",),
-        lambda scene: scene.tracker.decoder is not None,
-        "the LEDs are identified by their codes",
-        "no tracker.decoder",
     ),
     Rule(
         ("tracker.brightness_sigma",),

@@ -31,7 +31,7 @@ from skysim.sources.dome.displays import display
 from skysim.sources.dome.survey.survey_errors import led_covariance_m2
 from skysim.tracking import dome_map_file
 from skysim.tracking.onboard_model import assumed_camera, onboard_catalog
-from skysim.tracking.orbit_velocity import assumed_observer
+from skysim.tracking.orbit_velocity import assumed_observer, assumed_orbit
 from skysim.tracking.settings import assumed_settings
 
 REACH_PX = 7.0  # of neighbors
@@ -130,7 +130,7 @@ def believed_stars(testbed: Testbed) -> StarCatalog:
     """The tracker's stars at their believed directions in lab axes, unresolved ones merged. Raises InputError."""
     scene = testbed.scene
     stars = catalog.brighter_than(onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag)
-    directions = catalog.apparent(stars, assumed_observer(scene))
+    directions = catalog.apparent(stars, assumed_observer(scene, assumed_orbit(scene)))
     if isinstance(scene.light, CollimatedDisplayConfig):
         directions = display.lab_from_icrs(scene.light).apply(directions)
     merge_rad = assumed_settings(scene).merge_px / scene.camera.focal_px

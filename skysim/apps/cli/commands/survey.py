@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from skysim.experiments.dome_survey.findings import Coverage
     from skysim.experiments.dome_survey.frames import SurveyFrame
     from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty
+    from skysim.experiments.dome_survey.procedure import Plan
     from skysim.scene.scene import Scene
     from skysim.simulation.testbed import Testbed
 
@@ -153,13 +154,15 @@ def survey_mode(plan: bool, images: Path | None, camera: Path | None, repeat: in
     return mode
 
 
-def assumed_testbed(request: Request) -> tuple[Testbed, CalibrationPrior]:
-    """The test bed with the onboard model before a survey, whose errors are drawn, and that model."""
-    from skysim.experiments.dome_survey import prior
+def planned(request: Request) -> tuple[Testbed, CalibrationPrior, Plan]:
+    """The test bed with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
+    from skysim.experiments.dome_survey import prior, procedure
     from skysim.simulation.testbed import build_testbed
 
     testbed = build_testbed(prior.with_survey_errors(request.scene, request.uncertainty))
-    return testbed, prior.calibration_prior(testbed)
+    before, tilt_deg = prior.calibration_prior(testbed), request.tilt_deg
+    plan = procedure.make_plan(testbed, before, request.uncertainty, request.frames, tilt_deg, request.attitudes)
+    return testbed, before, plan
 
 
 def plan_only(request: Request) -> dict[str, Any]:
@@ -167,9 +170,7 @@ def plan_only(request: Request) -> dict[str, Any]:
     from skysim.core.io import files
     from skysim.experiments.dome_survey import findings, procedure
 
-    testbed, prior = assumed_testbed(request)
-    uncertainty = request.uncertainty
-    plan = procedure.make_plan(testbed, prior, uncertainty, request.frames, request.tilt_deg, request.attitudes)
+    _, _, plan = planned(request)
     path = files.make_folder(request.folder) / "plan.csv"
     procedure.write_plan(path, plan)
     return {
@@ -186,10 +187,8 @@ def repeated(request: Request, repeat: int) -> dict[str, Any]:
     """The errors predicted and those of simulated surveys, side by side."""
     from skysim.experiments.dome_survey import procedure
 
-    testbed, prior = assumed_testbed(request)
-    uncertainty = request.uncertainty
-    plan = procedure.make_plan(testbed, prior, uncertainty, request.frames, request.tilt_deg, request.attitudes)
-    surveys = procedure.repeat_survey(testbed, uncertainty, plan, repeat)
+    testbed, _, plan = planned(request)
+    surveys = procedure.repeat_survey(testbed, request.uncertainty, plan, repeat)
     errors = list(progress(surveys, repeat, "surveys"))
     return {
         "scene": request.scene.name,
@@ -207,10 +206,8 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str
     from skysim.simulation.testbed import build_tracker
     from skysim.tracking import factory
 
-    testbed, before = assumed_testbed(request)
-    uncertainty, tilt_deg = request.uncertainty, request.tilt_deg
-    first_tracker = build_tracker(testbed)
-    plan = procedure.make_plan(testbed, before, uncertainty, request.frames, tilt_deg, request.attitudes)
+    testbed, before, plan = planned(request)
+    uncertainty, first_tracker = request.uncertainty, build_tracker(testbed)
     taken = procedure.simulated_frames(testbed, uncertainty, plan.lab_from_body, frames_to)
     observations = list(progress(taken, len(plan.shown), "rendering"))
     with progress_callback("adjusting") as update, coverage_shown(request, observations, before, plan.model.sigma_px):
@@ -218,7 +215,7 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str
     statistics = write_results(request, run, before, testbed)
     tracker = factory.build_tracker(prior.with_map(testbed.scene, statistics["map"]), testbed.mount, testbed.sources)
     tests = frames.render_stops(
-        testbed, stops.stop_attitudes(testbed.scene, "checks", checks, tilt_deg), len(plan.shown)
+        testbed, stops.stop_attitudes(testbed.scene, "checks", checks, request.tilt_deg), len(plan.shown)
     )
     statistics |= report.truth_statistics(run, before, testbed)
     statistics |= report.compare_trackers(
