@@ -303,11 +303,11 @@ def test_a_finding_names_the_number_of_leds_where_the_study_varies_it(tmp_path: 
     """A level of another factor is checked at the first number of LEDs, which its name did not say."""
     factors = {
         "leds": {"key": "light.layout.count", "values": [60, 900]},
-        "size": {"key": "light.led.disk_diameter", "values": ["5 mm", "30 mm"]},
+        "disk": {"levels": {"small": {}, "large": {"light.led.disk_diameter": "10 mm"}}},
     }
     found = overview.overview(loaded(tmp_path, trial={"kind": "frames"}, factors=factors)).findings
     (wide,) = [one for one in found if "px wide; local treats" in one]
-    assert wide.endswith("[size = 30 mm, 60 LEDs]")
+    assert wide.endswith("[disk = large, 60 LEDs]")
 
 
 @pytest.mark.slow
