@@ -207,6 +207,15 @@ def print_summary(run: dict[str, Any]) -> None:
     print(f"report: {run['report']}")
 
 
+def print_head(name: str, run: dict[str, Any]) -> None:
+    """Print the result of a further star camera."""
+    print_wrapped(
+        f"{name}: {run['solved']} of {run['frames']} frames solved, {run['wrong']} wrong; "
+        f"cross-boresight median {run['cross_arcsec_median']:.3g}″, roll median {run['roll_arcsec_median']:.3g}″; "
+        f"report: {run['report']}"
+    )
+
+
 FACT_COLUMN = 21  # of the text of a fact
 MAX_WIDTH = 80  # of the lines of a check
 
