@@ -74,7 +74,7 @@ def residual_figure(run: SurveyRun) -> bytes:
 
 
 def draw_histogram(axes: Any, residual_px: Floats, noise_px: float) -> None:
-    """Residual coordinates as a density, with the Gaussian."""
+    """Residual coordinates as a density, with the Gaussian of the noise: wider, as a fit takes up part of the noise."""
     end_px = float(np.quantile(np.abs(residual_px), 1 - TAIL))
     x_px = np.linspace(-end_px, end_px, 200)
     inside = residual_px[np.abs(residual_px) <= end_px]
@@ -82,6 +82,7 @@ def draw_histogram(axes: Any, residual_px: Floats, noise_px: float) -> None:
     density = np.exp(-((x_px / noise_px) ** 2) / 2) / (noise_px * np.sqrt(2 * np.pi))
     axes.plot(x_px, density, color=INK[1], label=f"Gaussian of the noise, {noise_px:.2g} px")
     axes.set(xlabel="residual coordinate [px]", ylabel="density [1/px]", title="residuals")
+    axes.locator_params(axis="x", nbins=5)
     axes.legend()
 
 
