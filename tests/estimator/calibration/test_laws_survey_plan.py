@@ -166,6 +166,7 @@ def test_light_names_leds_that_the_list_has_in_the_wrong_order(rng: np.random.Ge
     listed, place_m, covariance, table = close_group(rng, levels)
     wrong = np.arange(60)
     wrong[[1, 2]] = [2, 1]
+    listed[[1, 2]] = place_m[[2, 1]]  # by place alone each would have the other's name
     mixed = replace(table, light=table.light[:, wrong])
     _, new = survey_faults.names(mixed, listed, place_m[wrong], covariance)
     np.testing.assert_array_equal(new, wrong)
