@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -190,6 +191,10 @@ def print_motion(run: dict[str, float]) -> None:
         "bias error {filter_bias_deg_h_end:.2g}°/h",
     }
     lines = [text.format(**run) for key, text in templates.items() if key in run]
+    mounts = re.findall(r"mounting_(\w+)_arcsec_end", " ".join(run))
+    if mounts:
+        errors = ", ".join(f"{name} {run[f'mounting_{name}_arcsec_end']:.3g}″" for name in mounts)
+        lines.append(f"mounting error at the end: {errors}")
     for n, line in enumerate(lines):
         print_wrapped(line, first=" " * 8 if n else "motion: ", others=" " * 8)
 
