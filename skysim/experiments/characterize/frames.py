@@ -46,10 +46,15 @@ class Stack:
 
 
 def image_files(folder: Path, option: str) -> list[Path]:
-    """The images of a folder and its subfolders, by name. Raises InputError without one."""
+    """The images of a folder and its subfolders, by name; of several formats of one name FITS. Raises InputError."""
     if not folder.is_dir():
         raise InputError(f"--{option} {folder}: no such folder; allowed: a folder of images")
-    found = [path for path in sorted(folder.rglob("*")) if images.image_suffix(path.name) and path.name[0] != "."]
+    best: dict[Path, Path] = {}
+    for path in sorted(folder.rglob("*")):
+        if (suffix := images.image_suffix(path.name)) and path.name[0] != ".":
+            stem = path.with_name(path.name[: -len(suffix)])
+            best[stem] = min(best.get(stem, path), path, key=lambda one: not images.is_fits(one))
+    found = list(best.values())
     if not found:
         raise InputError(f"--{option} {folder}: no images; allowed: {', '.join(images.IMAGE_SUFFIXES)}")
     return found

@@ -8,21 +8,24 @@ from pathlib import Path
 from typing import Any
 
 from skysim.core.errors import printable
+from skysim.experiments.characterize.night.lens import LENS, Night, lens_estimates
 from skysim.experiments.characterize.sensor.estimate import Estimate
 from skysim.experiments.characterize.sensor.sensor import Sensor
 from skysim.scene.data_sheet.sheet import Line, yaml_lines
+from skysim.scene.sections.camera import CameraConfig
 
 DIGITS = 6
 AT_LEAST_ZERO = ("nonlinearity", "hot_pixels")  # an estimate below 0 is 0
 
 
-def preset_text(camera: Mapping[str, Any], sensor: Sensor, name: str) -> str:
+def preset_text(camera: Mapping[str, Any], config: CameraConfig, sensor: Sensor, night: Night | None, name: str) -> str:
     """The file: YAML with the source of each value. camera : raw section of the camera that was measured"""
     head = [
         f"# {printable(name)}, measured. Written by `skysim characterize`.",
         "# [M] measured, with its 95 % interval. Other values are those of the camera's file.",
     ]
-    return "\n".join([*head, *yaml_lines(list(lines(camera, measured(sensor))))]) + "\n"
+    found = measured(sensor) | (measured_lens(config, night) if night else {})
+    return "\n".join([*head, *yaml_lines(list(lines(camera, found)))]) + "\n"
 
 
 def measured(sensor: Sensor) -> dict[str, tuple[Any, str]]:
@@ -39,6 +42,27 @@ def measured(sensor: Sensor) -> dict[str, tuple[Any, str]]:
     return found
 
 
+def measured_lens(config: CameraConfig, night: Night) -> dict[str, tuple[Any, str]]:
+    """Value and comment by key, of the lens."""
+    size = night.size
+    found: dict[str, tuple[Any, str]] = {
+        "psf.kind": ("gaussian", "[M]"),
+        "psf.sigma_px": (rounded(size.sigma_px.value), comment(size.sigma_px)),
+        "psf.corner_sigma_px": (rounded(size.corner_sigma_px.value), comment(size.corner_sigma_px)),
+    }
+    if night.lens is None:
+        return found
+    lens = lens_estimates(config, night.lens)
+    focal = lens["focal_length_mm"]
+    x, y, *distortion = (lens[name] for name in LENS[1:])
+    points = f"{comment(x)}, {y.low:.5g} to {y.high:.5g}"
+    return found | {
+        "focal_length": (f"{focal.value:.7g} mm", f"[M] {focal.low:.7g} to {focal.high:.7g} mm"),
+        "principal_point_px": ([rounded(x.value), rounded(y.value)], points),
+        "distortion": ([rounded(one.value) for one in distortion], f"k1 {comment(distortion[0])}"),
+    }
+
+
 def comment(one: Estimate) -> str:
     return f"[M] {one.low:.5g} to {one.high:.5g}"
 
@@ -51,6 +75,8 @@ def rounded(value: float) -> float:
 def lines(camera: Mapping[str, Any], found: Mapping[str, tuple[Any, str]]) -> Iterator[Line]:
     """The lines of the section with the values that were found in place of the camera's own, sections last."""
     tree = copy.deepcopy(dict(camera))
+    if "psf.kind" in found:
+        tree["psf"] = {}  # keys of another kind
     for key, (value, _) in found.items():
         section, _, last = key.rpartition(".")
         (tree.setdefault(section, {}) if section else tree)[last] = value

@@ -8,28 +8,32 @@ from typing import Any
 import numpy as np
 
 from skysim.core.errors import InputError
+from skysim.core.io import files
 from skysim.experiments.characterize import checks, preset
 from skysim.experiments.characterize.frames import read_stack
+from skysim.experiments.characterize.night import lens
+from skysim.experiments.characterize.night.lens import Night
 from skysim.experiments.characterize.sensor import sensor
 from skysim.experiments.characterize.sensor.estimate import Estimate
 from skysim.experiments.characterize.sensor.sensor import Sensor
 from skysim.scene import loader
 from skysim.scene.data_sheet.sheet import PLACEHOLDER_LENS
-from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig, GaussianPsfConfig
 
 UNITS = {
     "gain_e_dn": "e-/DN",
     "offset_dn": "DN",
     "read_noise_e": "e-",
     "full_well_e": "e-",
-    "nonlinearity": "",
     "dark_e_s": "e-/s",
     "dark_doubling_c": "K",
-    "dsnu": "",
-    "hot_pixels": "",
     "hot_e_s": "e-/s",
-    "prnu": "",
     "column_offset_e": "e-",
+    "sigma_px": "px",
+    "corner_sigma_px": "px",
+    "focal_length_mm": "mm",
+    "center_x_px": "px",
+    "center_y_px": "px",
 }
 
 
@@ -53,25 +57,54 @@ def measure_sensor(camera: CameraConfig, darks_folder: Path, flats_folder: Path)
     return sensor.characterize(darks.levels, flats.levels)
 
 
-def write_results(folder: Path, raw: dict[str, Any], found: Sensor, name: str) -> dict[str, Any]:
-    """Write the preset; returns its statistics, which `characterize.json` holds too."""
-    from skysim.core.io import files
+def measure_night(config: CameraConfig, raw: dict[str, Any], folder: Path, found: Sensor) -> Night:
+    """The lens from a folder of night frames. Raises InputError for a camera without a lens, and as `lens` does."""
+    if "focal_length" not in raw:
+        raise InputError(
+            "--night: the camera's file has no lens; allowed: with focal_length, to 5 %, and f_number in --camera"
+        )
+    return lens.measure_night(config, folder, found.transfer, found.saturation_dn)
 
+
+def write_results(
+    folder: Path, config: CameraConfig, raw: dict[str, Any], found: Sensor, night: Night | None, name: str
+) -> dict[str, Any]:
+    """Write the preset; returns its statistics, which `characterize.json` holds too."""
     path = folder / "camera.yaml"
-    preset.write(path, preset.preset_text(raw, found, name))
-    detector = raw["detector"]
+    preset.write(path, preset.preset_text(raw, config, found, night, name))
     statistics = {
         "camera": name,
         "preset": str(path),
         "temperature_c": found.dark_temperature_c,
-        "values": [row(key, one, detector.get(key)) for key, one in found.estimates.items()],
+        "values": [row(key, one, raw["detector"].get(key)) for key, one in found.estimates.items()],
         "linearity_error": found.linearity_error,
         "flicker": found.transfer.flicker,
         "misfit": found.transfer.misfit,
-        "remarks": found.remarks,
+        "night": night_statistics(config, night) if night else None,
+        "remarks": found.remarks + (night.remarks if night else []),
     }
     files.write_text(folder / "characterize.json", files.to_json(statistics))
     return statistics
+
+
+def night_statistics(config: CameraConfig, night: Night) -> dict[str, Any]:
+    """Rows of the lens, and the frames and stars from which they are."""
+    psf = config.psf if isinstance(config.psf, GaussianPsfConfig) else None
+    rows = [
+        row("sigma_px", night.size.sigma_px, psf and psf.sigma_px),
+        row("corner_sigma_px", night.size.corner_sigma_px, psf and psf.corner_sigma_px),
+    ]
+    if night.lens:
+        before = [1e3 * config.focal_length_m, *config.center_px, *config.distortion]
+        found = lens.lens_estimates(config, night.lens)
+        rows += [row(name, one, value) for (name, one), value in zip(found.items(), before, strict=True)]
+    return {
+        "values": rows,
+        "frames": night.frames,
+        "identified": night.identified,
+        "stars": len(night.size.used.chi2),
+        "rms_px": night.lens.report.rms_px if night.lens else None,
+    }
 
 
 def row(key: str, one: Estimate, before: object) -> dict[str, Any]:
@@ -81,7 +114,7 @@ def row(key: str, one: Estimate, before: object) -> dict[str, Any]:
         "value": one.value,
         "low": one.low,
         "high": one.high,
-        "unit": UNITS[key],
+        "unit": UNITS.get(key, ""),
         "file": before if isinstance(before, int | float) else None,
     }
 

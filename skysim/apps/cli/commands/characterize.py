@@ -23,6 +23,7 @@ def characterize(
     ],
     darks: Annotated[Path | None, typer.Option(help="Folder of darks, of two exposures or more.")] = None,
     flats: Annotated[Path | None, typer.Option(help="Folder of flats: pairs at exposures up to saturation.")] = None,
+    night: Annotated[Path | None, typer.Option(help="Folder of frames of the night sky, stars at rest.")] = None,
     frames_to: Annotated[
         Path | None, typer.Option(help="Measure nothing: write the darks and flats of --camera, simulated.")
     ] = None,
@@ -30,7 +31,7 @@ def characterize(
     out: Out = None,
     json: Json = False,
 ) -> None:
-    """Measure a camera from its own frames: gain, noise, dark current, full well, fixed pattern, to a preset.
+    """Measure a camera from its own frames: sensor from darks and flats, lens from the night sky, to a preset.
 
     The method is photon transfer, in the terms of EMVA 1288. Every value has its 95 % interval.
     """
@@ -39,15 +40,16 @@ def characterize(
 
     config, raw = procedure.read_camera(camera)
     if frames_to is not None:
-        given = {"darks": darks, "flats": flats, "out": out}
+        given = {"darks": darks, "flats": flats, "night": night, "out": out}
         if conflict := next((name for name, value in given.items() if value is not None), None):
             raise InputError(f"--{conflict}: has no effect with --frames-to; allowed: one of the two")
         write_simulated(config, frames_to, seed, json)
         return
     folders = procedure.check_folders(darks, flats)
     found = procedure.measure_sensor(config, *folders)
+    sky = procedure.measure_night(config, raw, night, found) if night else None
     name = Path(camera).stem
-    statistics = procedure.write_results(output_folder(out, name), raw, found, name)
+    statistics = procedure.write_results(output_folder(out, name), config, raw, found, sky, name)
     print_json(statistics) if json else print_results(statistics)
 
 
@@ -65,6 +67,7 @@ def write_simulated(config: Any, folder: Path, seed: int, json: bool) -> None:
 
 def print_results(statistics: dict[str, Any]) -> None:
     """Print the table of the values, what is not known, and the file."""
+    night = statistics["night"]
     lines = [
         [
             row["what"],
@@ -73,13 +76,18 @@ def print_results(statistics: dict[str, Any]) -> None:
             "-" if row["file"] is None else f"{row['file']:.5g}",
             row["unit"],
         ]
-        for row in statistics["values"]
+        for row in statistics["values"] + (night["values"] if night else [])
     ]
     print_table("", ["what", "measured", "95 %", "file", "unit"], lines)
     print()
     if statistics["temperature_c"] is not None:
         print_wrapped(f"dark current at {statistics['temperature_c']:g} °C")
     print_wrapped(f"linearity error {100 * statistics['linearity_error']:.2g} %, of 5 to 95 % of the saturation")
+    if night:
+        print_wrapped(
+            f"{night['stars']} star images in {night['frames']} frames; {night['identified']} frames identified"
+            + (f", residuals {night['rms_px']:.2g} px rms" if night["rms_px"] is not None else "")
+        )
     for remark in statistics["remarks"]:
         print_wrapped(f"unknown: {remark}")
     print_wrapped(f"{statistics['preset']}: for camera.preset")

@@ -34,6 +34,9 @@ class Sensor(NamedTuple):
 
     estimates : by key of `camera.detector`, in its units
     remarks   : what they do not tell, one line each
+    dark      : distribution of the dark current, None if it is below the noise
+    flats     : all levels, those too that are beyond the fit
+    saturation_dn : digital number of a saturated pixel, or of the brightest flat
     """
 
     estimates: dict[str, Estimate]
@@ -43,6 +46,7 @@ class Sensor(NamedTuple):
     dark_temperature_c: float | None
     flats: list[Point]
     linearity_error: float
+    saturation_dn: float
 
 
 def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> Sensor:
@@ -82,7 +86,8 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> Sensor:
     black = transfer.offset_dn
     estimates["offset_dn"] = Estimate.normal(black.value, math.hypot(black.sigma, scatter_dn))
     error = linearity_error(flat_points, transfer)
-    return Sensor(estimates, remarks, transfer, dark, temperatures[own], flat_points, error)
+    saturation_dn = max(one.moments.mean_dn for one in flat_points)
+    return Sensor(estimates, remarks, transfer, dark, temperatures[own], flat_points, error, saturation_dn)
 
 
 def rate_ratio(transfer: Transfer, own: int, chosen: int) -> float:
