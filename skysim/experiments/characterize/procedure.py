@@ -9,7 +9,7 @@ import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.io import files
-from skysim.experiments.characterize import checks, preset
+from skysim.experiments.characterize import checks, preset, report
 from skysim.experiments.characterize.frames import read_stack
 from skysim.experiments.characterize.night import lens
 from skysim.experiments.characterize.night.lens import Night
@@ -75,6 +75,7 @@ def write_results(
     statistics = {
         "camera": name,
         "preset": str(path),
+        "report": str(folder / "report.html"),
         "temperature_c": found.dark_temperature_c,
         "values": [row(key, one, raw["detector"].get(key)) for key, one in found.estimates.items()],
         "linearity_error": found.linearity_error,
@@ -84,6 +85,7 @@ def write_results(
         "remarks": found.remarks + (night.remarks if night else []),
     }
     files.write_text(folder / "characterize.json", files.to_json(statistics))
+    report.write_page(folder / "report.html", statistics, config, found, night)
     return statistics
 
 

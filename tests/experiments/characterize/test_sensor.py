@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import stats
+from two_samples import histogram_p
 
 from skysim.camera.detector import detector
 from skysim.camera.detector.detector import Detector
@@ -246,15 +247,6 @@ def test_intervals_cover_the_truth_in_95_percent_of_400_cameras() -> None:
 
 
 # Two samples
-
-
-def histogram_p(first: Floats, second: Floats) -> float:
-    """Two-sample chi-square of pixel histograms, bins merged to 20 counts or more of both."""
-    values, index = np.unique(np.concatenate([first, second]), return_inverse=True)
-    counts = np.stack([np.bincount(half, minlength=len(values)) for half in np.split(index, [len(first)])])
-    groups = np.cumsum(counts.sum(axis=0)) // 20
-    merged = np.stack([np.bincount(groups, weights=one) for one in counts])
-    return float(stats.chi2_contingency(merged[:, merged.sum(axis=0) > 0]).pvalue)
 
 
 @pytest.mark.slow

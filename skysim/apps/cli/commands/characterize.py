@@ -90,4 +90,4 @@ def print_results(statistics: dict[str, Any]) -> None:
         )
     for remark in statistics["remarks"]:
         print_wrapped(f"unknown: {remark}")
-    print_wrapped(f"{statistics['preset']}: for camera.preset")
+    print_wrapped(f"{statistics['preset']}: for camera.preset; {statistics['report']}")

@@ -33,7 +33,8 @@ CATALOG, DEFAULT_EPOCH_YR = "gaia_v8.0", 2020.0
 STARS_A_FIELD = 300.0  # of the catalog, on average
 FOCAL_UNCERTAINTY = 0.05  # of the focal length in the camera's file
 LEAST_SNR, MAX_PEAK = 40.0, 0.8  # of a star whose image is measured; its peak over saturation
-LEAST_STARS, LEAST_FRAMES = 20, 3
+LEAST_STARS, LEAST_FRAMES, LEAST_TRAILED = 20, 3, 3
+MEDIAN_COST = 1.25  # standard error of a median over that of a mean
 MAX_STRETCH = 0.25  # of the images, over their variance
 LENS = ("focal_px", "center_x_px", "center_y_px", "k1", "k2", "p1", "p2", "k3")
 
@@ -60,7 +61,8 @@ class NightFrame(NamedTuple):
 def measure_night(config: CameraConfig, folder: Path, transfer: Transfer, saturation_dn: float) -> Night:
     """The lens from frames of the sky. Raises InputError for frames that do not tell."""
     frames = [read_frame(path, config, transfer, saturation_dn) for path in image_files(folder, "night")]
-    stars = StarImages(*(np.concatenate(part) for part in zip(*(one.stars for one in frames), strict=True)))
+    still = [without_trail(one.stars) for one in frames]
+    stars = StarImages(*(np.concatenate(part) for part in zip(*still, strict=True)))
     if len(stars.chi2) < LEAST_STARS:
         raise InputError(
             f"--night {folder}: {len(stars.chi2)} single stars of a signal to noise of {LEAST_SNR:g}, not saturated, in"
@@ -121,12 +123,28 @@ def measurable(numbers: NDArray[Any], centroids: Centroids, transfer: Transfer, 
     return np.asarray(xy[kept])
 
 
+def trail_px2(stars: StarImages) -> tuple[float, float]:
+    """Median difference of the variances along the rows and along the columns, and twice the median covariance."""
+    if len(stars.chi2) < LEAST_TRAILED:
+        return 0.0, 0.0
+    along, across = np.median(stars.stretch_px2, axis=0)
+    return float(along), float(across)
+
+
+def without_trail(stars: StarImages) -> StarImages:
+    """The images without what a common trail adds to their mean variance: half of the stretch, less its own error."""
+    count = max(len(stars.chi2), 1)
+    noise2 = float(np.sum(np.var(stars.stretch_px2, axis=0))) * MEDIAN_COST**2 / count if count > 1 else 0.0
+    added = math.sqrt(max(math.hypot(*trail_px2(stars)) ** 2 - noise2, 0.0)) / 2
+    return stars._replace(variance_px2=stars.variance_px2 - added)
+
+
 def check_trails(frames: list[NightFrame]) -> None:
     """Raise InputError for a frame whose stars trail: their images are longer in one direction."""
     for one in frames:
-        if len(one.stars.chi2) < 3:
+        if not len(one.stars.chi2):
             continue
-        along, across = np.median(one.stars.stretch_px2, axis=0)
+        along, across = trail_px2(one.stars)
         stretch, variance = math.hypot(along, across), float(np.median(one.stars.variance_px2))
         if stretch > MAX_STRETCH * variance:
             trail_px = math.sqrt(12 * stretch)  # a uniform streak of length L has the variance L^2 / 12
