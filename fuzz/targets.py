@@ -28,12 +28,9 @@ from skysim.dynamics.multibody import mjcf
 from skysim.dynamics.profiles.load import read_profile
 from skysim.dynamics.profiles.samples import check_samples
 from skysim.dynamics.profiles.spline import fit_spline
-<<<<<<< HEAD
 from skysim.experiments.characterize.frames import read_settings
 from skysim.experiments.dome_survey import images as survey_images
-=======
 from skysim.experiments.dome_survey.folder import images as survey_images
->>>>>>> 79de4f6b7ff2088bf9f9c30a716d433bd70f9f8c
 from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study import store
 from skysim.results.files import recording
