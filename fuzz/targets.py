@@ -29,7 +29,6 @@ from skysim.dynamics.profiles.load import read_profile
 from skysim.dynamics.profiles.samples import check_samples
 from skysim.dynamics.profiles.spline import fit_spline
 from skysim.experiments.characterize.frames import read_settings
-from skysim.experiments.dome_survey import images as survey_images
 from skysim.experiments.dome_survey.folder import images as survey_images
 from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study import store
