@@ -33,6 +33,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "skysim solve night.png --time 2012-06-22T21:00:00",
     ),
     "survey": ("skysim survey afit_simsat --frames 60 --checks 5 --out out/surveyed",),
+    "characterize": (
+        "skysim characterize --camera imx264 --darks lab/darks --flats lab/flats --out out/mine",
+        "skysim characterize --camera mine.yaml --frames-to out/lab",
+    ),
     "camera": ("skysim camera", "skysim camera shefex2", "skysim camera new --out my.yaml"),
     "camera show": (
         "skysim camera shefex2 --out out/shefex2.yml",
