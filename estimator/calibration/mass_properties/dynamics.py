@@ -97,7 +97,7 @@ class Motion:
 
     def __init__(self, record: BearingRecord, lab: Lab, parameters: Floats) -> None:
         inertia = inertia_matrix(parameters[INERTIA]) + record.added_inertia_kg_m2[:, :, None]
-        self.inverse: Floats = np.moveaxis(np.linalg.inv(np.moveaxis(inertia, 2, 0)), 0, 2)
+        self.inverse = np.linalg.inv(inertia.transpose(2, 0, 1)).transpose(1, 2, 0)
         self.moment = parameters[MOMENT] + record.added_moment_kg_m[:, None]
         self.lab_torque, self.drag = parameters[LAB_TORQUE], parameters[DRAG]
         self.wheel_scale = 1 + parameters[WHEELS:]
