@@ -23,6 +23,7 @@ class Vehicle:
     moment_kg_m: Floats
     lab_torque_nm: Floats
     drag: tuple[float, float] = (0.0, 0.0)
+    bias_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     wheel_errors: tuple[float, float, float] = (0.0, 0.0, 0.0)
     torque_rms_nm: float = 2e-6
     correlation_s: float = 2.0
@@ -30,9 +31,16 @@ class Vehicle:
 
     @property
     def truth(self) -> Floats:
-        """(17,) in the order of the estimator's parameters."""
+        """(20,) in the order of the estimator's parameters."""
         return np.array(
-            [*inertia_six(self.inertia_kg_m2), *self.moment_kg_m, *self.lab_torque_nm, *self.drag, *self.wheel_errors]
+            [
+                *inertia_six(self.inertia_kg_m2),
+                *self.moment_kg_m,
+                *self.lab_torque_nm,
+                *self.drag,
+                *self.bias_rad,
+                *self.wheel_errors,
+            ]
         )
 
     @property
@@ -98,7 +106,7 @@ def record(vehicle: Vehicle, rng: np.random.Generator, duration_s: float = 62.0,
     noise = vehicle.attitude_sigma_rad * rng.standard_normal((len(t_s[::every]), 3))
     return BearingRecord(
         t_s[::every],
-        lab_from_body[::every] * Rotation.from_rotvec(noise),
+        lab_from_body[::every] * Rotation.from_rotvec(vehicle.bias_rad) * Rotation.from_rotvec(noise),
         np.tile(vehicle.attitude_sigma_rad**2 * np.eye(3), (len(noise), 1, 1)),
         t_s,
         wheels * wheel_momenta(t_s) / (1 + np.array(vehicle.wheel_errors)),
@@ -106,9 +114,10 @@ def record(vehicle: Vehicle, rng: np.random.Generator, duration_s: float = 62.0,
 
 
 def prior(vehicle: Vehicle, rng: np.random.Generator) -> tuple[Prior, Vehicle]:
-    """What is assumed of a vehicle, and the vehicle with its wheels' errors drawn: all within their deviations."""
-    sigma = np.array([*[0.01] * 3, *[0.005] * 3, *[3e-5] * 3, *[1e-5] * 3, 1e-4, 1e-3, *[1e-3] * 3])
-    true = replace(vehicle, wheel_errors=tuple(1e-3 * rng.standard_normal(3)))
-    assumed = vehicle.truth + sigma * rng.standard_normal(17)
+    """What is assumed of a vehicle, and the vehicle with bias and wheel errors drawn: all within their deviations."""
+    sigma = np.array([*[0.01] * 3, *[0.005] * 3, *[3e-5] * 3, *[1e-5] * 3, 1e-4, 1e-3, *[5e-4] * 3, *[1e-3] * 3])
+    bias, wheels = 5e-4 * rng.standard_normal(3), 1e-3 * rng.standard_normal(3)
+    true = replace(vehicle, bias_rad=tuple(bias), wheel_errors=tuple(wheels))
+    assumed = vehicle.truth + sigma * rng.standard_normal(20)
     assumed[14:] = 0
     return Prior(assumed, sigma), true

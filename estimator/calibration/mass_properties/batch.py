@@ -16,18 +16,29 @@ parameters, whose covariance is the inverse of the sum.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError, solveh_banded
+from scipy.spatial.transform import Rotation
 
 from estimator.calibration.mass_properties.dynamics import STATE, Motion, States, transition, turn
-from estimator.calibration.mass_properties.record import BearingRecord, Lab, MassEstimate, Prior, inertia_matrix
+from estimator.calibration.mass_properties.record import (
+    BIAS,
+    BearingRecord,
+    Lab,
+    MassEstimate,
+    Prior,
+    inertia_matrix,
+)
 from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
 
 MAX_ITERATIONS = 30
 CONVERGED_SIGMA = 0.01  # largest step of a parameter, in its standard deviations
+MISFIT_TOLERANCE, MAX_FACTORS = 0.1, 8  # of the logarithm of the misfit; fits to reach it
+FACTOR_POWER, FACTOR_LIMITS = 1.5, (1e-3, 1e3)  # above 1: the random torque's share of the misfit stays
 BANDS = 2 * STATE  # of the normal matrix: a state and its neighbor
 
 
@@ -69,6 +80,23 @@ def estimate_mass(records: Sequence[BearingRecord], lab: Lab, prior: Prior) -> M
     raise ImageError("mass properties: the fit does not converge; allowed: a motion that the assumed values describe")
 
 
+def estimate_with_noise(records: Sequence[BearingRecord], lab: Lab, prior: Prior) -> MassEstimate:
+    """The mass properties, with the attitudes' covariance scaled by a factor at which the misfit is 1.
+
+    A tracker's own covariance is too large where it counts an error that successive attitudes share (of the map of the
+    LEDs), and too small where an error is unknown to it. The level of the random torque is taken as known. Raises
+    ImageError as `estimate_mass`.
+    """
+    factor = 1.0
+    for _ in range(MAX_FACTORS):
+        scaled = [replace(one, covariance_rad2=factor * one.covariance_rad2) for one in records]
+        estimate = estimate_mass(scaled, lab, prior)
+        if abs(np.log(estimate.misfit)) < MISFIT_TOLERANCE:
+            break
+        factor = float(np.clip(factor * estimate.misfit**FACTOR_POWER, *FACTOR_LIMITS))
+    return replace(estimate, attitude_factor=factor)
+
+
 def first_states(record: BearingRecord, lab: Lab, values: Floats) -> States:
     """States to begin with: the measured attitudes, the momentum of their differences, no random torque."""
     motion = Motion(record, lab, values[:, None])
@@ -91,13 +119,14 @@ def reduced(record: BearingRecord, states: States, lab: Lab, values: Floats, sig
     for block, to in ((before, slice(None, -1)), (after, slice(1, None))):
         diagonal[to] += products[:, block, block]
         border[to] += products[:, block, rest]
-    chi2 = float(np.sum(rows[:, :, -1] ** 2)) + add_measured(record, states, lab, diagonal, border[:, :, -1])
+    corner = products[:, rest, rest].sum(axis=0)
+    chi2 = float(np.sum(rows[:, :, -1] ** 2)) + add_measured(record, states, lab, values, (diagonal, border, corner))
     flat = border.reshape(-1, size + 1)
     try:
         solved = solveh_banded(lower_band(diagonal, products[:, before, after]), flat, lower=True)
     except LinAlgError as error:
         raise ImageError(f"mass properties: {error}") from error
-    corner = products[:, rest, rest].sum(axis=0) - flat.T @ solved
+    corner -= flat.T @ solved
     return Reduced(corner[:-1, :-1], -corner[:-1, -1], -solved[:, -1], solved[:, :-1], chi2)
 
 
@@ -112,17 +141,32 @@ def whitened_links(record: BearingRecord, states: States, lab: Lab, values: Floa
     return np.asarray(np.linalg.inv(np.linalg.cholesky(link.noise)) @ rows)
 
 
-def add_measured(record: BearingRecord, states: States, lab: Lab, diagonal: Floats, gradient: Floats) -> float:
-    """Add the attitudes (N), and what is known of the first random torque, to normal blocks (N, 9, 9) and gradient
-    (N, 9); return their chi-square.
+def add_measured(
+    record: BearingRecord, states: States, lab: Lab, values: Floats, to: tuple[Floats, Floats, Floats]
+) -> float:
+    """Add the attitudes (N), and what is known of the first random torque; return their chi-square.
+
+    A measured attitude is R exp(bias) exp(noise). `to` are the blocks that are added to: diagonal (N, 9, 9), border
+    (N, 9, P + 1) and corner (P + 1, P + 1); the last column is the gradient.
     """
+    diagonal, border, corner = to
     weight, torque_weight = np.linalg.inv(record.covariance_rad2), lab.torque_rms_nm**-2.0
-    off = (states.rotation.inv() * record.lab_from_body).as_rotvec()
+    off = measured_minus(record.lab_from_body, states.rotation, values[BIAS])
+    pull = np.einsum("nij,nj->ni", weight, off)
     diagonal[:, :3, :3] += weight
-    gradient[:, :3] -= np.einsum("nij,nj->ni", weight, off)
+    border[:, :3, BIAS] += weight
+    border[:, :3, -1] -= pull
+    corner[BIAS, BIAS] += weight.sum(axis=0)
+    corner[BIAS, -1] -= pull.sum(axis=0)
+    corner[-1, BIAS] -= pull.sum(axis=0)
     diagonal[0, 6:, 6:] += np.diag(torque_weight)
-    gradient[0, 6:] += torque_weight * states.torque[:, 0]
-    return float(np.einsum("ni,nij,nj", off, weight, off) + torque_weight @ states.torque[:, 0] ** 2)
+    border[0, 6:, -1] += torque_weight * states.torque[:, 0]
+    return float(np.sum(off * pull) + torque_weight @ states.torque[:, 0] ** 2)
+
+
+def measured_minus(measured: Rotation, lab_from_body: Rotation, bias_rad: Floats) -> Floats:
+    """(N, 3) rotation vectors of attitudes measured minus those of the states with the tracker's bias."""
+    return np.asarray(((lab_from_body * Rotation.from_rotvec(bias_rad)).inv() * measured).as_rotvec())
 
 
 def lower_band(diagonal: Floats, beside: Floats) -> Floats:

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
 
-INERTIA, MOMENT, LAB_TORQUE, DRAG, WHEELS = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 14), 14
+INERTIA, MOMENT, LAB_TORQUE, DRAG = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 14)
+BIAS, WHEELS = slice(14, 17), 17  # the wheels' are the last
 TRIANGLE = ((0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2))  # rows and columns of the six numbers of an inertia tensor
 MIN_ATTITUDES = 4
 
@@ -72,8 +73,8 @@ class Prior:
     """Values assumed before, (P,), and their standard deviations.
 
     In the order: inertia xx, yy, zz, xy, xz, yz about the bearing (kg m2); moment m r, mass times center of mass (3,)
-    (kg m); torque constant in the lab (3,) (N m); viscous and quadratic drag (N m s, N m s2); relative error of
-    each wheel's assumed axial inertia (n).
+    (kg m); torque constant in the lab (3,) (N m); viscous and quadratic drag (N m s, N m s2); rotation of the
+    tracker's body axes from the true ones (3,) (rad); relative error of each wheel's assumed axial inertia (n).
     """
 
     values: Floats
@@ -90,14 +91,14 @@ class MassEstimate:
 
     values, covariance : (P,) and (P, P), in the order of `Prior`
     misfit     : chi-square of the residuals over their number; 1 if noise and torques are as assumed
-    torque_nm  : (3,) mean of the random torque over all records, about lab axes
-    iterations : 0 of a recursive estimate
+    iterations : 0 of a recursive estimate;  attitude_factor : by which the attitudes' covariance was scaled
     """
 
     values: Floats
     covariance: Floats
     misfit: float
     iterations: int = 0
+    attitude_factor: float = 1.0
 
     @property
     def inertia_kg_m2(self) -> Floats:

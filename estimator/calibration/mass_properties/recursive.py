@@ -3,8 +3,9 @@
 State and parameters are those of `batch`; the parameters are constant. Between attitudes the estimate is integrated
 (`dynamics.transition`) and its covariance becomes F P F^T + Q; an attitude with the residual r and the covariance S
 corrects it by K r, K = P H^T (H P H^T + S)^-1 (Gelb, Applied Optimal Estimation, 1974, ch. 6), where H selects the
-attitude's error. The filter linearizes once, at its estimate of the moment. It diverges from assumptions that are far
-off, since the rate is the ratio of two unknowns, momentum and inertia; a batch over the first attitudes begins it.
+attitude's error plus the tracker's bias. The filter linearizes once, at its estimate of the moment. It diverges from
+assumptions that are far off, since the rate is the ratio of two unknowns, momentum and inertia; a batch over the first
+attitudes begins it.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator.calibration.mass_properties.batch import estimate_mass, first_states
+from estimator.calibration.mass_properties.batch import estimate_mass, first_states, measured_minus
 from estimator.calibration.mass_properties.dynamics import STATE, transition
-from estimator.calibration.mass_properties.record import MIN_ATTITUDES, BearingRecord, Lab, MassEstimate, Prior
+from estimator.calibration.mass_properties.record import BIAS, MIN_ATTITUDES, BearingRecord, Lab, MassEstimate, Prior
 from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
 
@@ -51,6 +52,7 @@ def filter_from(begun: MassEstimate, record: BearingRecord, lab: Lab, prior_sigm
     size, values = len(begun.values), begun.values
     states = first_states(record, lab, values).take(slice(1, 2))
     covariance = first_covariance(begun, record, lab)
+    at_bias = slice(STATE + BIAS.start, STATE + BIAS.stop)
     chi2 = 0.0
     for n in range(2, len(record.t_s)):
         link = transition(record, lab, n - 1, states, values, prior_sigma)
@@ -58,9 +60,10 @@ def filter_from(begun: MassEstimate, record: BearingRecord, lab: Lab, prior_sigm
         F[:STATE] = np.hstack([link.by_state[0], link.by_parameter[0]])
         covariance = F @ covariance @ F.T
         covariance[:STATE, :STATE] += link.noise[0]
-        off = (link.after.rotation[0].inv() * record.lab_from_body[n]).as_rotvec()
-        innovation = covariance[:3, :3] + record.covariance_rad2[n]
-        gain = np.linalg.solve(innovation, covariance[:3]).T
+        off = measured_minus(record.lab_from_body[n], link.after.rotation, values[BIAS])[0]
+        seen = covariance[:3] + covariance[at_bias]
+        innovation = seen[:, :3] + seen[:, at_bias] + record.covariance_rad2[n]
+        gain = np.linalg.solve(innovation, seen).T
         chi2 += float(off @ np.linalg.solve(innovation, off))
         change = gain @ off
         covariance = joseph(covariance, gain, record.covariance_rad2[n])
@@ -87,4 +90,5 @@ def joseph(covariance: Floats, gain: Floats, noise: Floats) -> Floats:
     """The covariance after an attitude, (I - K H) P (I - K H)^T + K S K^T, which stays positive."""
     kept = np.eye(len(covariance))
     kept[:, :3] -= gain
+    kept[:, STATE + BIAS.start : STATE + BIAS.stop] -= gain
     return np.asarray(kept @ covariance @ kept.T + gain @ noise @ gain.T)

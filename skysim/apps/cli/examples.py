@@ -33,6 +33,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "skysim solve night.png --time 2012-06-22T21:00:00",
     ),
     "survey": ("skysim survey afit_simsat --frames 60 --checks 5 --out out/surveyed",),
+    "balance": (
+        "skysim balance cubesat_table",
+        "skysim balance simsat_slew --estimate-only --offset-bar '5 um'",
+    ),
     "camera": ("skysim camera", "skysim camera shefex2", "skysim camera new --out my.yaml"),
     "camera show": (
         "skysim camera shefex2 --out out/shefex2.yml",

@@ -12,6 +12,7 @@ import typer
 from estimator.core.errors import ImageError
 from skysim import __version__
 from skysim.apps.cli.commands.availability import availability
+from skysim.apps.cli.commands.balance import balance
 from skysim.apps.cli.commands.camera import app as cameras
 from skysim.apps.cli.commands.files import catalog_app, export, scenes_app
 from skysim.apps.cli.commands.gui import gui
@@ -38,6 +39,7 @@ COMMANDS = (
     trackers,
     solve,
     survey,
+    balance,
     reproduce,
     gui,
     validate,

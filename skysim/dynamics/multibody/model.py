@@ -116,8 +116,9 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
     """The vehicle's MJCF on a bearing at the lab's origin, as MjSpec; its mass properties and its trim masses.
 
     mount `air_bearing`: gravity along lab -z and a tilt stop. mount `free`: neither, and the vehicle rotates
-    about its center of mass, which must be the body's origin. Mass properties are as declared, apart from trim
-    masses in other places than zero. Joints of actuators that the scene does not switch on are locked. Raises InputError with one line.
+    about its center of mass, which must be the body's origin. Mass properties are as declared, apart from trim masses
+    in other places than zero. Joints of actuators that the scene does not switch on are locked. Raises InputError with
+    one line.
     """
     if vehicle.mount == "free" and any(vehicle.center_of_mass_m):
         raise InputError(

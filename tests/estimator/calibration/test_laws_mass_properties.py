@@ -67,7 +67,7 @@ def test_a_transition_predicts_small_changes(rng: np.random.Generator) -> None:
     states = batch.first_states(RECORD, SMALL.lab, assumed.values).take(slice(0, 6))
     link = dynamics.transition(RECORD, SMALL.lab, 0, states, assumed.values, assumed.sigma)
     change = np.outer(np.repeat([1e-4, 1e-6, 1e-8], 3), np.ones(6)) * rng.standard_normal((STATE, 6))
-    by = 1e-3 * assumed.sigma * rng.standard_normal(17)
+    by = 1e-3 * assumed.sigma * rng.standard_normal(20)
     other = dynamics.transition(RECORD, SMALL.lab, 0, states.moved(change), assumed.values + by, assumed.sigma)
     expected = np.einsum("kij,jk->ik", link.by_state, change) + (link.by_parameter @ by).T
     scale = np.repeat([1e-6, 1e-8, 1e-10], 3)[:, None]
@@ -78,7 +78,16 @@ def test_a_transition_predicts_small_changes(rng: np.random.Generator) -> None:
     assert all((step > 0).all() for step in steps)
 
 
-@law(batch.estimate_mass, batch.first_states, batch.reduced, batch.whitened_links, batch.add_measured, batch.lower_band)
+@law(
+    batch.estimate_mass,
+    batch.estimate_with_noise,
+    batch.first_states,
+    batch.reduced,
+    batch.whitened_links,
+    batch.add_measured,
+    batch.lower_band,
+    batch.measured_minus,
+)
 @given(rng=SEEDS)
 def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) -> None:
     """The band of the states and their elimination against a dense inverse; more records, smaller errors."""
@@ -92,14 +101,16 @@ def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) ->
     for k, row in enumerate(rows):
         at = np.r_[STATE * k : STATE * (k + 2), STATE * count : len(whole)]
         whole[np.ix_(at, at)] += row.T @ row
-    diagonal, gradient = np.zeros((count, STATE, STATE)), np.zeros((count, STATE))
-    batch.add_measured(RECORD, states, lab, diagonal, gradient)
+    diagonal, border = np.zeros((count, STATE, STATE)), np.zeros((count, STATE, size + 1))
+    corner = np.zeros((size + 1, size + 1))
+    batch.add_measured(RECORD, states, lab, values, (diagonal, border, corner))
+    whole[STATE * count :, STATE * count :] += corner
     for k in range(count):
         at = slice(STATE * k, STATE * (k + 1))
         whole[at, at] += diagonal[k]
-        whole[at, -1] += gradient[k]
-    inner, border = whole[: STATE * count, : STATE * count], whole[: STATE * count, STATE * count :]
-    schur = whole[STATE * count :, STATE * count :] - border.T @ np.linalg.solve(inner, border)
+        whole[at, STATE * count :] += border[k]
+    inner, outer = whole[: STATE * count, : STATE * count], whole[: STATE * count, STATE * count :]
+    schur = whole[STATE * count :, STATE * count :] - outer.T @ np.linalg.solve(inner, outer)
     scale = np.outer(assumed.sigma, assumed.sigma)
     np.testing.assert_allclose(part.normal * scale, schur[:-1, :-1] * scale, rtol=1e-4, atol=1e-4)
     band = batch.lower_band(diagonal, np.zeros((count - 1, STATE, STATE)))
@@ -110,13 +121,13 @@ def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) ->
 @given(rng=SEEDS)
 def test_an_estimate_reads_its_vector(rng: np.random.Generator) -> None:
     half = rng.standard_normal((3, 3))
-    values = rng.standard_normal(17)
+    values = rng.standard_normal(20)
     values[:6] = inertia_six(half + half.T)
-    estimate = MassEstimate(values, np.diag(np.arange(1.0, 18.0) ** 2), 1.0)
+    estimate = MassEstimate(values, np.diag(np.arange(1.0, 21.0) ** 2), 1.0)
     np.testing.assert_array_equal(estimate.inertia_kg_m2, inertia_matrix(values[:6]))
     np.testing.assert_array_equal(estimate.inertia_kg_m2, half + half.T)
     np.testing.assert_array_equal(estimate.moment_kg_m, values[6:9])
-    np.testing.assert_allclose(estimate.sigma, np.arange(1.0, 18.0))
+    np.testing.assert_allclose(estimate.sigma, np.arange(1.0, 21.0))
 
 
 @law(

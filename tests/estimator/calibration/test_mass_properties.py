@@ -10,7 +10,7 @@ from bearing_motion import GRAVITY_M_S2, INERTIA, SMALL, Vehicle, prior, record
 from scipy.special import ellipj, ellipkinc
 from scipy.stats import chi2
 
-from estimator.calibration.mass_properties.batch import estimate_mass
+from estimator.calibration.mass_properties.batch import estimate_mass, estimate_with_noise
 from estimator.calibration.mass_properties.dynamics import Motion, States
 from estimator.calibration.mass_properties.record import BearingRecord, Lab, MassEstimate
 from estimator.calibration.mass_properties.recursive import filter_mass
@@ -102,6 +102,20 @@ def test_a_hundred_draws_err_as_their_covariance_says() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.2, 5.0])
+def test_wrong_tracker_covariance_is_found_from_the_misfit(factor: float) -> None:
+    rng = np.random.default_rng(10)
+    assumed, vehicle = prior(SMALL, rng)
+    one = record(vehicle, rng)
+    wrong = replace(one, covariance_rad2=factor * one.covariance_rad2)
+    estimate = estimate_with_noise([wrong], vehicle.lab, assumed)
+    right = estimate_mass([one], vehicle.lab, assumed)
+    assert estimate.attitude_factor * factor == pytest.approx(1, rel=0.4)
+    assert nees(estimate, vehicle) < chi2.ppf(0.9999, 9)
+    np.testing.assert_allclose(estimate.sigma[NINE], right.sigma[NINE], rtol=0.3)
+
+
+@pytest.mark.slow
 def test_filter_in_flight_ends_where_the_batch_does() -> None:
     for one, lab, _, batch in draws(3, 2):
         rng = np.random.default_rng(5)
@@ -130,9 +144,9 @@ def test_a_motion_of_known_trim_adds_the_scale() -> None:
     rng = np.random.default_rng(9)
     vehicle = replace(SMALL, moment_kg_m=np.array([1e-5, -2e-5, -4e-4]), lab_torque_nm=np.zeros(3))
     added = np.array([5e-5, 3e-5, -4e-4])
+    assumed, vehicle = prior(vehicle, rng)
     trimmed = replace(vehicle, moment_kg_m=vehicle.moment_kg_m + added)
     one, two = record(vehicle, rng, wheels=False), record(trimmed, rng, wheels=False)
-    assumed, _ = prior(vehicle, rng)
     alone = estimate_mass([one], vehicle.lab, assumed)
     both = estimate_mass([one, replace(two, added_moment_kg_m=added)], vehicle.lab, assumed)
     assert both.sigma[0] < alone.sigma[0] / 5
