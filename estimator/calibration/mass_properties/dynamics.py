@@ -97,7 +97,9 @@ class Motion:
 
     def __init__(self, record: BearingRecord, lab: Lab, parameters: Floats) -> None:
         inertia = inertia_matrix(parameters[INERTIA]) + record.added_inertia_kg_m2[:, :, None]
-        self.inverse: Floats = np.asarray(np.linalg.inv(inertia.transpose(2, 0, 1)), dtype=np.float64).transpose(1, 2, 0)
+        self.inverse: Floats = np.asarray(np.linalg.inv(inertia.transpose(2, 0, 1)), dtype=np.float64).transpose(
+            1, 2, 0
+        )
         self.moment = parameters[MOMENT] + record.added_moment_kg_m[:, None]
         self.lab_torque, self.drag = parameters[LAB_TORQUE], parameters[DRAG]
         self.wheel_scale = 1 + parameters[WHEELS:]
