@@ -37,6 +37,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "skysim characterize --camera imx264 --darks lab/darks --flats lab/flats --out out/mine",
         "skysim characterize --camera mine.yaml --frames-to out/lab",
     ),
+    "balance": (
+        "skysim balance cubesat_table",
+        "skysim balance simsat_slew --estimate-only --offset-bar '5 um'",
+    ),
     "camera": ("skysim camera", "skysim camera shefex2", "skysim camera new --out my.yaml"),
     "camera show": (
         "skysim camera shefex2 --out out/shefex2.yml",
