@@ -34,7 +34,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "survey": ("skysim survey afit_simsat --frames 60 --checks 5 --out out/surveyed",),
     "characterize": (
-        "skysim characterize --camera imx264 --darks lab/darks --flats lab/flats --out out/mine",
+        "skysim characterize --camera imx264 --darks lab/darks --flats lab/flats",
         "skysim characterize --camera mine.yaml --frames-to out/lab",
     ),
     "balance": (
