@@ -33,6 +33,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "skysim solve night.png --time 2012-06-22T21:00:00",
     ),
     "survey": ("skysim survey afit_simsat --frames 60 --checks 5 --out out/surveyed",),
+    "datasheet": ("skysim datasheet shefex2 --quick", "skysim datasheet afit_simsat --fields 200 --out out/afit_sheet"),
     "camera": ("skysim camera", "skysim camera shefex2", "skysim camera new --out my.yaml"),
     "camera show": (
         "skysim camera shefex2 --out out/shefex2.yml",

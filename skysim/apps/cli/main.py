@@ -13,6 +13,7 @@ from estimator.core.errors import ImageError
 from skysim import __version__
 from skysim.apps.cli.commands.availability import availability
 from skysim.apps.cli.commands.camera import app as cameras
+from skysim.apps.cli.commands.datasheet import datasheet
 from skysim.apps.cli.commands.files import catalog_app, export, scenes_app
 from skysim.apps.cli.commands.gui import gui
 from skysim.apps.cli.commands.reproduce import reproduce
@@ -38,6 +39,7 @@ COMMANDS = (
     trackers,
     solve,
     survey,
+    datasheet,
     reproduce,
     gui,
     validate,
