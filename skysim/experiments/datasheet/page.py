@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from functools import partial
 from pathlib import Path
 
 from skysim.core.io.files import make_folder, to_json, write_bytes, write_text
@@ -30,7 +29,7 @@ def command(sheet: Sheet, quick: bool) -> str:
 def figure_png(name: str, statement: Statement) -> bytes:
     """A figure as PNG."""
     drawing = FIGURES[name]
-    return png(partial(drawing.draw, statement=statement), drawing.size_in)
+    return png(lambda fig: drawing.draw(fig, statement), drawing.size_in)
 
 
 def write_all(folder: Path, statement: Statement, quick: bool) -> dict[str, Path]:

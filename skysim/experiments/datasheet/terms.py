@@ -56,7 +56,7 @@ def term_errors(sheet: Sheet) -> tuple[Floats, np.ndarray]:
     errors = sheet.errors(rows)
     shape = (3, designer.units, designer.states, size.attitudes, size.frames, size.fields)
     errors = np.moveaxis(errors.reshape(shape), -1, 1)
-    solved = np.isfinite(errors).all(axis=(0, 2, 3, 4, 5))
+    solved = np.asarray(np.isfinite(errors).all(axis=(0, 2, 3, 4, 5)))
     if solved.sum() < MIN_FIELDS:
         share = max(float(solved.mean()), 1 / size.fields)
         raise InputError(

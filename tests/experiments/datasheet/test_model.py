@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skysim.experiments.datasheet.model import export
+from skysim.experiments.datasheet.model import export, fit
 from skysim.experiments.datasheet.model.errors import ErrorModel, State, correlated
 
 CONSTANTS: dict[str, Any] = {
@@ -130,3 +130,13 @@ def test_the_unit_runs_in_another_tool_with_the_same_errors(tmp_path: Path, mode
     assert len(result) == 21
     found = np.array([[row[name] for name in outputs] for row in result[1:]])
     assert found == pytest.approx(np.array(expected), rel=1e-6)
+
+
+def test_the_scatter_of_the_fields_comes_from_two_estimates_of_each():
+    """Noise whose variance is lognormal over the fields, seen by eight frames in each estimate: not widened by these."""
+    rng = np.random.default_rng(9)
+    variance = np.exp(0.7 * rng.standard_normal(60_000))
+    first, second = (variance * rng.chisquare(7, 60_000) / 7 for _ in range(2))
+    assert fit.log_scale(first, second) == pytest.approx(0.7, rel=0.05)
+    assert fit.log_scale(first, first) > 0.8
+    assert fit.log_scale(np.ones(9), np.ones(9)) == 0

@@ -11,7 +11,7 @@ from skysim.core.types import Floats
 from skysim.experiments.datasheet.components import components, effects, mean_known
 from skysim.experiments.datasheet.model.errors import AXES
 from skysim.experiments.datasheet.run import Sheet
-from skysim.experiments.datasheet.terms import term_errors
+from skysim.experiments.datasheet.terms import GROUPS, term_errors
 
 GRID = 60  # correlation angles that are tried
 LEAST_NOISE = 0.05  # of the mean square at a rate: noise below it is not told from the slow terms
@@ -23,7 +23,7 @@ def constants(sheet: Sheet) -> dict[str, Any]:
     found = [components(one) for one in errors]
     field, pixel = (np.sqrt(np.maximum([getattr(one, name) for one in found], 0)) for name in ("field", "pixel"))
     bias = [bias_terms(one) for one in errors]
-    scale = [log_scale(one) for one in (errors[:2], errors[:2], errors[2:])]
+    across, about = (log_scale(*field_variances(sheet, axes)) for axes in GROUPS.values())
     rates, squares = squares_by_rate(sheet)
     slow = np.array([one[0] ** 2 for one in bias]) + field**2 + pixel**2
     noise = np.sqrt(np.maximum(squares - slow, LEAST_NOISE * squares))
@@ -35,7 +35,7 @@ def constants(sheet: Sheet) -> dict[str, Any]:
         "unit": [one[1] for one in bias],
         "field": field.tolist(),
         "pixel": pixel.tolist(),
-        "scale": scale,
+        "scale": [across, across, about],
         "field_deg": field_angle_deg(sheet, field, pixel, [one[0] for one in bias]),
         "pixel_deg": sheet.designer.pixel_deg,
         "scale_deg": sheet.designer.half_field_deg,
@@ -52,16 +52,23 @@ def bias_terms(errors: Floats) -> tuple[float, float]:
     return float(errors.mean()), math.sqrt(max(scatter, 0.0))
 
 
-def log_scale(errors: Floats) -> float:
-    """Standard deviation of the logarithm of a field's noise variance, from (axes, fields, ...) errors.
+def log_scale(first: Floats, second: Floats) -> float:
+    """Standard deviation of the logarithm of a field's noise variance, from two estimates of it in each of (F,) fields.
 
-    A lognormal variance has E[v^2] / E[v]^2 = exp(scale^2). Two estimates of a field's variance from other attitudes
-    have independent errors, so the mean of their product is E[v^2].
+    A lognormal variance has E[v^2] / E[v]^2 = exp(scale^2). The estimates are of other frames, so their errors are
+    independent and the mean of their product is E[v^2].
     """
-    variance = np.var(errors, axis=-1, ddof=1).mean(axis=(0, 2, 3))
-    halves = [variance[:, half::2].mean(axis=1) for half in range(2)]
-    ratio = float(np.mean(halves[0] * halves[1]) / (halves[0].mean() * halves[1].mean()))
+    ratio = float(np.mean(first * second) / (first.mean() * second.mean()))
     return math.sqrt(math.log(max(ratio, 1.0)))
+
+
+def field_variances(sheet: Sheet, axes: slice) -> tuple[Floats, Floats]:
+    """Two estimates of the noise variance in each field: of the terms' frames, and of the sequence at rest."""
+    errors, solved = term_errors(sheet)
+    terms = np.var(errors[axes], axis=-1, ddof=1).mean(axis=(0, 2, 3, 4))
+    rest = sequences(sheet, 0.0)[1][axes][:, :, solved]
+    known = np.isfinite(rest).all(axis=(0, 1))
+    return terms[known], np.var(rest[:, :, known], axis=1, ddof=1).mean(axis=0)
 
 
 def sequences(sheet: Sheet, rate_deg_s: float) -> tuple[list[int], Floats]:
