@@ -28,7 +28,7 @@ from skysim.dynamics.multibody import mjcf
 from skysim.dynamics.profiles.load import read_profile
 from skysim.dynamics.profiles.samples import check_samples
 from skysim.dynamics.profiles.spline import fit_spline
-from skysim.experiments.dome_survey import images as survey_images
+from skysim.experiments.dome_survey.folder import images as survey_images
 from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study import store
 from skysim.results.files import recording

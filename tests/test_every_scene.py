@@ -225,6 +225,8 @@ def whole(request: pytest.FixtureRequest) -> Testbed:
 @pytest.mark.long
 def test_the_camera_sees_five_leds_all_along_the_maneuver(whole: Testbed) -> None:
     """In every frame, at geometry alone: what is on the chip, by the tracker's map."""
+    if isinstance(whole.scene.light, StarsConfig):
+        pytest.skip("no LEDs")
     eyes, counts = build_tracker(whole), []
     for index in range(whole.scene.exposure.frames):
         body_from_lab = whole.trajectory.attitude_at(exposure_window(whole.scene, index).open_s).inv()
@@ -243,7 +245,8 @@ def test_it_is_steered_to_where_it_is_told_and_off_its_stop(whole: Testbed) -> N
     assert error_deg[-1] < 0.1  # some are still on their way
     assert np.median(error_deg) < 0.05
     up = telemetry.lab_from_body.as_matrix()[:, 2, 2]
-    assert np.degrees(np.arccos(np.clip(up, -1, 1))).max() < 29
+    tilt_deg = np.degrees(np.arccos(np.clip(up, -1, 1)))
+    assert whole.scene.vehicle.mount == "free" or tilt_deg.max() < 29
 
 
 # --- the vehicles, at the hands of chance -------------------------------------------------------------------

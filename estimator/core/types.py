@@ -271,7 +271,8 @@ class FilterState:
     covariance    : (N, N) of the small rotation in body axes (rad^2), of the bias (rad^2/s^2), then of `others` in
         order; N is 6 without others
     others        : estimates of the filter's other states by name: "scale" (3,) of the gyro's axes, "misalignment"
-        (6,) of its matrix off the diagonal, row by row (rad), "mounting" (3,) of the tracker in body axes (rad)
+        (6,) of its matrix off the diagonal, row by row (rad), "mounting" (3,) of the tracker in body axes (rad), of
+        further star cameras relative to the first "mounting_1" and so on
     """
 
     t_s: float

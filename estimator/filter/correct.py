@@ -9,19 +9,21 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.arrays import Floats
 from estimator.filter.propagate import rotate_quaternion, transition
-from estimator.filter.states import Layout, State
+from estimator.filter.states import Layout, State, of_head
 
 
 class Solution(NamedTuple):
     """A star tracker's solution, at the time of a State.
 
     noise_rad2      : (3, 3) covariance of its small rotation error in body axes, without what solutions share
-    systematic_rad2 : (3, 3) covariance of the slow error that it shares with others
+    systematic_rad2 : (3, 3) covariance of the slow error that it shares with others of its head
+    head            : number of the star camera
     """
 
     body_from_ref: Rotation
     noise_rad2: Floats
     systematic_rad2: Floats
+    head: int = 0
 
 
 class Innovation(NamedTuple):
@@ -55,7 +57,7 @@ def innovation(prior: State, solution: Solution, layout: Layout) -> Innovation:
     after many solutions, so the expected residual is small; but if the slow error changed faster than
     assumed, the gate would refuse correct solutions.
     """
-    slow, offsets = layout.slices["systematic"], offset_rows(solution, layout)
+    slow, offsets = layout.slices[of_head("systematic", solution.head)], offset_rows(solution, layout)
     measured = Rotation.from_rotvec(offsets @ prior.values) * solution.body_from_ref
     residual = (prior.body_from_ref * measured.inv()).as_rotvec()
     inverse = np.linalg.inv(right_jacobian(residual))
@@ -124,11 +126,12 @@ def adopt(prior: State, solution: Solution, layout: Layout, bias_variance: Float
 
 
 def offset_rows(solution: Solution, layout: Layout) -> Floats:
-    """(3, N) the offset of a solution from the states: the mounting, and L times the normalized slow error."""
+    """(3, N) the offset of a solution from the states: its mounting, and L times the normalized slow error."""
     offsets = np.zeros((3, layout.size))
-    offsets[:, layout.slices["systematic"]] = root(solution.systematic_rad2)
-    if "mounting" in layout.slices:
-        offsets[:, layout.slices["mounting"]] = np.eye(3)
+    offsets[:, layout.slices[of_head("systematic", solution.head)]] = root(solution.systematic_rad2)
+    for head in {0, solution.head}:
+        if mounting := layout.slices.get(of_head("mounting", head)):
+            offsets[:, mounting] = np.eye(3)
     return offsets
 
 

@@ -102,6 +102,7 @@ class AttitudeFilter:
     tracker, jumps     : errors that solutions share; wrong solutions and missed motions
     considered         : names of the states that are considered and not estimated, of "bias", "scale", "misalignment",
         "mounting", "systematic"
+    heads              : number of star cameras on the body, each with its own mounting and slow error
 
     Considered states (Schmidt 1966). Their uncertainty is in the covariance and in the gain; their value stays 0 and
     their variance as it was. So a state that the data hardly shows cannot take up other errors.
@@ -110,6 +111,11 @@ class AttitudeFilter:
     filter's attitude tends to it. It is the considered state "systematic": a slow error whose covariance is the
     solution's own `systematic_rad2` plus that of TrackerModel. The covariance of the attitude then tends to it too, for
     any number of solutions. A constant one cannot be seen in the residuals, so the filter has to be given its size.
+
+    Several heads. Each solution is truth exp(o_n + v), as above, with the offset o_n = m_0 + m_n + L slow_n of head n
+    and m_n, its mounting relative to that of the first head, estimated. At rest the solutions show only m_n, so m_0 is
+    considered. Where the body turns about more than one axis and the gyro is accurate, they show m_0 too, the rotation
+    of the first head relative to the gyro's axes: it is estimated if `considered` is without "mounting".
 
     Saturation. While the gyro is at its rate limit, the true rate can be anything above it. The rate error is assumed
     constant throughout the saturation, with a standard deviation on each axis as large as the measured rate
@@ -145,6 +151,7 @@ class AttitudeFilter:
         tracker: TrackerModel | None = None,
         jumps: JumpModel | None = None,
         considered: tuple[str, ...] = CONSIDERED,
+        heads: int = 1,
     ) -> None:
         checks.of_type("filter: gyro", gyro, GyroModel)
         checks.one_rotation("filter: body_from_ref", body_from_ref)
@@ -153,7 +160,7 @@ class AttitudeFilter:
         self._floor_rad2 = not_negative("floor_rad", floor_rad) ** 2
         # The chi-square of 3 degrees of freedom with the tail probability of gate_sigma for a scalar Gaussian.
         self._gate = float(chdtri(3, chdtrc(1, not_negative("gate_sigma", gate_sigma) ** 2)))
-        self._layout = build_layout(gyro, self._tracker, considered)
+        self._layout, self._heads = build_layout(gyro, self._tracker, considered, heads), heads
         sigma_bias = not_negative("sigma_bias_rad_s", sigma_bias_rad_s) * np.ones(3)
         sigmas: dict[str, ArrayLike] = {
             "attitude": not_negative("sigma_attitude_rad", sigma_attitude_rad) * np.ones(3),
@@ -229,19 +236,23 @@ class AttitudeFilter:
         body_from_ref_measured: Rotation,
         covariance_rad2: ArrayLike,
         systematic_rad2: ArrayLike | None = None,
+        head: int = 0,
     ) -> Update:
         """Apply a star tracker's solution for the current or a past time, then repropagate from there to the present.
 
         covariance_rad2 : (3, 3) of the small rotation error of the solution, in body axes
         systematic_rad2 : (3, 3) the part of it that is common to successive solutions; None for 0
+        head            : number of the star camera, from 0
 
         Raises ValueError for a covariance that is not symmetric and positive definite, a systematic part that is not
-        less, or a time after the last sample.
+        less, a head that there is not, or a time after the last sample.
         """
         checks.one_rotation("update: body_from_ref_measured", body_from_ref_measured)
         t_s = checks.number("update: t_s", t_s, -math.inf, math.inf, "a time in seconds")
         now_s = self._current.t_s
-        solution = self._solution(body_from_ref_measured, covariance_rad2, systematic_rad2)
+        if head not in range(self._heads):
+            raise ValueError(f"update: head {head}; allowed: 0 to {self._heads - 1}")
+        solution = self._solution(body_from_ref_measured, covariance_rad2, systematic_rad2, head)
         if not t_s <= now_s + ROUNDING_S:
             raise ValueError(f"update: a solution at {t_s} s; allowed: up to the last gyro sample, {now_s} s")
         if t_s < self._segments[0].state.t_s:
@@ -271,12 +282,14 @@ class AttitudeFilter:
         self._current = self._propagate_state(self._segments[-1].state, self._segments[-1].samples)
         return update
 
-    def _solution(self, body_from_ref: Rotation, total_rad2: ArrayLike, systematic_rad2: ArrayLike | None) -> Solution:
+    def _solution(
+        self, body_from_ref: Rotation, total_rad2: ArrayLike, systematic_rad2: ArrayLike | None, head: int
+    ) -> Solution:
         """The solution with the filter's floor and systematic error added to its covariances, after checks."""
         noise, systematic = checked_covariances(total_rad2, systematic_rad2)
         unit = np.eye(3)
         common = systematic + self._tracker.systematic_rad**2 * unit
-        return Solution(body_from_ref, noise + self._floor_rad2 * unit, common)
+        return Solution(body_from_ref, noise + self._floor_rad2 * unit, common, head)
 
     def _weigh(self, prior: State, solution: Solution, update: Update) -> Update:
         """The update by a solution outside the gate: refused, or a reset if the filter is probably wrong."""

@@ -55,7 +55,8 @@ class TrackerModel:
     systematic_rad       : standard deviation about each axis of the slow error: distortion across the field, a survey
     systematic_time_s    : its correlation time; inf for a constant
     systematic_angle_rad : rotation after which it is another one, because other stars are in the field
-    mounting_rad         : standard deviation about each axis of the constant rotation from assumed to true mount
+    mounting_rad         : standard deviation about each axis of the rotation from assumed to true mount
+    mounting_drift_rad_sqrt_s : its random walk about each axis, rad / sqrt(s); 0 for a constant one
 
     The slow error is a first-order Gauss-Markov process with the correlation exp(-T / time - rotation / angle). The
     covariance that a solution names (`Attitude.systematic_rad2`) is part of the same process, and is added to
@@ -66,9 +67,12 @@ class TrackerModel:
     systematic_time_s: float = 3600.0
     systematic_angle_rad: float = 0.2
     mounting_rad: float = 0.0
+    mounting_drift_rad_sqrt_s: float = 0.0
 
     def __post_init__(self) -> None:
         _check(self, "tracker", above_0=("systematic_time_s", "systematic_angle_rad"))
+        if self.mounting_drift_rad_sqrt_s and not self.mounting_rad:
+            raise ValueError("tracker: mounting_drift_rad_sqrt_s needs mounting_rad above 0")
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,25 +18,31 @@ OFF_DIAGONAL = np.array([1, 2, 3, 5, 6, 7])
 
 
 class Layout(NamedTuple):
-    """Order of the error states: attitude (3), bias (3), then those in use, then the tracker's slow error (3).
+    """Order of the error states: attitude (3), bias (3), then those in use, then the slow error (3) of each head.
 
     The slow error is normalized: its standard deviation is 1, and each solution has the matrix that makes it an angle.
+    Heads are the star cameras on the body. The states of head n above 0 have its number in their name: "mounting_1",
+    which is relative to the mounting of the first head.
 
     size      : N
     slices    : of each state by name, "attitude" and "systematic" included
+    slow      : that of the slow errors of all heads
+    mountings : (M,) index of each state of a mounting
     columns   : (9,) state of each element of the gyro's matrix M, row by row; -1 if it is none
     estimated : (N,) whether its value is estimated; False if it is only considered
     """
 
     size: int
     slices: dict[str, slice]
+    slow: slice
+    mountings: Ints
     columns: Ints
     estimated: Floats
 
     @property
     def reported(self) -> dict[str, slice]:
         """The slices without the normalized slow error, whose effect is in the covariance of the attitude."""
-        return {name: rows for name, rows in self.slices.items() if name != "systematic"}
+        return {name: rows for name, rows in self.slices.items() if not name.startswith("systematic")}
 
 
 class State(NamedTuple):
@@ -65,7 +71,12 @@ class State(NamedTuple):
         return Rotation.from_quat(self.ref_from_body_wxyz, scalar_first=True).inv()
 
 
-def build_layout(gyro: GyroModel, tracker: TrackerModel, considered: tuple[str, ...]) -> Layout:
+def of_head(name: str, head: int) -> str:
+    """The name of a head's state."""
+    return f"{name}_{head}" if head else name
+
+
+def build_layout(gyro: GyroModel, tracker: TrackerModel, considered: tuple[str, ...], heads: int = 1) -> Layout:
     """The states in use. Raises ValueError for a considered one that there is not."""
     unknown = sorted(set(considered) - set(STATES))
     if unknown:
@@ -75,27 +86,32 @@ def build_layout(gyro: GyroModel, tracker: TrackerModel, considered: tuple[str, 
         "bias": 3,
         "scale": 3 * (gyro.scale > 0),
         "misalignment": 6 * (gyro.misalignment_rad > 0),
-        "mounting": 3 * (tracker.mounting_rad > 0),
-        "systematic": 3,
+        **{of_head("mounting", head): 3 * (tracker.mounting_rad > 0) for head in range(heads)},
+        **{of_head("systematic", head): 3 for head in range(heads)},
     }
+    # The mount of the first head defines the attitude of the body, so the others can be estimated beside it.
+    fixed = {of_head(name, head) for name in considered for head in range(heads if name == "systematic" else 1)}
     slices, size, estimated = {}, 0, []
     for name, count in counts.items():
         if count:
             slices[name] = slice(size, size + count)
             size += count
-            estimated += [float(name not in considered)] * count
+            estimated += [float(name not in fixed)] * count
     columns = np.full(9, -1)
     for name, elements in (("scale", DIAGONAL), ("misalignment", OFF_DIAGONAL)):
         if name in slices:
             columns[elements] = np.arange(slices[name].start, slices[name].stop)
-    return Layout(size, slices, columns, np.array(estimated))
+    slow = slice(slices["systematic"].start, size)
+    mounts = [rows for name, rows in slices.items() if name.startswith("mounting")]
+    mountings = [row for rows in mounts for row in range(rows.start, rows.stop)]
+    return Layout(size, slices, slow, np.array(mountings, dtype=int), columns, np.array(estimated))
 
 
 def start_state(t_s: float, wxyz: Floats, sigmas: dict[str, ArrayLike], layout: Layout) -> State:
     """The state at the start: all values 0, all states independent with these standard deviations."""
     sigma = np.empty(layout.size)
     for name, rows in layout.slices.items():
-        sigma[rows] = sigmas[name]
+        sigma[rows] = sigmas[name.partition("_")[0]]
     return State(t_s, wxyz, np.zeros(layout.size), np.diag(sigma**2), 0.0, 0.0, t_s, wxyz, 0)
 
 
@@ -110,10 +126,13 @@ def propagate_state(state: State, samples: Floats, gyro: GyroModel, tracker: Tra
         1 / tracker.systematic_time_s,
         gyro.outage_rad_s,
     )
-    slow, inverse = layout.slices["systematic"], inverse_response(state.values, layout.columns)
+    slow, inverse = layout.slow, inverse_response(state.values, layout.columns)
     wxyz, values, covariance, saturation_rad, lost_rad = advance(
         tuple(state[:6]), samples, noise, layout.columns, inverse, (slow.start, slow.stop)
     )
+    # Nothing else depends on a mounting between two solutions, so its random walk can be added at the end.
+    walked_rad2 = tracker.mounting_drift_rad_sqrt_s**2 * (float(samples[-1, 0]) - state.t_s)
+    covariance[layout.mountings, layout.mountings] += walked_rad2
     return state._replace(
         t_s=float(samples[-1, 0]),
         ref_from_body_wxyz=wxyz,
@@ -125,13 +144,13 @@ def propagate_state(state: State, samples: Floats, gyro: GyroModel, tracker: Tra
 
 
 def decorrelate(state: State, tracker: TrackerModel, layout: Layout) -> State:
-    """Let the tracker's slow error change by the rotation since the last solution that was used."""
-    rows = layout.slices["systematic"]
+    """Let the slow errors change by the rotation since the last solution that was used."""
+    rows = layout.slow
     # The angle between two quaternions; the scalar product may exceed 1 by rounding.
     turned_rad = 2 * math.acos(min(abs(float(state.ref_from_body_wxyz @ state.used_wxyz)), 1.0))
     kept = math.exp(-turned_rad / tracker.systematic_angle_rad)
     factor = np.ones(layout.size)
     factor[rows] = kept
     covariance = state.covariance * np.outer(factor, factor)
-    covariance[rows, rows] += (1 - kept**2) * np.eye(3)
+    covariance[rows, rows] += (1 - kept**2) * np.eye(rows.stop - rows.start)
     return state._replace(values=state.values * factor, covariance=covariance)

@@ -165,19 +165,24 @@ class CodedTracker(DomeTracker):
         # An error of the same size in all frames of a light: relative errors of its dim frames would invite noise.
         greatest = np.nanmax(tracks.sigma[usable], axis=1, keepdims=True)
         sigma = np.where(np.isfinite(tracks.light[usable]), greatest, 1.0)
-        misfit = self._misfit(tracks.light[usable], sigma)
-        plausible = misfit.min(axis=1) <= codes.expected_misfit(measured[usable])
-        usable, misfit = usable[plausible], misfit[plausible]
+        misfit, lights = self._misfit(tracks.light[usable], sigma), len(usable)
+        plausible = misfit.min(axis=(0, 2)) <= codes.expected_misfit(measured[usable])
+        usable, misfit = usable[plausible], misfit[:, plausible]
         if len(usable) < 2:
             self.phases[:] = True
             return COLLECTING
+        misfit = misfit / codes.excess_noise(misfit.min(axis=(0, 2)), measured[usable])
         row = tracks.row[usable]
-        lights = naming.NamedLights(*self._tangents(centroids.take(row)), misfit)
-        match = naming.identify(lights, self.sphere)
-        return match if isinstance(match, str) else replace(match, observed=row[match.observed])
+        named = naming.NamedLights(*self._tangents(centroids.take(row)), misfit.min(axis=0))
+        match = naming.identify(named, self.sphere)
+        if isinstance(match, str):
+            return match
+        if not naming.is_supported(match, misfit, lights):
+            return naming.CONTRADICTED
+        return replace(match, observed=row[match.observed])
 
     def _misfit(self, light: Floats, sigma: Floats) -> Floats:
-        """(T, N) misfit of each LED's code at the phases of the code's clock that all lights allow.
+        """(P, T, N) misfit of each LED's code at each of the phases of the code's clock that all lights allow.
 
         The next frame tries these phases and their neighbors.
         """
@@ -193,7 +198,7 @@ class CodedTracker(DomeTracker):
         self.phases[:] = False
         for step in (-1, 0, 1):
             self.phases[(tried[allowed] + step) % len(self.phases)] = True
-        return each[:, allowed].min(axis=1)
+        return np.asarray(each[:, allowed].swapaxes(0, 1))
 
     def _tangents(self, centroids: Centroids) -> tuple[Floats, Floats]:
         """(K, 3) rays of centroids and (K,) errors of their tangents, of the LED map and the lever too."""

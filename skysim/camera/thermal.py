@@ -57,6 +57,12 @@ def temperature_c(config: ThermalConfig, t_s: float) -> float:
     return TEMPERATURES[config.temperature.kind](config.temperature, t_s * config.speed / HOUR_S)
 
 
+def turned(config: ThermalConfig, t_s: float) -> Rotation:
+    """The camera's rotation on its mount since the calibration, about its own axes, at a time since the start."""
+    difference_k = temperature_c(config, t_s) - config.reference_c
+    return Rotation.from_rotvec(np.array(config.mount_arcsec_k) * (ARCSEC_RAD * difference_k))
+
+
 class Hardware(NamedTuple):
     """Light sources, camera mount and lens."""
 
@@ -78,7 +84,6 @@ def at_time(config: ThermalConfig, hardware: Hardware, t_s: float) -> Hardware:
         place = sources.place.copy()
         place[:, :3] += 1e-6 * config.dome_ppm_k * difference_k * (place[:, :3] - anchor_m) + config.creep_m
         sources = replace(sources, place=place)
-    turned = Rotation.from_rotvec(np.array(config.mount_arcsec_k) * (ARCSEC_RAD * difference_k))
-    mount = replace(mount, cam_from_body=turned * mount.cam_from_body)
+    mount = replace(mount, cam_from_body=turned(config, t_s) * mount.cam_from_body)
     scale = 1 + 1e-6 * config.lens_ppm_k * difference_k
     return Hardware(sources, mount, ScaledOptics.of(optics, scale) if config.lens_ppm_k else optics)

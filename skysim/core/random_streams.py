@@ -15,7 +15,13 @@ DETECTOR, JITTER, IMU, AIR_CURRENT, LED_CLOCKS, CAMERA_TIMING = 1, 2, 3, 4, 5, 6
 SCINTILLATION = 10
 LED_CODE, LED_CODE_CLOCK = 12, 13  # the second key of LED_CODE is the bit
 VARIABLE_STARS = 11  # under `light.variability_seed`
+HEAD_SEED = 14  # seed of a further star camera; the second key is its number
 SATELLITES = 7  # under the seed of `light.satellites.random`
+
+
+def derived_seed(seed: int, *key: int) -> int:
+    """A seed whose streams are independent of those of `seed`."""
+    return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1)[0])
 
 
 def random_stream(seed: int, *key: int) -> np.random.Generator:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +80,14 @@ class Trajectory:
         return np.array([np.interp(t_s, self.t_s, rate) for rate in self.rate_body_rad_s.T])
 
 
+class Mounting(NamedTuple):
+    """Rotation of a camera from its assumed mount in body axes: the filter's estimate, its sigma, the truth; (K, 3)."""
+
+    estimate_rad: Floats
+    sigma_rad: Floats
+    true_rad: Floats
+
+
 @dataclass(frozen=True, slots=True)
 class Telemetry:
     """True and estimated states of the vehicle at K ticks of its computer; None for what it does not have.
@@ -99,6 +107,8 @@ class Telemetry:
     lab_from_filter : K, the filter's attitude; sigma_attitude_rad (K, 3) its standard deviation about the body's
                       axes; assumed_bias_rad_s (K, 3) its bias estimate, sigma_bias_rad_s (K, 3) the bias's standard
                       deviation
+    mountings       : by name of the camera, where the filter has these states: "main" relative to the gyro's axes,
+                      the others relative to "main"
     """
 
     t_s: Floats
@@ -120,6 +130,7 @@ class Telemetry:
     sigma_attitude_rad: Floats | None = None
     assumed_bias_rad_s: Floats | None = None
     sigma_bias_rad_s: Floats | None = None
+    mountings: dict[str, Mounting] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

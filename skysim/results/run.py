@@ -90,10 +90,12 @@ class Run(Sequence[ScoredFrame]):
 
     testbed : the scene's test bed with its simulated trajectory
     frames  : one entry per frame, in order
+    heads   : the runs of the scene's further star cameras, by name
     """
 
     testbed: Testbed
     frames: tuple[ScoredFrame, ...] = field(repr=False)
+    heads: dict[str, Run] = field(repr=False, default_factory=dict)
 
     @property
     def scene(self) -> Scene:
@@ -129,11 +131,16 @@ class Run(Sequence[ScoredFrame]):
         return self.table().to_pandas()
 
     def save(self, folder: str | Path) -> Path:
-        """Write the same files as `skysim run`: frames with truth, tables and report.html. Returns the folder."""
+        """Write the same files as `skysim run`: frames with truth, tables and report.html. Returns the folder.
+
+        The files of a further star camera are in a folder with its name.
+        """
         recorder = Recorder(Path(folder), self.testbed)
         for frame in self.frames:
             recorder.add(frame)
         recorder.finish(f"skysim.simulate(skysim.load_scene({self.scene.name!r}))")
+        for name, run in self.heads.items():
+            run.save(recorder.folder / name)
         return recorder.folder
 
     def _repr_html_(self) -> str:
@@ -253,7 +260,10 @@ def simulate(
     """
     testbed = build_testbed_with(scene, programs, controller, tracker, profile)
     testbed = simulation.simulate_motion(testbed, progress)
-    return Run(testbed, tuple(_with_own_image(frame) for frame in score_frames(testbed)))
+    main, *heads = (
+        Run(camera, tuple(_with_own_image(frame) for frame in score_frames(camera))) for camera in testbed.cameras
+    )
+    return replace(main, heads={head.name: run for head, run in zip(scene.heads, heads, strict=True)})
 
 
 def render(scene: Scene, index: int = 0) -> tuple[Frame, Truth]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.core.quantities.units import RPM_RAD_S
+from skysim.core.quantities.units import ARCSEC_RAD, RPM_RAD_S
 from skysim.core.types import Floats, Telemetry
 from skysim.dynamics.imu import Increments, tilt_rad
 from skysim.results.plots import figure_png, stacked_axes
@@ -61,6 +61,9 @@ def summary(log: Telemetry) -> dict[str, float]:
         bias_error = per_hour(log.assumed_bias_rad_s - log.bias_rad_s)[-1]
         statistics |= {"filter_deg_worst": by_filter.max(), "filter_arcsec_end": by_filter[-1] / ARCSEC_DEG}
         statistics["filter_bias_deg_h_end"] = float(np.linalg.norm(bias_error))
+    for name, mounting in log.mountings.items():
+        error_rad = mounting.estimate_rad[-1] - mounting.true_rad[-1]
+        statistics[f"mounting_{name}_arcsec_end"] = float(np.linalg.norm(error_rad)) / ARCSEC_RAD
     return {name: float(value) for name, value in statistics.items()}
 
 
@@ -103,6 +106,9 @@ def table(log: Telemetry) -> Any:
             add(name, per_hour(rates), AXES, "deg_h")
     if log.sigma_attitude_rad is not None:
         add("sigma_attitude", np.degrees(log.sigma_attitude_rad) / ARCSEC_DEG, AXES, "arcsec")
+    for name, mounting in log.mountings.items():
+        for prefix, values in zip(("mounting", "sigma_mounting", "true_mounting"), mounting, strict=True):
+            add(f"{prefix}_{name}", values / ARCSEC_RAD, AXES, "arcsec")
     return Table(columns)
 
 
@@ -165,6 +171,21 @@ def bias_panel(log: Telemetry, axes: Any) -> None:
     axes.set_ylabel("gyro bias [deg/h]\n(dashed: true, band: 3σ)")
 
 
+def mounting_panel(log: Telemetry, axes: Any) -> None:
+    for k, (name, mounting) in enumerate(log.mountings.items()):
+        estimate, sigma, true = (values / ARCSEC_RAD for values in mounting)
+        for n, axis in enumerate(AXES):
+            color = f"C{3 * k + n}"
+            axes.plot(log.t_s, true[:, n], "--", color=color, lw=1)
+            axes.plot(log.t_s, estimate[:, n], color=color, label=f"{name} {axis}")
+            band = estimate[:, n] - 3 * sigma[:, n], estimate[:, n] + 3 * sigma[:, n]
+            axes.fill_between(log.t_s, *band, color=color, alpha=0.12, lw=0)
+    late = [values[len(log.t_s) // 4 :] / ARCSEC_RAD for mounting in log.mountings.values() for values in mounting]
+    limit = max(np.abs(values).max() for values in late) * 1.3
+    axes.set_ylim(-limit, limit)
+    axes.set_ylabel("mounting [arcsec]\n(dashed: true, band: 3σ)")
+
+
 def torque_panel(log: Telemetry, axes: Any) -> None:
     for n, name in enumerate(AXES):
         axes.plot(log.t_s, log.torque_nm[:, n], color=f"C{n}", label=name)
@@ -202,6 +223,7 @@ def panels(log: Telemetry) -> list[Callable[[Telemetry, Any], None]]:
         attitude_panel: True,
         attitude_error_panel: log.lab_from_imu is not None or log.lab_from_ref is not None,
         bias_panel: log.lab_from_filter is not None,
+        mounting_panel: bool(log.mountings),
         torque_panel: controlled,
         wheels_panel: controlled and bool(log.wheel_rad_s.size),
         gimbals_panel: controlled and bool(log.gimbal_rad.size),

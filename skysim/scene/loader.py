@@ -26,7 +26,7 @@ from skysim.core.paths import DATA, SCENES
 from skysim.core.quantities.units import ConfigModel, quantity
 from skysim.scene.keys import unused
 from skysim.scene.opencv_calibration import read as read_calibration
-from skysim.scene.scene import NAME_ALIAS, Scene
+from skysim.scene.scene import HEAD_SECTIONS, NAME_ALIAS, Scene
 from skysim.scene.sections.camera import CameraConfig, focus_distance
 
 PRESETS = DATA / "cameras"
@@ -74,6 +74,29 @@ def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
             )
     merged = merge(base, own)
     return tree | {"camera": merged | calibrated_keys(Path(str(camera["calibration"])), merged)}
+
+
+def with_heads(tree: dict[str, Any]) -> dict[str, Any]:
+    """The raw scene with the sections of each head as its own keys over those of the main camera.
+
+    Raises InputError; its message begins with the key.
+    """
+    heads = tree.get("heads")
+    if not isinstance(heads, list):
+        return tree
+    return tree | {"heads": [completed_head(tree, head, n) for n, head in enumerate(heads)]}
+
+
+def completed_head(tree: dict[str, Any], head: Any, n: int) -> Any:
+    """The raw head n with complete sections; unchanged if it is no mapping, which validation reports."""
+    if not isinstance(head, dict):
+        return head
+    own = {key: head[key] for key in HEAD_SECTIONS if isinstance(head.get(key), dict)}
+    main = {key: tree[key] for key in own if isinstance(tree.get(key), dict)}
+    try:
+        return head | with_preset(over_base(main, own))
+    except InputError as error:
+        raise InputError(f"heads.{n}.{error}") from None
 
 
 CALIBRATED_KEYS = ("width_px", "height_px", "focal_length", "principal_point_px", "distortion")
@@ -284,9 +307,9 @@ def read(path: Path) -> tuple[dict[str, Any], Files]:
 
 
 def apply_preset(tree: dict[str, Any], files: Files, overrides: Mapping[str, str]) -> dict[str, Any]:
-    """`with_preset`, with file and line added to its errors."""
+    """`with_preset` of the camera and of the heads, with file and line added to its errors."""
     try:
-        return with_preset(tree)
+        return with_preset(with_heads(tree))
     except InputError as error:
         key = str(error).partition(":")[0]
         raise InputError(f"{error} {location_of(key.split('.'), files, overrides)}") from None
@@ -313,6 +336,7 @@ FILE_KEYS = (
     ("tracker", "catalog"),
     ("tracker", "map"),
 )
+FILE_KEYS += tuple(("heads", "*", *keys) for keys in FILE_KEYS if keys[0] in HEAD_SECTIONS)
 
 
 def resolve_files(path: Path, tree: dict[str, Any]) -> dict[str, Any]:

@@ -11,17 +11,18 @@ import html
 import math
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from skysim.core.quantities.tolerance import TimeError
-from skysim.core.quantities.units import ConfigModel, Number, Time
+from skysim.core.quantities.units import ConfigModel, Length, Number, Spin, Time
 from skysim.core.quantities.utc import check_year
+from skysim.core.random_streams import HEAD_SEED, derived_seed
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, Glow, Light, StarsConfig
 from skysim.scene.sections.motion import MotionConfig, PointingConfig
 from skysim.scene.sections.orbit import Orbit
-from skysim.scene.sections.thermal import ThermalConfig
+from skysim.scene.sections.thermal import Coefficient, ThermalConfig
 from skysim.scene.sections.tracker import FilterConfig, SurveyErrorsConfig, TrackerConfig
 from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
 
@@ -62,6 +63,34 @@ class ExposureConfig(ConfigModel):
         return self
 
 
+class HeadConfig(ConfigModel):
+    """A further star camera on the vehicle, beside that of the sections `camera` and `tracker`, the main one.
+
+    name         : of its folder in the results, and in messages
+    position     : of its entrance pupil on the body
+    rotation_deg : its axes are those of the main camera turned by this rotation vector, about the main camera's axes
+        (+x right, +y down, +z boresight): [0, 90, 0] looks to the right of the main camera's image
+    mount_error_arcsec : rotation of the real camera from the assumed mount, about its own axes; its tracker does not
+        know of it
+    mount_arcsec_k : the same for each kelvin of `thermal`
+    camera, tracker, exposure : keys that differ from those of the main camera. Its camera is another unit: its
+        hardware_seed is the next one unless it is given
+    """
+
+    name: Annotated[str, Field(pattern=r"^[a-z]\w*$", max_length=40)]
+    position_m: tuple[Length, Length, Length]
+    rotation_deg: tuple[Spin, Spin, Spin]
+    mount_error_arcsec: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+    mount_arcsec_k: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0, 0.0)
+    camera: CameraConfig | None = None
+    tracker: TrackerConfig | None = None
+    exposure: ExposureConfig | None = None
+
+
+MAX_HEADS = 8
+HEAD_SECTIONS = ("camera", "tracker", "exposure")  # whose keys in a head are put over those of the main camera
+
+
 class Scene(ConfigModel):
     """A complete simulation: the laboratory, the vehicle and its motion, the light, the camera and the tracker."""
 
@@ -80,6 +109,7 @@ class Scene(ConfigModel):
     thermal: ThermalConfig | None = None
     tracker: TrackerConfig = TrackerConfig()
     filter: FilterConfig | None = None
+    heads: Annotated[tuple[HeadConfig, ...], Field(max_length=MAX_HEADS)] = ()
     name: Annotated[str, Field(exclude=True, alias=NAME_ALIAS)] = ""
 
     @model_validator(mode="after")
@@ -235,6 +265,46 @@ class Scene(ConfigModel):
             )
         return self
 
+    @model_validator(mode="after")
+    def check_heads(self) -> Scene:
+        """Check that heads have different names, and each camera and tracker against the rest of the scene."""
+        names = [head.name for head in self.heads]
+        for n, head in enumerate(self.heads):
+            if head.name in ("main", *names[:n]):
+                raise ValueError(f"heads.{n}.name: {head.name} is the name of another camera")
+            if any(head.mount_arcsec_k) and not self.thermal:
+                raise ValueError(f"heads.{n}.mount_arcsec_k: requires the section thermal")
+            own = self.of_head(n)
+            try:
+                Scene.model_validate(
+                    {field.alias or key: getattr(own, key) for key, field in Scene.model_fields.items()}
+                )
+            except ValidationError as error:
+                message = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
+                raise ValueError(f"heads.{n}.{message}") from None
+        return self
+
+    def of_head(self, n: int) -> Scene:
+        """The scene with head n as its only camera. Its noise and timing are drawn from a seed of its own."""
+        head, main = self.heads[n], self.camera
+        camera = head.camera or main
+        if camera.detector.hardware_seed == main.detector.hardware_seed:
+            unit = {"hardware_seed": main.detector.hardware_seed + n + 1}
+            camera = camera.model_copy(update={"detector": camera.detector.model_copy(update=unit)})
+        thermal = self.thermal and self.thermal.model_copy(update={"mount_arcsec_k": head.mount_arcsec_k})
+        if thermal and not thermal.has_effect:
+            thermal = None
+        sections = {
+            "seed": derived_seed(self.seed, HEAD_SEED, n),
+            "vehicle": self.vehicle.model_copy(update={"camera_m": head.position_m}),
+            "camera": camera,
+            "tracker": head.tracker or self.tracker,
+            "exposure": head.exposure or self.exposure,
+            "thermal": thermal,
+            "heads": (),
+        }
+        return self.model_copy(update=sections)
+
     @property
     def summary(self) -> list[tuple[str, str]]:
         """What the scene has, one line a section, for tables."""
@@ -256,6 +326,7 @@ class Scene(ConfigModel):
                 f"{exposure.frames} of {1e3 * exposure.time_s:g} ms at {exposure.rate_hz:g} Hz",
             ),
             ("tracker", ", ".join([tracker.name, *(stage for stage in stages if stage)])),
+            *([("heads", ", ".join(head.name for head in self.heads))] if self.heads else []),
         ]
 
     def _repr_html_(self) -> str:

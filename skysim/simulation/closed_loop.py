@@ -21,7 +21,7 @@ from estimator.trackers.pipeline import Clock, Report
 from skysim.camera.render import Window
 from skysim.core.errors import InputError
 from skysim.core.random_streams import AIR_CURRENT, IMU, JITTER, random_stream
-from skysim.core.types import Floats, Frame, Truth
+from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.disturbances import DisturbanceModel
 from skysim.dynamics.flight_computer import ControlInput, FlightComputer
@@ -63,10 +63,10 @@ class ClosedLoop:
         start = testbed.trajectory.lab_from_body[0]
         self.testbed, self.discards_history = testbed, discards_history
         self.reference = guidance.plan(scene.motion, start, testbed.profiles)
-        self.simulation = build_simulation(testbed, self.reference, history_s(scene) if discards_history else None)
+        self.simulation = build_simulation(testbed, self.reference, history_s(testbed) if discards_history else None)
         self.vibration = Vibration.draw(scene.motion, random_stream(scene.seed, JITTER, 0), self.reference)
         self.flight_computer = FlightComputer(scene, vehicle, self.reference, testbed.controllers)
-        self.navigation = build_navigation(testbed, start, history_s(scene) if discards_history else math.inf)
+        self.navigation = build_navigation(testbed, start, history_s(testbed) if discards_history else math.inf)
         self.disturbances = DisturbanceModel.from_config(
             scene.vehicle.disturbances,
             imu.earth_rate_lab_rad_s(scene.site),
@@ -123,31 +123,38 @@ class ClosedLoop:
         if navigation:
             navigation.sample_imu(simulation.now_s, *recent_motion(simulation, self.vibration, len(control)))
 
-    def testbed_since(self, begin_s: float) -> Testbed:
-        """The test bed with the trajectory from shortly before a time until now."""
+    def trajectory_since(self, begin_s: float) -> Trajectory:
+        """The motion from shortly before a time until now."""
         trajectory = self.simulation.trajectory(max(int(begin_s / self.simulation.step_s) - 1, 0))
-        return replace(self.testbed, trajectory=self.vibration.add_to(trajectory))
+        return self.vibration.add_to(trajectory)
 
 
 class OnboardCamera:
-    """The camera and star tracker during the motion: render each frame when due, solve it, update the filter.
+    """A camera and star tracker during the motion: render each frame when due, solve it, update the filter.
 
     tracker : solves the frames; None leaves them unsolved
     selects(index, close_s) : whether to render a frame
+    number  : of the camera on the vehicle, 0 for the main one
     """
 
     def __init__(
-        self, loop: ClosedLoop, tracker: factory.Estimator | None, selects: FrameSelector | None = None
+        self,
+        loop: ClosedLoop,
+        tracker: factory.Estimator | None,
+        selects: FrameSelector | None = None,
+        number: int = 0,
     ) -> None:
-        self.loop, self.tracker, self.selects = loop, tracker, selects
-        self.scene, self.exposure_control = loop.testbed.scene, ExposureController(loop.testbed.scene)
+        self.loop, self.tracker, self.selects, self.number = loop, tracker, selects, number
+        self.testbed = loop.testbed.cameras[number]
+        self.scene, self.exposure_control = self.testbed.scene, ExposureController(self.testbed.scene)
         self.latency_s = self.scene.filter.latency_s if self.scene.filter else 0.0
         self.index = 0
 
     def capture_due(self, clock: Clock | None = None) -> Iterator[CapturedFrame]:
         """Yield the frames not yet rendered whose exposure ended at least the filter's latency ago."""
         scene, loop = self.scene, self.loop
-        while self.index < loop.testbed.frames:
+        frames = math.inf if loop.testbed.endless else self.testbed.frames
+        while self.index < frames:
             window = exposure_window(scene, self.index, self.exposure_control.exposure_s)
             close_s = window.close_s(scene.camera.height_px)
             tagged_s = window.middle_s(scene.camera.height_px) + time_tag_error_s(scene, self.index)
@@ -157,14 +164,17 @@ class OnboardCamera:
             if self.selects and not self.selects(self.index, close_s):
                 self.index += 1
                 continue
-            frame, truth = render_frame(loop.testbed_since(window.open_s), self.index, clock, window.exposure_s)
+            moved = replace(self.testbed, trajectory=loop.trajectory_since(window.open_s))
+            frame, truth = render_frame(moved, self.index, clock, window.exposure_s)
             self.exposure_control.update(frame)
             samples = loop.navigation.imu_samples() if loop.navigation and scene.tracker.gyro else None
-            rate = measured_rate(loop.testbed, samples, window)
+            rate = measured_rate(self.testbed, samples, window)
             report = factory.solve_frame(self.tracker, frame, rate=rate) if self.tracker else None
             # The filter takes the solution at its mid-exposure time, although it arrives later.
             navigation = loop.navigation if scene.filter and report else None
-            update_status = navigation.update_filter(frame.t_mid_s, report.attitude) if navigation and report else ""
+            update_status = ""
+            if navigation and report:
+                update_status = navigation.update_filter(frame.t_mid_s, report.attitude, self.number)
             self.index += 1
             yield CapturedFrame(frame, truth, report, update_status)
 
@@ -177,7 +187,12 @@ def measured_rate(testbed: Testbed, samples: imu.Increments | None, window: Wind
     return gyro.rate_of_frame(samples, window, scene.camera.height_px, config, testbed.mount)
 
 
-def history_s(scene: Scene) -> float:
+def history_s(testbed: Testbed) -> float:
+    """Seconds of past states that a frame of any camera needs when due: see `camera_history_s`."""
+    return max(camera_history_s(camera.scene) for camera in testbed.cameras)
+
+
+def camera_history_s(scene: Scene) -> float:
     """Seconds of past states that a frame needs when due: longest exposure, latency, two control periods."""
     control, latency_s = scene.tracker.exposure_control, scene.filter.latency_s if scene.filter else 0.0
     window = exposure_window(scene, 0, control.longest_s if control else None)
@@ -216,4 +231,5 @@ def build_navigation(testbed: Testbed, start: Rotation, kept_s: float) -> Naviga
         return None
     position_m = multibody.imu_position_m(testbed.vehicle)
     stream = random_stream(testbed.scene.seed, IMU, 0)
-    return Navigation(testbed.scene, testbed.mount, start, position_m, testbed.vehicle.gravity_m_s2, stream, kept_s)
+    mounts = tuple(camera.mount for camera in testbed.cameras)
+    return Navigation(testbed.scene, mounts, start, position_m, testbed.vehicle.gravity_m_s2, stream, kept_s)

@@ -208,6 +208,9 @@ def at_time(testbed: Testbed, t_s: float) -> Testbed:
     if left < 1:
         dimmed = replace(testbed.sources, strength=left * testbed.sources.strength)
         testbed = replace(testbed, sources=dimmed)
+    if testbed.mount_error is not None:
+        mount = replace(testbed.mount, cam_from_body=testbed.mount_error * testbed.mount.cam_from_body)
+        testbed = replace(testbed, mount=mount)
     if testbed.scene.thermal is None:
         return testbed
     hardware = thermal.Hardware(testbed.sources, testbed.mount, testbed.optics)

@@ -7,8 +7,10 @@ the controller use their attitudes. `live` yields frames during the motion and k
 
 from __future__ import annotations
 
+import collections
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 from estimator.trackers.pipeline import Clock, Report
 from skysim.core.types import Frame, Truth
@@ -51,49 +53,59 @@ def simulate_motion(testbed: Testbed, watch: ProgressCallback | None = None) -> 
     """
     loop = ClosedLoop(testbed)
     try:
-        reports, update_statuses, exposures_s, recorder = fly(loop, watch)
+        captured, recorder = fly(loop, watch)
     finally:
         loop.close()
-    return replace(
-        testbed,
-        trajectory=loop.vibration.add_to(loop.simulation.trajectory()),
-        telemetry=recorder.telemetry(loop.reference if testbed.scene.motion.control else None),
-        imu_samples=loop.navigation.imu_samples() if loop.navigation else None,
-        reports=reports,
-        update_statuses=update_statuses,
-        exposures_s=exposures_s,
+    motion: dict[str, Any] = {
+        "trajectory": loop.vibration.add_to(loop.simulation.trajectory()),
+        "telemetry": recorder.telemetry(loop.reference if testbed.scene.motion.control else None, testbed.cameras),
+        "imu_samples": loop.navigation.imu_samples() if loop.navigation else None,
+    }
+    main, *heads = (
+        replace(camera, **motion, **solved._asdict()) for camera, solved in zip(testbed.cameras, captured, strict=True)
     )
+    return replace(main, heads=tuple(heads))
 
 
-def fly(
-    loop: ClosedLoop, watch: ProgressCallback | None
-) -> tuple[dict[int, Report], dict[int, str], dict[int, float], TelemetryRecorder]:
-    """Simulate the whole motion; with a filter also its frames.
+class Captured(NamedTuple):
+    """Frames of one camera that were solved during the motion, by index; see `Testbed`."""
 
-    Returns the reports, the filter's statuses and the exposure times of these frames by index, and the telemetry.
-    """
+    reports: dict[int, Report]
+    update_statuses: dict[int, str]
+    exposures_s: dict[int, float]
+
+
+def fly(loop: ClosedLoop, watch: ProgressCallback | None) -> tuple[list[Captured], TelemetryRecorder]:
+    """Simulate the whole motion; with a filter also the frames. Returns those of each camera, and the telemetry."""
     testbed, simulation = loop.testbed, loop.simulation
     # Raises InputError for too fast vibration before any long work.
     loop.vibration.subdivisions(simulation.times_s(0, simulation.last_step + 1))
-    camera = None
-    if testbed.scene.filter and loop.navigation:
-        camera = OnboardCamera(loop, build_tracker(testbed))
-        warm_up_tracker(testbed, camera.tracker)
+    cameras = onboard_cameras(loop)
+    for camera in cameras:
+        warm_up_tracker(camera.testbed, camera.tracker)
+    captured = [Captured({}, {}, {}) for _ in testbed.cameras]
     recorder = TelemetryRecorder(simulation, loop.flight_computer, loop.navigation)
     # If nothing depends on the motion, one call integrates all of it.
     steps = simulation.steps_left if loop.is_free_motion else round(loop.flight_computer.period_s / simulation.step_s)
-    reports: dict[int, Report] = {}
-    update_statuses, exposures_s = {}, {}
     while simulation.steps_left:
         loop.tick(steps, recorder)
-        for captured in camera.capture_due() if camera else ():
-            index = captured.frame.index
-            assert captured.report is not None
-            reports[index], update_statuses[index] = captured.report, captured.update_status
-            exposures_s[index] = captured.frame.exposure_s
+        for camera in cameras:
+            for frame, _, report, status in camera.capture_due():
+                assert report is not None
+                reports, update_statuses, exposures_s = captured[camera.number]
+                reports[frame.index], update_statuses[frame.index] = report, status
+                exposures_s[frame.index] = frame.exposure_s
         if watch:
             watch(simulation.now_s, simulation.now_s + simulation.steps_left * simulation.step_s)
-    return reports, update_statuses, exposures_s, recorder
+    return captured, recorder
+
+
+def onboard_cameras(loop: ClosedLoop) -> list[OnboardCamera]:
+    """The cameras whose frames are solved during the motion: with a filter all, else none."""
+    if not (loop.testbed.scene.filter and loop.navigation):
+        return []
+    beds = loop.testbed.cameras
+    return [OnboardCamera(loop, build_tracker(bed), number=n) for n, bed in enumerate(beds)]
 
 
 def live(
@@ -101,7 +113,8 @@ def live(
 ) -> Iterator[CapturedFrame]:
     """Yield the frames of a test bed during its motion, each rendered as its exposure ends.
 
-    Only the most recent states are kept, so that the motion may last without end. The frames equal those of `run`.
+    Only the most recent states are kept, so that the motion may last without end. The frames equal those of `run`, and
+    are those of the main camera; with a filter the others update it.
 
     estimator : solves each frame; if None, frames are solved only where the scene has a filter
     selects(index, close_s) : whether to render a frame. Skipping one does not change the others, except that exposure
@@ -110,11 +123,14 @@ def live(
     loop = ClosedLoop(testbed, discards_history=True)
     simulation = loop.simulation
     camera = OnboardCamera(loop, estimator or (build_tracker(testbed) if testbed.scene.filter else None), selects)
+    heads = onboard_cameras(loop)[1:]
     steps = round(loop.flight_computer.period_s / simulation.step_s)
     try:
         while simulation.steps_left:
             loop.tick(steps)
             yield from camera.capture_due()
+            for head in heads:
+                collections.deque(head.capture_due(), maxlen=0)  # for the filter
     finally:
         loop.close()
 

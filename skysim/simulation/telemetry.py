@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.core.types import Floats, Telemetry
+from skysim.camera import thermal
+from skysim.core.types import Floats, Mounting, Telemetry
 from skysim.dynamics.flight_computer import CmgActuator, FlightComputer
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import Simulation
+from skysim.simulation.testbed import Testbed
 from skysim.tracking.navigation import Navigation
+
+MAIN = "main"  # name of the camera of the scene's section `camera`
 
 
 class TelemetryRecorder:
@@ -30,6 +36,8 @@ class TelemetryRecorder:
         self.saturated = np.zeros(rows, dtype=bool)
         self.bias_rad_s = np.zeros((rows, 3))
         self.filter_estimates = np.zeros((rows, 3, 3))  # filter: sigma of the attitude, bias, its sigma
+        mounted = mounting_states(navigation)
+        self.mountings = np.zeros((len(mounted), 2, rows, 3))  # filter: estimate and sigma of each mounting
 
     def record_disturbance(self, torque_nm: Floats) -> None:
         """Record the mean disturbance torque (3,) of this control period; call it before `record`."""
@@ -54,8 +62,10 @@ class TelemetryRecorder:
             state = navigation.filter.state
             self.filter_wxyz[k] = navigation.attitude_wxyz("filter")
             self.filter_estimates[k] = state.sigma_attitude_rad, state.bias_rad_s, state.sigma_bias_rad_s
+            for n, name in enumerate(mounting_states(navigation)):
+                self.mountings[n, :, k] = state.others[name], state.sigma(name)
 
-    def telemetry(self, reference: Reference | None) -> Telemetry:
+    def telemetry(self, reference: Reference | None, cameras: Sequence[Testbed]) -> Telemetry:
         """All rows as Telemetry; reference is the commanded attitude profile, if there is one."""
         simulation, vehicle, steps = self.simulation, self.simulation.vehicle, self.at_step[: self.row]
         single_call = self.row == 1  # integrated in a single call, see `ClosedLoop.is_free_motion`
@@ -89,8 +99,42 @@ class TelemetryRecorder:
             self.saturated if has_imu else None,
             self.bias_rad_s if has_imu else None,
             rotation(self.filter_wxyz) if has_filter else None,
-            *((self.filter_estimates[:, n] if has_filter else None) for n in range(3)),
+            self.filter_estimates[:, 0] if has_filter else None,
+            self.filter_estimates[:, 1] if has_filter else None,
+            self.filter_estimates[:, 2] if has_filter else None,
+            self.mountings_by_camera(t_s, cameras),
         )
+
+    def mountings_by_camera(self, t_s: Floats, cameras: Sequence[Testbed]) -> dict[str, Mounting]:
+        """The filter's mounting states, and what they are in truth."""
+        if not len(self.mountings):
+            return {}
+        names = [MAIN, *(head.name for head in cameras[0].scene.heads)]
+        true_rad = [mounting_rad(camera, t_s) for camera in cameras]
+        relative_rad = [true_rad[0], *(head - true_rad[0] for head in true_rad[1:])]
+        return {
+            name: Mounting(estimate[: self.row], sigma[: self.row], true)
+            for name, (estimate, sigma), true in zip(names, self.mountings, relative_rad, strict=True)
+        }
+
+
+def mounting_states(navigation: Navigation | None) -> list[str]:
+    """Names of the filter's mounting states, the main camera's first."""
+    if navigation is None or navigation.filter is None:
+        return []
+    return [name for name in navigation.filter.state.others if name.startswith("mounting")]
+
+
+def mounting_rad(camera: Testbed, t_s: Floats) -> Floats:
+    """(K, 3) the error that a camera's real mount makes of the body's attitude, in body axes.
+
+    The real camera is turned by e from its assumed mount C, cam = exp(e) C body. Its tracker's attitude of the body is
+    C^-1 exp(e) C body = exp(C^-1 e) body, so that ref_from_body = truth exp(-C^-1 e).
+    """
+    error = camera.mount_error or Rotation.identity()
+    config = camera.scene.thermal
+    turned = [(thermal.turned(config, t) if config else Rotation.identity()) * error for t in t_s]
+    return -camera.mount.cam_from_body.inv().apply(Rotation.concatenate(turned).as_rotvec())
 
 
 def rotation(wxyz: Floats) -> Rotation:

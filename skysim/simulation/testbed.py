@@ -20,6 +20,7 @@ from skysim.camera.psf.otf import EXTENT
 from skysim.camera.render import Window
 from skysim.core.errors import InputError
 from skysim.core.quantities.tolerance import scaled_errors
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.random_streams import CAMERA_TIMING, random_stream
 from skysim.core.types import Floats, Mount, Sources, StarSources, Telemetry, Trajectory
 from skysim.dynamics import guidance, imu, multibody
@@ -100,6 +101,8 @@ class Testbed:
     endless   : frames continue without end, whatever the scene's number; only for `live`
     orbit     : the camera's; None without the section
     satellites: elements of `light.satellites.file`
+    heads     : the same with each of the scene's further star cameras in place of the main one
+    mount_error : rotation of the real camera from the assumed mount; None for none
     """
 
     scene: Scene
@@ -129,6 +132,13 @@ class Testbed:
     endless: bool = False
     orbit: CameraOrbit | None = None
     satellites: Elements | None = None
+    heads: tuple[Testbed, ...] = ()
+    mount_error: Rotation | None = None
+
+    @property
+    def cameras(self) -> tuple[Testbed, ...]:
+        """The test beds of all cameras, that of the main one first."""
+        return self, *self.heads
 
     @property
     def frames(self) -> float:
@@ -137,12 +147,13 @@ class Testbed:
 
     @property
     def duration_s(self) -> float:
-        """Duration to simulate, s: to the end of the last frame's longest exposure."""
+        """Duration to simulate, s: to the end of the last frame's longest exposure, of all cameras."""
         if self.endless:
             return math.inf
         config = self.scene.tracker.exposure_control
         last = exposure_window(self.scene, self.scene.exposure.frames - 1, config.longest_s if config else None)
-        return last.close_s(self.scene.camera.height_px) + MARGIN_S
+        own_s = last.close_s(self.scene.camera.height_px) + MARGIN_S
+        return max(own_s, *(head.duration_s for head in self.heads)) if self.heads else own_s
 
     @property
     def controllers(self) -> ControllerSource:
@@ -153,7 +164,11 @@ class Testbed:
         """The same hardware in the run of another seed: other noise, jitter, timing and phases of the LEDs' clocks."""
         scene = self.scene.model_copy(update={"seed": seed})
         clocks = build_clocks(scene.light, self.sources, seed)
-        return replace(self, scene=scene, clocks=clocks, codes=build_codes(scene.light, self.sources, seed))
+        codes = build_codes(scene.light, self.sources, seed)
+        heads = tuple(
+            replace(head, scene=scene.of_head(n), clocks=clocks, codes=codes) for n, head in enumerate(self.heads)
+        )
+        return replace(self, scene=scene, clocks=clocks, codes=codes, heads=heads)
 
     def at_rest(self, lab_from_body: Rotation, index: int = 0) -> Testbed:
         """The test bed with the vehicle at rest at this attitude, until after the exposure of a frame."""
@@ -182,13 +197,9 @@ def build_testbed(
     Raises InputError for wrong names of algorithms, trackers, controllers or catalogs and for an unreadable PSF or
     profile, before any long work.
     """
-    settings.assumed_settings(scene)  # raises for a wrong algorithm name
-    if tracker is None:
-        TRACKERS.check_name(scene.tracker.name, programs)
+    check_hardware(scene, programs, tracker is None)
     if scene.motion.control:
         ControllerSource(programs, controller).check_name(scene.motion.control.law)
-    catalog.require_catalog("tracker.catalog", scene.tracker.catalog)
-    EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # raises for a bad PSF file
     vehicle = multibody.build(scene.vehicle)
     band = Band.from_camera(scene.camera)
     dtype = np.float32 if scene.camera.detector.noise else np.float64
@@ -197,7 +208,7 @@ def build_testbed(
     orbit, satellites = build_orbit(scene.orbit, scene.start_time), getattr(scene.light, "satellites", None)
     stars = scene_stars(scene)
     sources = light_sources(scene, band, orbit, stars)
-    return Testbed(
+    testbed = Testbed(
         scene,
         vehicle,
         mount,
@@ -220,6 +231,51 @@ def build_testbed(
         orbit=orbit,
         satellites=read_elements(satellites.file) if satellites and satellites.file else None,
     )
+    return replace(testbed, heads=tuple(build_head(testbed, n, stars) for n in range(len(scene.heads))))
+
+
+def check_hardware(scene: Scene, programs: Mapping[str, str], has_tracker: bool) -> None:
+    """Raise InputError for unusable names and files of the camera and, if it is the scene's, of the tracker."""
+    settings.assumed_settings(scene)  # raises for a wrong algorithm name
+    if has_tracker:
+        TRACKERS.check_name(scene.tracker.name, programs)
+    catalog.require_catalog("tracker.catalog", scene.tracker.catalog)
+    EXTENT[scene.camera.psf.kind](scene.camera.psf, scene.camera)  # raises for a bad PSF file
+
+
+def build_head(testbed: Testbed, n: int, stars: catalog.Catalog | None) -> Testbed:
+    """The test bed with head n of the scene as its camera: the same vehicle, motion and lights.
+
+    The lights' strengths are those in the band of the head's camera.
+    """
+    head, scene = testbed.scene.heads[n], testbed.scene.of_head(n)
+    try:
+        check_hardware(scene, testbed.programs, True)
+        band, sources = testbed.band, testbed.sources
+        if head.camera:
+            band = Band.from_camera(scene.camera)
+            sources = light_sources(scene, band, testbed.orbit, stars)
+    except InputError as error:
+        raise InputError(f"heads.{n}.{error}") from None
+    main_from_head = Rotation.from_rotvec(head.rotation_deg, degrees=True)
+    mount = Mount(np.array(head.position_m), main_from_head.inv() * testbed.mount.cam_from_body)
+    dtype = np.float32 if scene.camera.detector.noise else np.float64
+    return replace(
+        testbed,
+        scene=scene,
+        mount=mount,
+        sources=sources,
+        optics=Optics.from_camera(scene.camera),
+        detector=Detector.from_camera(scene.camera),
+        band=band,
+        canvas=np.empty((scene.camera.height_px, scene.camera.width_px), dtype),
+        air=build_air(scene, band, stars),
+        obstacles=build_obstacles(scene, testbed.vehicle, mount),
+        reflecting=reflecting_dome(scene.light, sources),
+        tracker=None,
+        heads=(),
+        mount_error=Rotation.from_rotvec(np.array(head.mount_error_arcsec) * ARCSEC_RAD),
+    )
 
 
 def build_air(scene: Scene, band: Band, stars: catalog.Catalog | None) -> Air | None:
@@ -229,12 +285,14 @@ def build_air(scene: Scene, band: Band, stars: catalog.Catalog | None) -> Air | 
     return Air.from_config(scene.light.air, scene.site, stars, band)
 
 
-def build_obstacles(scene: Scene, vehicle: multibody.VehicleModel) -> multibody.Obstacles | None:
-    """Occluders, or None if `light.occlusion` is off (a collimated display has none)."""
+def build_obstacles(
+    scene: Scene, vehicle: multibody.VehicleModel, mount: Mount | None = None
+) -> multibody.Obstacles | None:
+    """Occluders, or None if `light.occlusion` is off (a collimated display has none). mount : of a further camera."""
     if not getattr(scene.light, "occlusion", False):
         return None
     return multibody.build_obstacles(
-        vehicle, surface.build_surface(scene.light.surface) if isinstance(scene.light, DomeConfig) else None
+        vehicle, surface.build_surface(scene.light.surface) if isinstance(scene.light, DomeConfig) else None, mount
     )
 
 

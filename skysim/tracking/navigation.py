@@ -7,6 +7,7 @@ multiplicative extended Kalman filter (`estimator.filter.mekf`). Each star-track
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,6 +28,7 @@ class Navigation:
     """The vehicle's attitude estimates: integrated gyros, and the filter that the star tracker corrects.
 
     scene : with `vehicle.imu`, and optionally `filter`
+    mounts : of the cameras, as assumed; the main one's first
     lab_from_body_wxyz : (4,) the true attitude at the start, when the navigator is zeroed
     position_body_m, gravity_m_s2 : of the accelerometers
     kept_s : how long IMU samples are kept, for `imu_samples`
@@ -35,7 +37,7 @@ class Navigation:
     def __init__(
         self,
         scene: Scene,
-        mount: Mount,
+        mounts: Sequence[Mount],
         lab_from_body: Rotation,
         position_body_m: Floats,
         gravity_m_s2: float,
@@ -46,7 +48,7 @@ class Navigation:
         assert config is not None
         self.imu = imu.Imu.from_config(config, rng)
         self.position_body_m, self.gravity_m_s2 = position_body_m, gravity_m_s2
-        self.body_from_cam = mount.cam_from_body.inv()
+        self.body_from_cam = [mount.cam_from_body.inv() for mount in mounts]
         self.step_s = 1 / config.rate_hz
         self.samples = 0
         earth = imu.earth_rate_lab_rad_s(scene.site)
@@ -54,7 +56,7 @@ class Navigation:
         self.earth_compensated_rad_s = earth * (config.earth_rate == "compensated")
         assumed = zeroed_attitude(lab_from_body, config.home_error_deg)
         self.navigator = imu.Navigator(assumed.as_quat(scalar_first=True), self.earth_compensated_rad_s)
-        self.filter = build_filter(scene.filter, assumed) if scene.filter else None
+        self.filter = build_filter(scene.filter, assumed, len(mounts)) if scene.filter else None
         self.time_tag_sigma_s = scene.filter.time_tag_sigma_s if scene.filter else 0.0
         self.kept_s, self.measured = kept_s, list[imu.Increments]()
         self.rate_rad_s = np.zeros(3)
@@ -116,22 +118,24 @@ class Navigation:
         """(3,) Earth rate to subtract, in body axes; zeros if it is not compensated."""
         return quaternion.apply(quaternion.inverse(lab_from_body_wxyz), self.earth_compensated_rad_s)
 
-    def update_filter(self, t_s: float, solution: Attitude) -> str:
-        """Update the filter with a star tracker's attitude at mid-exposure t_s; return the status of the update.
+    def update_filter(self, t_s: float, solution: Attitude, camera: int = 0) -> str:
+        """Update the filter with a camera's attitude at mid-exposure t_s; return the status of the update.
 
         Without filter, attitude or covariance the tracker's own status is returned. The time's standard deviation s
         adds s^2 w w^T to the covariance, w the filter's rate: a late tag turns the attitude along the motion.
         """
         if self.filter is None or solution.cam_from_ref is None or solution.covariance_rad2 is None:
             return solution.status
-        R_body_from_cam = self.body_from_cam.as_matrix()
+        body_from_cam = self.body_from_cam[camera]
+        R_body_from_cam = body_from_cam.as_matrix()
         covariance = R_body_from_cam @ solution.covariance_rad2 @ R_body_from_cam.T
         turn_rad = self.time_tag_sigma_s * self.filter.rate_rad_s
         covariance += np.outer(turn_rad, turn_rad)
         systematic = solution.systematic_rad2
         if systematic is not None:
             systematic = R_body_from_cam @ systematic @ R_body_from_cam.T
-        return self.filter.update(t_s, self.body_from_cam * solution.cam_from_ref, covariance, systematic).status
+        measured = body_from_cam * solution.cam_from_ref
+        return self.filter.update(t_s, measured, covariance, systematic, camera).status
 
     def attitude_wxyz(self, feedback: str) -> Floats:
         """(4,) lab_from_body from the inertial navigator ("imu") or the filter."""
@@ -151,7 +155,7 @@ def zeroed_attitude(lab_from_body: Rotation, error_deg: tuple[float, float, floa
     return Rotation.from_euler("ZYX", angles_deg, degrees=True)
 
 
-def build_filter(config: FilterConfig, lab_from_body: Rotation) -> AttitudeFilter:
+def build_filter(config: FilterConfig, lab_from_body: Rotation, cameras: int = 1) -> AttitudeFilter:
     """The attitude filter at the start; its reference frame is the lab."""
     hour_s = 3600.0
     gyro = GyroModel(
@@ -167,6 +171,7 @@ def build_filter(config: FilterConfig, lab_from_body: Rotation) -> AttitudeFilte
         config.systematic_time_s,
         math.radians(config.systematic_angle_deg),
         config.mounting_arcsec * ARCSEC_RAD,
+        config.mounting_drift_arcsec_sqrt_h * ARCSEC_RAD / math.sqrt(hour_s),
     )
     return AttitudeFilter(
         gyro,
@@ -179,4 +184,5 @@ def build_filter(config: FilterConfig, lab_from_body: Rotation) -> AttitudeFilte
         tracker,
         JumpModel(config.missed_per_h / hour_s, config.wrong_share, config.wrong_repeat),
         config.considered,
+        cameras,
     )

@@ -187,6 +187,23 @@ def test_the_cap_s_margin_is_the_angle_beyond_the_field() -> None:
     assert found.corner_deg == pytest.approx(25 + math.degrees(at_bearing), abs=1e-3)
 
 
+def test_the_cap_of_listed_leds_ends_at_the_farthest_of_them() -> None:
+    """Three LEDs to 20 deg from the zenith in a cap of 50: the row says both; a warning has nothing to change."""
+    testbed = bed(
+        "afit_simsat",
+        light__surface="{kind: sphere, apex: 48 in, radius: 48 in}",
+        light__layout="{kind: listed, directions_deg: [[0, 20], [90, 10], [200, 5]], cap_deg: 50}",
+        motion__maneuver=TILTED,
+    )
+    planned = check(testbed)
+    values = fact(planned, "LED cap").values
+    assert values["cap_deg"] == pytest.approx(20, abs=1e-6)
+    assert values["limit_deg"] == 50
+    assert values["margin_deg"] < -5
+    assert "LEDs to 20° from the zenith, shell and wires to cap_deg, 50°" in fact(planned, "LED cap").lines[0]
+    assert not any("LEDs end at" in one for one in planned.findings)
+
+
 @pytest.mark.slow
 def test_the_cap_s_margin_at_the_tilt_stop_is_stated_and_a_study_is_warned_of_it() -> None:
     """The maneuver tilts by 9.6 deg, the stop is at 30: 5 deg of tilt more need 5 deg of LEDs more on a sphere."""

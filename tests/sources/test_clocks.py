@@ -180,7 +180,9 @@ class Recorder:
     def __init__(self, rate_rad_s: np.ndarray, given: list[np.ndarray]) -> None:
         self.rate_rad_s, self.given = rate_rad_s, given
 
-    def update(self, _t_s: float, _measured: Rotation, covariance_rad2: np.ndarray, _systematic: None) -> Update:
+    def update(
+        self, _t_s: float, _measured: Rotation, covariance_rad2: np.ndarray, _systematic: None, _head: int
+    ) -> Update:
         self.given.append(covariance_rad2)
         return Update("used", np.zeros(3), 0.0)
 

@@ -42,6 +42,9 @@ def test_words_are_as_far_apart_as_stated(code: Code, bits: int, distance: int) 
     assert words.shape == (400, bits)
     assert least_distance(words) >= distance
     assert np.ptp(words, axis=1).min() == 1
+    assert codebook(code, 400) is words
+    with pytest.raises(ValueError, match="read-only"):
+        words[0, 0] = 1
 
 
 @pytest.mark.parametrize(

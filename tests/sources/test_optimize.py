@@ -17,6 +17,7 @@ from skysim.scene import loader
 from skysim.scene.sections import layouts
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources import catalog, dome
+from skysim.sources.dome.layouts import spreads
 from skysim.sources.dome.placement import fisher, optimize
 from skysim.sources.dome.placement.ambiguity import field_ambiguity
 from skysim.sources.photometry import Band, star_flux_e_s_m2
@@ -56,6 +57,23 @@ def spread(kind: str, count: int, cap_deg: float) -> Sources:
 @pytest.fixture(scope="module")
 def best() -> Sources:
     return lit(WANTED)
+
+
+@pytest.mark.slow
+def test_places_are_searched_once_for_each_dome_and_camera() -> None:
+    """Brightness is drawn after the search, from the same stream: a kept search changes no byte, and no other dome."""
+    few = WANTED | {"count": 12, "rounds": 1, "levels": [1, 0.5], "spacing": "20 mm"}
+    spreads.optimized_places.cache_clear()
+    first = lit(few)
+    again = lit(few | {"levels": [1, 0.25]})
+    assert spreads.optimized_places.cache_info().misses == 1
+    np.testing.assert_array_equal(again.place, first.place)
+    full = first.strength.max()
+    np.testing.assert_allclose(np.where(first.strength < 0.9 * full, 0.25, 1), again.strength / full, rtol=0.1)
+    spreads.optimized_places.cache_clear()
+    np.testing.assert_array_equal(lit(few).strength, first.strength)
+    assert not np.array_equal(lit(few | {"hardware_seed": 1}).place, first.place)
+    assert spreads.optimized_places.cache_info().misses == 2
 
 
 def variances(place_m: Floats, tilt_deg: float = TILT_DEG, count: int = 2000) -> Floats:

@@ -125,8 +125,8 @@ def test_the_check_says_how_a_dome_fits_its_room() -> None:
         )[0]
     )
     assert fact.lines == [
-        "top 2.50 m of 2.90 m, rim 1.90 m above the floor; 2.40 x 2.40 m wide (room: 4.00 m x any); shell in 4 segments"
-        f" of {sides} m: fits the door of 0.90 x 2.10 m"
+        "top 2.50 m of 2.90 m, rim 1.90 m above the floor; 2.40 x 2.40 x 0.60 m along x, y, z (room: 4.00 m x any);"
+        f" each of 4 segments goes into a box of {sides} m, shortest side first: fits the door of 0.90 x 2.10 m"
     ]
     assert fact.values["top_m"] == pytest.approx(2.5, abs=1e-9)
     assert fact.values["extent_m"] == pytest.approx([2.4, 2.4, 0.6], abs=1e-9)

@@ -174,7 +174,7 @@ def test_tick_by_tick_it_feels_the_whole_flight(rate_hz: int) -> None:
 def test_samples_that_do_not_end_with_a_tick_are_not_lost() -> None:
     """Knots of 1 ms felt 7 ms at a time by a unit of 400 Hz: now two, now three samples, none twice."""
     testbed = flown(0.1, vehicle__imu=f"{{{PERFECT}}}", motion__rate_deg_s="[0, 0, 30]")
-    there = testbed.mount, testbed.trajectory.lab_from_body[0], np.zeros(3), 9.8, np.random.default_rng(1)
+    there = [testbed.mount], testbed.trajectory.lab_from_body[0], np.zeros(3), 9.8, np.random.default_rng(1)
     navigation = Navigation(testbed.scene, *there)
     knots, counts = testbed.trajectory, []
     for end in range(7, 100, 7):
@@ -209,7 +209,7 @@ def test_without_a_filter_its_answer_is_the_navigator_s() -> None:
     vehicle = multibody.build(loaded.vehicle)
     mount = multibody.camera_mount(vehicle)
     start = Rotation.from_rotvec([0.1, 0.2, 0.3])
-    navigation = Navigation(loaded, mount, start, np.zeros(3), 9.8, np.random.default_rng(1))
+    navigation = Navigation(loaded, [mount], start, np.zeros(3), 9.8, np.random.default_rng(1))
     np.testing.assert_array_equal(navigation.attitude_wxyz("filter"), navigation.attitude_wxyz("imu"))
     np.testing.assert_array_equal(navigation.body_rate_rad_s("filter"), np.zeros(3))
     assert navigation.update_filter(0.0, Attitude("no stars")) == "no stars"
@@ -229,7 +229,7 @@ def test_the_filter_is_told_a_solution_in_its_own_axes() -> None:
     aside = type(mount)(mount.camera_body_m, Rotation.from_euler("y", -90, degrees=True))
     boresight_body = aside.cam_from_body.inv().apply([0, 0, 1])
     truth = Rotation.from_rotvec([0.02, -0.03, 0.04])
-    navigation = Navigation(loaded, aside, Rotation.identity(), np.zeros(3), 9.8, np.random.default_rng(1))
+    navigation = Navigation(loaded, [aside], Rotation.identity(), np.zeros(3), 9.8, np.random.default_rng(1))
     spread = np.diag([1.0, 1.0, 100.0]) * (20 * ARCSEC) ** 2
     solution = Attitude("solved", aside.cam_from_body * truth.inv(), spread)
     assert navigation.update_filter(0.0, solution) == "used"

@@ -148,6 +148,15 @@ def likely(light: Floats, templates: Floats) -> Ints:
     return np.flatnonzero(misfit <= misfit.min() + LIKELY)
 
 
+def excess_noise(least: Floats, measured: Floats | Ints) -> float:
+    """The factor by which squared errors exceed the assumed ones, 1 or more, from the least misfit of each light (T,).
+
+    Half a chi-square of n measurements has the mean n / 2 (Birge 1932, Phys. Rev. 40, 207: errors are enlarged until
+    the residuals are as large as expected). The median over the lights leaves out one that is no LED.
+    """
+    return max(1.0, float(np.median(least / (np.asarray(measured) / 2))))
+
+
 def expected_misfit(measured: Floats | Ints) -> Floats:
     """(T,) greatest misfit of the true word to so many measurements that is not suspicious.
 

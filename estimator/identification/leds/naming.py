@@ -77,6 +77,23 @@ def identify(lights: NamedLights, sphere: Sphere) -> StarMatch | str:
     return StarMatch(rows[matched], star[best][matched], rotation(R_cam_from_lab[best]), -MARGIN_DEX)
 
 
+def is_supported(match: StarMatch, misfit: Floats, lights: int) -> bool:
+    """Whether the names hold at one time of the codes' clock, and no other light of the frame speaks against them.
+
+    misfit : (P, T, N) of each LED's code at P phases of the clock, of the rows of `match.observed` among others
+    lights : number of lights with enough bits, also those that fit no code
+
+    `identify` takes each light at its own best phase; the names together must be nearly as good at a common one. Two
+    names that nothing else confirms count only where there is no other light; else half of the lights must have one.
+    """
+    count = len(match.observed)
+    if count < lights / 2 or (count == 2 and lights > 2):
+        return False
+    together = misfit[:, match.observed, match.star].sum(axis=1).min()
+    apart = misfit.min(axis=(0, 2))[match.observed].sum()
+    return bool(together - apart <= TRUSTED * np.sqrt(count))
+
+
 def _best_pair(ray: Floats, excess: Floats) -> tuple[int, int]:
     """The two lights with the fewest pairs of names, of those that are at least half as far apart as any."""
     apart = np.linalg.norm(ray[:, None] - ray, axis=2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from skysim.apps.cli.terminal import print_error, print_table, print_wrapped, terminal_width
+from skysim.apps.cli.terminal import print_error, print_table, print_wrapped, table_width, terminal_width
 from skysim.core.errors import printable
 
 if TYPE_CHECKING:
@@ -62,6 +62,16 @@ def print_points(heads: Sequence[str], cells: Sequence[Sequence[str]], factors: 
         print_wrapped(f"in the report, or in a wider terminal: {', '.join(heads[count:])}")
     if len(cells) > MAX_ROWS:
         print(f"and {len(cells) - MAX_ROWS} more points in the report")
+
+
+def print_front(heads: Sequence[str], cells: Sequence[Sequence[str]], candidates: int) -> None:
+    """Print a search's front: a table, or a paragraph for each candidate where the terminal is too narrow."""
+    print(f"front of {candidates} candidates:" if cells else f"no front: none of {candidates} candidates is feasible")
+    if cells and table_width(heads, cells) <= terminal_width():
+        print_table("", heads, cells)
+        return
+    for row in cells:
+        print_wrapped(", ".join(f"{head} {cell}" for head, cell in zip(heads, row, strict=True)), others="    ")
 
 
 def fitting_columns(heads: Sequence[str], cells: Sequence[Sequence[str]], kept: int, width: int) -> int:

@@ -91,7 +91,7 @@ def print_survey(survey: dict[str, Any]) -> None:
     print()
     print_coverage(survey)
     print_faults(survey["faults"])
-    print_wrapped(f"{survey['map']}: for tracker.map; picture of the dome: {survey['picture']}")
+    print_wrapped(f"{survey['map']}: for tracker.map; report: {survey['report']}")
 
 
 def cell(what: str, number: float) -> str:
@@ -126,14 +126,18 @@ def print_faults(faults: dict[str, Any]) -> None:
         print(f"LED {led} is {1e3 * distance_m:.1f} mm from its place in the list")
     for led, shows, others in faults["exchanged"]:
         alike = f" (or {', '.join(map(str, others))})" if others else ""
-        cause = "wires or numbers exchanged, or named wrongly by the IMU"
-        print(f"LED {shows}{alike} shines at the place of LED {led}: {cause}")
+        print(f"LED {shows}{alike} shines at the place of LED {led}: wires or numbers exchanged")
     for place_m in faults["unlisted"]:
         print(f"a light that is not in the list shines at {', '.join(f'{one:.3f}' for one in place_m)} m")
+    share = faults["exchange_share"]
+    observable = (
+        f"{100 * share:.0f} % of exchanges would be found"
+        if share
+        else "exchanged LEDs cannot be found: all shine alike; codes or brightness levels would tell them apart"
+    )
     print_wrapped(
         f"{len(faults['dark'])} dark, {len(faults['displaced'])} displaced, {len(faults['exchanged'])} exchanged; the"
-        f" other places of the list err by {1e3 * faults['list_sigma_m']:.2g} mm about each axis;"
-        f" {100 * faults['exchange_share']:.0f} % of exchanges would be found"
+        f" other places of the list err by {1e3 * faults['list_sigma_m']:.2g} mm about each axis; {observable}"
     )
 
 
@@ -141,5 +145,6 @@ PRINTERS: dict[str, Callable[[dict[str, Any]], None]] = {
     "plan": print_plan,
     "repeat": print_comparison,
     "images": print_survey,
+    "watch": print_survey,
     "simulate": print_survey,
 }

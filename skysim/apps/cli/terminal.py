@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -190,6 +191,10 @@ def print_motion(run: dict[str, float]) -> None:
         "bias error {filter_bias_deg_h_end:.2g}°/h",
     }
     lines = [text.format(**run) for key, text in templates.items() if key in run]
+    mounts = re.findall(r"mounting_(\w+)_arcsec_end", " ".join(run))
+    if mounts:
+        errors = ", ".join(f"{name} {run[f'mounting_{name}_arcsec_end']:.3g}″" for name in mounts)
+        lines.append(f"mounting error at the end: {errors}")
     for n, line in enumerate(lines):
         print_wrapped(line, first=" " * 8 if n else "motion: ", others=" " * 8)
 
@@ -205,6 +210,15 @@ def print_summary(run: dict[str, Any]) -> None:
     print_wrapped(f"median ms per frame: {stages}")
     print_motion(run["flight"])
     print(f"report: {run['report']}")
+
+
+def print_head(name: str, run: dict[str, Any]) -> None:
+    """Print the result of a further star camera."""
+    print_wrapped(
+        f"{name}: {run['solved']} of {run['frames']} frames solved, {run['wrong']} wrong; "
+        f"cross-boresight median {run['cross_arcsec_median']:.3g}″, roll median {run['roll_arcsec_median']:.3g}″; "
+        f"report: {run['report']}"
+    )
 
 
 FACT_COLUMN = 21  # of the text of a fact

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core import quaternion
 from skysim.core.paths import SCENES
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Mount, Sources
 from skysim.dynamics.multibody.integrator import member_values
 from skysim.dynamics.multibody.joints import lock_unused
 from skysim.dynamics.multibody.mass import CAMERA
@@ -44,12 +44,13 @@ class Obstacles:
     wall: Surface | None
 
 
-def build_obstacles(vehicle: VehicleModel, wall: Surface | None) -> Obstacles:
+def build_obstacles(vehicle: VehicleModel, wall: Surface | None, mount: Mount | None = None) -> Obstacles:
     """Compile the vehicle's file again with separate bodies: the simulated model has all rigid ones fused into bus.
 
     The camera's housing lets light through: all geoms of the body that carries the camera, if it is not bus, and any
-    geom that surrounds the pupil, since the camera then looks out through a hole in it. MuJoCo's rays ignore geoms
-    with an alpha of 0.
+    geom that surrounds the pupil, since the camera then looks out through a hole in it. A further camera, whose
+    `mount` is given, has no housing of its own, and that of the main one is in its way like all else. MuJoCo's rays
+    ignore geoms with an alpha of 0.
     """
     path = SCENES / vehicle.config.model
     with mujoco_warnings():
@@ -66,15 +67,16 @@ def build_obstacles(vehicle: VehicleModel, wall: Surface | None) -> Obstacles:
         for name, angle_deg in zip(vehicle.gimbals.names, start_deg, strict=True):
             data.joint(name).qpos[:] = np.radians(angle_deg)
     mujoco.mj_kinematics(model, data)
-    camera_body_m = camera_mount(vehicle).camera_body_m
-    model.geom_group[:] = np.where(camera_housing(model, data, camera_body_m), TRANSPARENT, OPAQUE)
+    camera_body_m = (mount or camera_mount(vehicle)).camera_body_m
+    housing = camera_housing(model, data, camera_body_m, is_main=mount is None)
+    model.geom_group[:] = np.where(housing, TRANSPARENT, OPAQUE)
     return Obstacles(model, data, camera_body_m, wall)
 
 
-def camera_housing(model: Any, data: Any, camera_body_m: Floats) -> NDArray[np.bool_]:
+def camera_housing(model: Any, data: Any, camera_body_m: Floats, is_main: bool) -> NDArray[np.bool_]:
     """(ngeom,) which geoms belong to the camera's housing. Overwrites the geoms' groups."""
     body = model.cam_bodyid[model.camera(CAMERA).id]
-    is_housing = (model.geom_bodyid == body) & (body != model.body("bus").id)
+    is_housing = (model.geom_bodyid == body) & (body != model.body("bus").id) & is_main
     six_directions = np.vstack([np.eye(3), -np.eye(3)])
     for geom in np.flatnonzero(~is_housing):
         model.geom_group[:], model.geom_group[geom] = TRANSPARENT, OPAQUE

@@ -179,7 +179,22 @@ def term_section(statement: Statement) -> Section:
         f" fields, with all drawn anew: {ratios}.",
         f"Mean error about the camera's axes, arcseconds: x {x}, y {y}, roll {roll}.",
     ]
+    if sheet.designer.units > 1:
+        texts.insert(2, unit_text(sheet.designer.units, sheet.size.draws))
     return Section("Error terms", texts, ["term", "across ″", "%", "about ″", "%", "what it is"], rows, ["terms"])
+
+
+def unit_text(units: int, draws: int) -> str:
+    """What the intervals over the fields leave out: that units are few (chi-square of a variance)."""
+    from scipy.special import chdtri
+
+    freedom = units - 1
+    low, high = (math.sqrt(freedom / chdtri(freedom, tail)) for tail in (0.025, 0.975))
+    return (
+        f"These intervals are over the fields. Where the bias scatters among units, {units} of them know it to a factor of"
+        f" {low:.2g} to {high:.2g} (95 %), and the independent frames are of {draws} other units: a bias that dominates needs"
+        " more units before the two can agree."
+    )
 
 
 def lowering_section(statement: Statement) -> Section:

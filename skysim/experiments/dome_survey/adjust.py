@@ -3,32 +3,32 @@
 The IMU gives the attitude of each frame to about half a degree. At first the detections are matched to LEDs with it.
 Its error shifts all lights of a frame together by more than the LED spacing, so the most likely common shift is found
 first (`matching`). Then `estimator.calibration.dome_survey.survey` adjusts LED positions, lever arm, lens and attitudes
-together by least squares. Both are repeated with the improved values. LEDs that turn out to be far from their place in
-the list start the last rounds where they were found. The result is a `DomeMap`, the file that `tracker.map` reads.
+together by least squares, and the LEDs get the names that their places and their light have together. All is repeated
+with the improved values. LEDs that turn out to be far from their place in the list start the last rounds where they
+were found. The result is a `DomeMap`, the file that `tracker.map` reads.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.attitude.dome_map import LedMap
 from estimator.calibration import dome_survey, survey_faults
-from estimator.calibration.dome_survey import DomeFrame, DomeSurvey
-from estimator.calibration.survey_faults import HeldFrames, StrayLight
-from estimator.calibration.survey_plan import Mask, SurveyAccuracy
+from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, Unconnected
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey.frames import SurveyFrame
 from skysim.experiments.dome_survey.matching import Correspondences, match_by_imu, match_by_survey
 from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty
+from skysim.experiments.dome_survey.survey_run import SurveyRun, identified, led_sigma_m, light_table, stray_lights
 from skysim.tracking.dome_map_file import DomeMap
 
-# Lights that a frame must share with others: two determine its attitude; a misidentified patch board accounts for six.
-MIN_SHARED_LEDS = (3, 8)
+MIN_SHARED_LEDS = 3  # that a frame must share with others: two determine its attitude
+MAX_UNCONNECTED = 0.5  # share of the frames that may be left out at a time
 
 # Minimum rms angle between an LED's rays for its distance: twice the minimum that the adjustment requires.
 MIN_RAY_ANGLE_RAD = 2 * dome_survey.CROSSING_RAD
@@ -36,87 +36,9 @@ MIN_RAY_ANGLE_RAD = 2 * dome_survey.CROSSING_RAD
 ROUNDS = 3  # rounds of identification and adjustment; from the second on with the adjusted values
 MOVED_ROUNDS = 2  # further rounds if LEDs are far from their places in the list
 
-MIN_MATCHED = 0.5  # share of a frame's lights that are matched; if only chance matches them it is far less
-STRAY_SIGMA_PX = 0.3  # of a ray to a stray light, for the errors of the attitude and of blends
-STRAY_REACH_M = 0.005  # on the dome, within which stray lights of two frames may be one
+# Share of a frame's lights that are matched, and of these that fit the adjustment: far less by chance.
+MIN_MATCHED = 0.5
 MAX_DISPLACEMENT_M = 0.1  # of an LED from its place in the list
-
-
-@dataclass(frozen=True, slots=True)
-class SurveyRun:
-    """A survey with the frames and correspondences of its last round.
-
-    taken  : all frames, with the IMU's attitudes;  rows : those of `taken` that are in the survey
-    listed : the LEDs before the survey
-    prior  : the model before the last round; its LEDs are the listed ones, those moved at the places found
-    """
-
-    survey: DomeSurvey
-    taken: Sequence[SurveyFrame]
-    rows: list[int]
-    matches: list[Correspondences]
-    listed: LedMap
-    prior: CalibrationPrior
-    uncertainty: SurveyUncertainty
-
-    @property
-    def frames(self) -> list[SurveyFrame]:
-        """The frames of the survey, with their adjusted attitudes."""
-        pairs = zip(self.rows, self.survey.body_from_lab, strict=True)
-        return [replace(self.taken[row], body_from_lab=attitude) for row, attitude in pairs]
-
-    @property
-    def held(self) -> HeldFrames:
-        """The frames with their adjusted attitudes and the model found."""
-        survey = self.survey
-        return HeldFrames(survey.camera, survey.leds, survey.lever, survey.body_from_lab)
-
-    @property
-    def inliers(self) -> list[Correspondences]:
-        """The correspondences without those that the adjustment rejected."""
-        keep = [np.ones(len(match.led), dtype=bool) for match in self.matches]
-        for frame, row in self.survey.outliers.tolist():
-            keep[frame][row] = False
-        return [Correspondences(m.light[k], m.led[k]) for m, k in zip(self.matches, keep, strict=True)]
-
-    @property
-    def seen(self) -> Mask:
-        """(F, N) LEDs identified in each frame."""
-        return identified(self.inliers, len(self.listed.id))
-
-    @property
-    def noise_px(self) -> float:
-        """Standard deviation of a centroid's coordinates, as the residuals have it; of the mean information."""
-        pairs = zip(self.frames, self.inliers, strict=True)
-        sigma_px = np.concatenate([frame.lights.sigma_px[match.light] for frame, match in pairs])
-        return self.survey.noise_scale / float(np.sqrt(np.mean(sigma_px**-2.0)))
-
-    @property
-    def accuracy(self) -> SurveyAccuracy:
-        """The standard deviations of the survey."""
-        survey = self.survey
-        return SurveyAccuracy(
-            survey.surveyed,
-            led_sigma_m(survey, self.uncertainty),
-            np.sqrt(np.diag(survey.lever_covariance_m2)),
-            np.sqrt(np.diag(survey.lens_covariance)),
-        )
-
-    @property
-    def uncertainty_after(self) -> SurveyUncertainty:
-        """The uncertainty of the IMU and of LEDs that are not measured, and that of the lever and the lens found."""
-        accuracy, before = self.accuracy, self.uncertainty
-        lever_m = float(np.sqrt(np.mean(accuracy.lever_sigma_m**2)))
-        focal = float(accuracy.lens_sigma[0] / self.survey.camera.focal_px)
-        return replace(before, lever_sigma_m=lever_m, focal_error=focal)
-
-
-def identified(matches: Sequence[Correspondences], leds: int) -> Mask:
-    """(F, N) LEDs that the correspondences of each frame have."""
-    out = np.zeros((len(matches), leds), dtype=bool)
-    for row, match in zip(out, matches, strict=True):
-        row[match.led] = True
-    return out
 
 
 def run_survey(
@@ -141,7 +63,7 @@ def run_survey(
         selected, survey = adjust_connected(pairs, prior, uncertainty, fit_distortion)
         rows, matches = [rows[k] for k in selected], [matches[k] for k in selected]
         start.update(zip(rows, survey.body_from_lab, strict=True))
-        return SurveyRun(survey, frames, rows, matches, listed, prior, uncertainty)
+        return with_names(SurveyRun(survey, frames, rows, matches, listed, prior, uncertainty))
 
     listed, total = prior.leds, ROUNDS + MOVED_ROUNDS
     start = {row: frame.body_from_lab for row, frame in enumerate(frames)}
@@ -185,6 +107,38 @@ def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], Calibra
     return rows, matches, replace(model, leds=prior.leds)
 
 
+def with_names(run: SurveyRun) -> SurveyRun:
+    """The run with the names that place and light give its LEDs together (`survey_faults.names`).
+
+    An LED that is not measured keeps its name, or gets one that is free if another LED has it now.
+    """
+    survey, listed_m = run.survey, run.listed.position_m
+    old, new = survey_faults.names(light_table(run), listed_m, survey.leds.position_m, survey.led_covariance_m2)
+    if (old == new).all():
+        return run
+    every = np.arange(len(listed_m))
+    others, free = np.setdiff1d(every, old), np.setdiff1d(every, new)
+    name = every.copy()
+    name[old] = new
+    name[np.setdiff1d(others, free)] = np.setdiff1d(free, others)
+    position_m, covariance_m2, surveyed = (
+        run.prior.leds.position_m.copy(),
+        np.empty_like(survey.led_covariance_m2),
+        np.empty_like(survey.surveyed),
+    )
+    position_m[new], covariance_m2[name], surveyed[name] = (
+        survey.leds.position_m[old],
+        survey.led_covariance_m2,
+        survey.surveyed,
+    )
+    leds = replace(survey.leds, position_m=position_m)
+    return replace(
+        run,
+        survey=replace(survey, leds=leds, led_covariance_m2=covariance_m2, surveyed=surveyed),
+        matches=[Correspondences(match.light, name[match.led]) for match in run.matches],
+    )
+
+
 def is_identified(frame: SurveyFrame, match: Correspondences, model: CalibrationPrior) -> bool:
     """Whether at least MIN_MATCHED of the lights of a frame, or of the LEDs in it if they are fewer, are matched."""
     visible = int(np.count_nonzero(model.camera.contains(model.pixels(frame.body_from_lab))))
@@ -200,19 +154,6 @@ def displaced_leds(run: SurveyRun) -> dict[int, Floats]:
     missing = np.flatnonzero(~run.seen.any(axis=0))
     named = survey_faults.name_strays(strays, missing, run.listed.position_m, MAX_DISPLACEMENT_M)
     return places | {led: strays[k].position_m for led, k in named}
-
-
-def stray_lights(run: SurveyRun) -> list[StrayLight]:
-    """Lights at rest in the lab that are no known LED."""
-    frame, xy_px = [np.zeros(0, np.int64)], [np.zeros((0, 2))]
-    for k, match in enumerate(run.inliers):
-        if run.survey.tied[k]:
-            lights = run.frames[k].lights.xy_px
-            xy_px.append(np.delete(lights, match.light, axis=0))
-            frame.append(np.full(len(xy_px[-1]), k))
-    return survey_faults.stray_lights(
-        run.held, np.concatenate(frame), np.concatenate(xy_px), STRAY_SIGMA_PX, STRAY_REACH_M
-    )
 
 
 def with_places(run: SurveyRun, places: dict[int, Floats]) -> SurveyRun:
@@ -236,12 +177,12 @@ def adjust_connected(
 ) -> tuple[list[int], DomeSurvey]:
     """Adjust the largest group of connected frames. Returns its rows and the survey.
 
-    A frame may be connected only by misidentified lights. The adjustment rejects these and then fails, so it is tried
-    again with a larger minimum number of shared lights (MIN_SHARED_LEDS). Raises InputError if the last attempt fails.
+    A frame may be connected only by misidentified lights. The adjustment rejects these and refuses the frame, or keeps
+    the few that fit by chance with a wrong attitude. Both are left out. Raises InputError if the frames that remain do
+    not determine the unknowns.
     """
-    visible = led_visibility(pairs, prior)
-    for min_shared in MIN_SHARED_LEDS:
-        selected = largest_connected_group(visible, min_shared)
+    selected = largest_connected_group(led_visibility(pairs, prior), MIN_SHARED_LEDS)
+    while True:
         try:
             # A robust loss, and the prior map as a measurement.
             survey = dome_survey.survey(
@@ -254,12 +195,19 @@ def adjust_connected(
                 leds_sigma_m=uncertainty.led_sigma_m,
                 fit_noise=True,
             )
-        except ValueError as error:
-            if min_shared == MIN_SHARED_LEDS[-1]:
+        except Unconnected as error:
+            if len(error.frames) > MAX_UNCONNECTED * len(selected):
                 raise InputError(str(error)) from None
+            selected = np.delete(selected, error.frames).tolist()
+        except ValueError as error:
+            raise InputError(str(error)) from None
         else:
-            break
-    return selected, survey
+            matched = np.array([len(pairs[k][1].led) for k in selected])
+            rejected = np.bincount(survey.outliers[:, 0], minlength=len(selected))
+            is_wrong = survey.tied & (matched - rejected < MIN_MATCHED * matched)
+            if not is_wrong.any():
+                return selected, survey
+            selected = np.array(selected)[~is_wrong].tolist()
 
 
 def led_visibility(pairs: Sequence[tuple[SurveyFrame, Correspondences]], prior: CalibrationPrior) -> NDArray[np.bool_]:
@@ -301,12 +249,6 @@ def largest_connected_group(visible: NDArray[np.bool_], min_shared: int) -> list
         remaining &= ~group
         best = group if group.sum() > best.sum() else best
     return np.flatnonzero(best).tolist()
-
-
-def led_sigma_m(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> Floats:
-    """(N,) standard deviation of each LED's position, RMS of three axes; that before the survey if not surveyed."""
-    variance_m2 = np.einsum("nii->n", survey.led_covariance_m2) / 3
-    return np.sqrt(np.where(survey.surveyed, variance_m2, uncertainty.led_sigma_m**2))
 
 
 def lens_sigma(survey: DomeSurvey) -> Floats:

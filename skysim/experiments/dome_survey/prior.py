@@ -55,6 +55,7 @@ class CalibrationPrior:
     """Assumed model of dome and camera, before a survey or from it.
 
     floor_px : least standard deviation of a prediction's residuals, by which lights are matched
+    disk_m   : diameter of an LED's luminous disk
     levels   : (N,) nominal brightness of the LEDs, relative; code : what each shows in a frame, None if all are steady
     """
 
@@ -62,6 +63,7 @@ class CalibrationPrior:
     leds: LedMap
     lever: Lever
     floor_px: float
+    disk_m: float
     levels: Floats
     code: LedCode | None = None
 
@@ -123,7 +125,8 @@ def prior_of(testbed: Testbed, camera: Camera, leds: LedMap) -> CalibrationPrior
     lever = onboard_model.assumed_lever(scene, testbed.mount)
     light = require_dome(scene)
     code = onboard_model.assumed_code(light, testbed.sources, leds) if light.led.code else None
-    return CalibrationPrior(camera, leds, lever, scene.tracker.centroid_sigma_px, levels / levels.max(), code)
+    floor_px, disk_m = scene.tracker.centroid_sigma_px, light.led.disk_diameter_m
+    return CalibrationPrior(camera, leds, lever, floor_px, disk_m, levels / levels.max(), code)
 
 
 def design_of(testbed: Testbed) -> Sources:
@@ -152,9 +155,9 @@ class ImageSizes:
     apart_px: float
 
 
-def image_sizes(scene: Scene, prior: CalibrationPrior) -> ImageSizes:
+def image_sizes(prior: CalibrationPrior) -> ImageSizes:
     """The sizes of an LED's image at the least distance, with BLUR_PX of blur on every side."""
-    radius_px = require_dome(scene).led.disk_diameter_m / 2 * prior.px_per_m
+    radius_px = prior.disk_m / 2 * prior.px_per_m
     return ImageSizes(radius_px + BLUR_PX, 2 * (radius_px + BLUR_PX))
 
 

@@ -17,10 +17,15 @@ from skysim.core.io import files
 from skysim.core.types import Floats
 from skysim.experiments.configs import with_config
 from skysim.experiments.dome_survey import stops
-from skysim.experiments.dome_survey.adjust import SurveyRun, run_survey
-from skysim.experiments.dome_survey.findings import accuracy_statistics, find_faults, predicted
+from skysim.experiments.dome_survey.adjust import run_survey
+from skysim.experiments.dome_survey.folder.images import (
+    ATTITUDES,
+    FRAME,
+    SurveyImage,
+    frames_with_attitude,
+    write_attitudes,
+)
 from skysim.experiments.dome_survey.frames import SurveyFrame, centroid_noise_px, imu_attitudes, take_frames
-from skysim.experiments.dome_survey.images import ATTITUDES, FRAME, SurveyImage, frames_with_attitude, write_attitudes
 from skysim.experiments.dome_survey.prior import (
     CalibrationPrior,
     SurveyUncertainty,
@@ -28,7 +33,9 @@ from skysim.experiments.dome_survey.prior import (
     image_sizes,
     survey_model,
 )
-from skysim.experiments.dome_survey.report import led_errors
+from skysim.experiments.dome_survey.results.findings import accuracy_statistics, find_faults, predicted
+from skysim.experiments.dome_survey.results.report import led_errors
+from skysim.experiments.dome_survey.survey_run import SurveyRun
 from skysim.results.files import frames as frame_files
 from skysim.simulation.testbed import Testbed
 
@@ -64,7 +71,7 @@ def make_plan(
     """The attitudes of a survey: by the plan, or random. Raises InputError for a tilt beyond the vehicle's stop."""
     random = stops.stop_attitudes(testbed.scene, "attitudes", count, tilt_deg)
     model = survey_model(prior, uncertainty.led_sigma_m, centroid_noise_px(testbed, tilt_deg))
-    margin_px = image_sizes(testbed.scene, prior).margin_px
+    margin_px = image_sizes(prior).margin_px
     held = random if kind == RANDOM else stops.planned_stops(testbed.scene, model, margin_px, count, tilt_deg)
     return Plan(held, model.visible(held.inv(), margin_px), model, margin_px)
 
@@ -163,7 +170,7 @@ def survey_errors(run: SurveyRun, prior: CalibrationPrior, testbed: Testbed) -> 
         float(np.mean(lever_m**2)),
         (survey.camera.focal_px - testbed.scene.camera.focal_px) ** 2,
         int(survey.surveyed.sum()),
-        find_faults(run, testbed.scene).count,
+        find_faults(run).count,
     )
 
 

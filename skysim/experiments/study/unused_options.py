@@ -31,7 +31,7 @@ from skysim.tracking import settings
 
 STREAK_ALGORITHMS = ("default", "streak")  # detectors and centroiders that use the streak measured by a gyro
 DYNAMICS = (
-    *("motion", "filter", "vehicle.imu", "vehicle.wheels", "vehicle.fans", "vehicle.drag"),
+    *("motion", "filter", "heads", "vehicle.imu", "vehicle.wheels", "vehicle.fans", "vehicle.drag"),
     *("vehicle.disturbances", "vehicle.mass", "vehicle.inertia", "vehicle.center_of_mass", "vehicle.torque_limit"),
     "vehicle.tilt_stop_deg",
 )

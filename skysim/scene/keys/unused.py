@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import Files, location_of, parse_yaml
 from skysim.core.quantities.units import ConfigModel
-from skysim.scene.scene import Scene
+from skysim.scene.scene import HEAD_SECTIONS, Scene
 from skysim.scene.sections.air import NEGLIGIBLE_PX
 from skysim.scene.sections.camera import DetectorConfig
 from skysim.scene.sections.layouts import (
@@ -479,6 +479,18 @@ def check(
         broken = find(RULES, [key], scene)
         if broken and (not overrides or useless_in_file(key, without_overrides)):
             raise InputError(f"{message(*broken)} {location_of(key.split('.'), files, {})}")
+    if not overrides:
+        check_heads(scene, own, files)
+
+
+def check_heads(scene: Scene, own: Mapping[str, Any], files: Files) -> None:
+    """Raise InputError for the first key of a head of the scene's own file that has no effect in that head's scene."""
+    for n, head in enumerate(own.get("heads") or ()):
+        for key in set_keys({section: head[section] for section in HEAD_SECTIONS if section in head}):
+            if broken := find(RULES, [key], scene.of_head(n)):
+                raise InputError(
+                    f"heads.{n}.{message(*broken)} {location_of(['heads', str(n), *key.split('.')], files, {})}"
+                )
 
 
 def check_overrides(scenes: Sequence[Scene], overrides: Mapping[str, str]) -> None:

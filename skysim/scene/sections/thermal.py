@@ -77,9 +77,14 @@ class ThermalConfig(ConfigModel):
     mount_arcsec_k: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0, 0.0)
     lens_ppm_k: Coefficient = 0.0
 
+    @property
+    def has_effect(self) -> bool:
+        """Whether anything depends on the temperature."""
+        return bool(self.dome_ppm_k or any(self.mount_arcsec_k) or self.lens_ppm_k)
+
     @model_validator(mode="after")
     def check_effect(self) -> ThermalConfig:
-        if not (self.dome_ppm_k or any(self.mount_arcsec_k) or self.lens_ppm_k):
+        if not self.has_effect:
             raise ValueError(
                 "nothing depends on the temperature; allowed: dome_ppm_k, mount_arcsec_k or lens_ppm_k, or no thermal"
             )

@@ -191,7 +191,9 @@ class FilterConfig(ConfigModel):
     systematic_arcsec : standard deviation about each axis of the tracker's slow error, which does not average out;
         added to what a dome tracker knows of its survey
     systematic_time, systematic_angle_deg : time and rotation after which the slow error is another one
-    mounting_arcsec : standard deviation of the tracker's mount about each axis
+    mounting_arcsec : standard deviation of the tracker's mount about each axis, and of those of `heads` relative to it,
+        which are estimated
+    mounting_drift_arcsec_sqrt_h : random walk of each mount about each axis
     floor_arcsec : error that all lights of one frame share, another one in every frame, added to the covariance
     considered   : states that are considered
     gate_sigma   : a solution with a larger innovation is rejected
@@ -213,6 +215,7 @@ class FilterConfig(ConfigModel):
     systematic_time_s: Annotated[Time, Field(gt=0)] = 3600.0
     systematic_angle_deg: Positive = 10.0
     mounting_arcsec: NotNegative = 0.0
+    mounting_drift_arcsec_sqrt_h: NotNegative = 0.0
     floor_arcsec: NotNegative = 0.0
     considered: tuple[Literal["bias", "scale", "misalignment", "mounting", "systematic"], ...] = (
         "mounting",
@@ -224,3 +227,9 @@ class FilterConfig(ConfigModel):
     wrong_repeat: Annotated[Number, Field(gt=0, lt=1)] = 0.75
     latency_s: Annotated[Time, Field(ge=0)] = 0.0
     time_tag_sigma_s: Annotated[Time, Field(ge=0)] = 0.0
+
+    @model_validator(mode="after")
+    def check_drift(self) -> FilterConfig:
+        if self.mounting_drift_arcsec_sqrt_h and not self.mounting_arcsec:
+            raise ValueError("mounting_drift_arcsec_sqrt_h: requires mounting_arcsec above 0")
+        return self

@@ -18,6 +18,7 @@ from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, full_scale_e
 from skysim.simulation.checks.expected_error import Expected, mean_root
 from skysim.simulation.checks.views import View
+from skysim.sources.dome.layouts.led_list import max_tilt_deg
 from skysim.sources.dome.shell.room import fit
 
 GAUSSIAN_WIDTH = 4.0  # width of an image over its rms radius: D4sigma (ISO 11146), the diameter of a uniform disk
@@ -147,13 +148,16 @@ def smear(context: Context, samples: Samples) -> Fact:
 class CapMargin(NamedTuple):
     """The cap of a dome's LEDs, a tilt, and what the field needs there; degrees from the zenith.
 
+    cap_deg : where the LEDs end; of a `listed` layout, the farthest one
     needed_deg : for the middle of the field's longer side;  corner_deg : for its corner
+    limit_deg : the layout's `cap_deg`, to which shell and wires reach
     """
 
     cap_deg: float
     tilt_deg: float
     needed_deg: float
     corner_deg: float
+    limit_deg: float
 
     @property
     def text(self) -> str:
@@ -177,13 +181,15 @@ def cap_margin(context: Context, samples: Samples, tilt_deg: float | None = None
     if not isinstance(light, DomeConfig) or context.surface is None:
         return None
     points = getattr(light.layout, "points", light.layout)
-    if points.kind == "listed" or getattr(points, "boards", ()):
+    if getattr(points, "boards", ()):
         return None
+    listed = points.kind == "listed"
+    cap_deg = max_tilt_deg(context.testbed.sources.place[:, :3]) if listed else float(points.cap_deg)
     if tilt_deg is None:
         tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
     size_px = (camera.width_px, camera.height_px)
     edge, corner = (field_reach_deg(context, radius_px, tilt_deg) for radius_px in (max(size_px) / 2, camera.corner_px))
-    return CapMargin(float(points.cap_deg), tilt_deg, edge, corner)
+    return CapMargin(cap_deg, tilt_deg, edge, corner, float(points.cap_deg))
 
 
 def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> float:
@@ -207,7 +213,8 @@ def cap(context: Context, samples: Samples) -> Fact | None:
     found, vehicle = cap_margin(context, samples), context.testbed.scene.vehicle
     if found is None:
         return None
-    lines = [f"LEDs to {found.cap_deg:.3g}° from the zenith; at a tilt of {found.tilt_deg:.1f}° {found.text}"]
+    wider = f", shell and wires to cap_deg, {found.limit_deg:.3g}°" if found.limit_deg > found.cap_deg else ""
+    lines = [f"LEDs to {found.cap_deg:.3g}° from the zenith{wider}; at a tilt of {found.tilt_deg:.1f}° {found.text}"]
     values = {**found._asdict(), "margin_deg": found.cap_deg - found.needed_deg}
     if vehicle.mount == "air_bearing" and vehicle.tilt_stop_deg > found.tilt_deg + 0.05:
         stop = cap_margin(context, samples, vehicle.tilt_stop_deg)
@@ -223,16 +230,16 @@ def room(context: Context, samples: Samples) -> Fact | None:
     if not isinstance(light, DomeConfig) or light.room is None or surface is None:
         return None
     limits, values = light.room, fit(light.room, surface, light.layout.cap_deg)
-    x_m, y_m, _ = values["extent_m"]
+    x_m, y_m, z_m = values["extent_m"]
     floor = [f"{size:.2f} m" if size is not None else "any" for size in (limits.width_m, limits.length_m)]
-    text = f"{x_m:.2f} x {y_m:.2f} m wide (room: {floor[0]} x {floor[1]})"
+    text = f"{x_m:.2f} x {y_m:.2f} x {z_m:.2f} m along x, y, z (room: {floor[0]} x {floor[1]})"
     if limits.bearing_height_m is not None:
         ceiling = f" of {limits.height_m:.2f} m" if limits.height_m is not None else ""
         text = f"top {values['top_m']:.2f} m{ceiling}, rim {values['rim_m']:.2f} m above the floor; {text}"
     if limits.door_m is not None:
-        part = "the shell" if limits.segments == 1 else f"shell in {limits.segments} segments of"
+        part = "the shell" if limits.segments == 1 else f"each of {limits.segments} segments"
         sides, door = (" x ".join(f"{side:.2f}" for side in box) for box in (values["part_m"], limits.door_m))
-        text += f"; {part} {sides} m: fits the door of {door} m"
+        text += f"; {part} goes into a box of {sides} m, shortest side first: fits the door of {door} m"
     return Fact("room", [text], values)
 
 

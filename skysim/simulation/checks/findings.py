@@ -273,6 +273,8 @@ def cap_too_small(context: Context, samples: Samples) -> str:
     found, light = cap_margin(context, samples), context.testbed.scene.light
     if found is None or not isinstance(light, DomeConfig) or found.needed_deg <= found.cap_deg:
         return ""
+    if getattr(light.layout, "points", light.layout).kind == "listed":
+        return ""  # its LEDs are where they are
     key = "light.layout.points.cap_deg" if hasattr(light.layout, "points") else "light.layout.cap_deg"
     uncovered = "the tilt itself is not covered" if found.tilt_deg > found.cap_deg else "its edge has no LED"
     return (

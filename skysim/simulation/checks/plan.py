@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from skysim.camera import wcs
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
 from skysim.scene.sections.light import DomeConfig, StarsConfig
@@ -15,13 +17,14 @@ from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, context_of, usable
 from skysim.simulation.checks.dome import assumptions, lookalike, reflections
 from skysim.simulation.checks.expected_error import expected
-from skysim.simulation.checks.facts import FACTS, Fact, Sampled, Samples
+from skysim.simulation.checks.facts import ARCSEC, FACTS, Fact, Sampled, Samples, short
 from skysim.simulation.checks.findings import FINDINGS
 from skysim.simulation.checks.sky import air, bodies, claims, depth, stray
 from skysim.simulation.checks.views import views
 from skysim.simulation.reference_limits import check_reference
 from skysim.simulation.testbed import Testbed
 
+OWN_KEYS = ("camera.", "tracker.", "exposure.")  # of a head; a finding about any other key is one about the scene
 SKY_FINDINGS = (depth.sky_too_shallow, depth.tracker_too_shallow, claims.floor_too_small, air.refraction)
 
 
@@ -69,7 +72,13 @@ def check(testbed: Testbed, tilt_deg: float | None = None, rate_body_rad_s: Floa
     if alike is not None and isinstance(scene.light, DomeConfig):
         facts.insert(2, lookalike.fact(alike))
         findings += [line for line in [lookalike.finding(alike, scene.light)] if line]
-    return Check(facts, findings + broken_assumptions(testbed))
+    findings += broken_assumptions(testbed)
+    checked = [check(head, tilt_deg, rate_body_rad_s) for head in testbed.heads]
+    if checked:
+        facts.append(heads_fact(testbed, [facts, *(head.facts for head in checked)]))
+    for n, head in enumerate(checked):
+        findings += head_findings(n, head.findings, findings)
+    return Check(facts, findings)
 
 
 def sampled(at: Attitudes, context: Context) -> Sampled:
@@ -87,3 +96,58 @@ def broken_assumptions(testbed: Testbed) -> list[str]:
     if not isinstance(scene.light, DomeConfig):
         return []
     return assumptions.warnings(scene, testbed.sources, testbed.mount)
+
+
+def errors_arcsec(facts: Sequence[Fact]) -> tuple[float, float]:
+    """Expected cross and roll error at the frames, of the facts of one camera; NaN without a solution."""
+    frames = next((fact.values["frames"] for fact in facts if fact.name == "expected error"), None)
+    return (frames["cross_arcsec"], frames["roll_arcsec"]) if frames else (float("nan"), float("nan"))
+
+
+def information(cross: float, roll: float) -> Floats:
+    """(3, 3) inverse covariance about the camera's axes, rad^-2; zeros without a solution."""
+    if not np.isfinite([cross, roll]).all():
+        return np.zeros((3, 3))
+    across2, along2 = (cross * ARCSEC_RAD) ** 2 / 2, (roll * ARCSEC_RAD) ** 2
+    return np.diag([1 / across2, 1 / across2, 1 / along2])
+
+
+def together_arcsec(testbed: Testbed, errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Expected cross and roll error about the main boresight of all cameras together.
+
+    Solutions of independent errors have the sum of their information: P^-1 = sum R_n P_n^-1 R_n^T with R_n the rotation
+    from the axes of camera n to those of the main one.
+    """
+    total, main = np.zeros((3, 3)), testbed.mount.cam_from_body
+    for camera, error in zip(testbed.cameras, errors, strict=True):
+        R_main_from_cam = (main * camera.mount.cam_from_body.inv()).as_matrix()
+        total += R_main_from_cam @ information(*error) @ R_main_from_cam.T
+    if not total.any():
+        return float("nan"), float("nan")
+    variance = np.diag(np.linalg.inv(total)) / ARCSEC_RAD**2
+    return float(np.sqrt(variance[:2].sum())), float(np.sqrt(variance[2]))
+
+
+def heads_fact(testbed: Testbed, facts: Sequence[Sequence[Fact]]) -> Fact:
+    """The expected errors of each head at the frames, and of all cameras together; facts : of each camera."""
+    errors = [errors_arcsec(own) for own in facts]
+    names = [head.name for head in testbed.scene.heads]
+    lines = [f"{name}: {errors_text(*error)}" for name, error in zip(names, errors[1:], strict=True)]
+    combined = together_arcsec(testbed, errors)
+    lines.append(f"with the main camera: {errors_text(*combined)}, about its axes, without errors of the mounts")
+    values = [
+        {"name": name, "cross_arcsec": cross, "roll_arcsec": roll}
+        for name, (cross, roll) in zip(names, errors[1:], strict=True)
+    ]
+    together = {"cross_arcsec": combined[0], "roll_arcsec": combined[1]}
+    return Fact("heads", lines, {"heads": values, "together": together})
+
+
+def errors_text(cross: float, roll: float) -> str:
+    """Expected errors as a sentence."""
+    return f"cross {short(cross)}{ARCSEC}, roll {short(roll)}{ARCSEC} (1σ)" if cross == cross else "no solution"
+
+
+def head_findings(n: int, own: Sequence[str], main: Sequence[str]) -> list[str]:
+    """The warnings of head n that are not those of the main camera, with the key of the head."""
+    return [f"heads.{n}.{line}" for line in own if line.startswith(OWN_KEYS) and line not in main]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -125,6 +126,74 @@ def test_strays_are_named_by_the_nearest_places(rng: np.random.Generator, count:
     pairs = survey_faults.name_strays(strays, np.arange(8), listed, 0.1)
     assert sorted(pairs) == sorted((int(k), n) for n, k in enumerate(chosen))
     assert survey_faults.name_strays(strays, np.arange(0), listed, 0.1) == []
+
+
+LIST_M, CLOSE_M = 0.001, 0.004  # error of a list, and distance of LEDs that it may have in the wrong order
+
+
+def close_group(rng: np.random.Generator, levels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, LightTable]:
+    """List, places, covariance and light of four LEDs in a row, and 56 far from one another, of these levels."""
+    place_m = 10 * rng.normal(0, 1, (60, 3))
+    place_m[:4] = place_m[0] + CLOSE_M * np.arange(4)[:, None] * [1.0, 0.0, 0.0]
+    listed = place_m + LIST_M * rng.normal(0, 1, place_m.shape)
+    light = levels * np.exp(0.03 * rng.normal(0, 1, (8, 60)))
+    table = LightTable(light, np.ones((8, 60), dtype=bool), np.tile(levels, (8, 1)))
+    return listed, place_m, np.tile(np.eye(3) * 1e-10, (60, 1, 1)), table
+
+
+@law(survey_faults.names)
+@given(rng=SEEDS)
+def test_of_equal_leds_the_names_are_the_nearest_of_all_orders(rng: np.random.Generator) -> None:
+    """The oracle tries all 24 orders of four LEDs that the list may have in any."""
+    listed, place_m, covariance, table = close_group(rng, np.ones(60))
+    listed[:4] = place_m[:4] + 3 * LIST_M * rng.normal(0, 1, (4, 3))
+    rows, new = survey_faults.names(table, listed, place_m, covariance)
+    cost = np.sum((place_m[:4, None] - listed[:4]) ** 2, axis=2)
+    orders = [np.array(order) for order in itertools.permutations(range(4))]
+    best = min(orders, key=lambda order: cost[range(4), order].sum())
+    np.testing.assert_array_equal(rows, np.arange(60))
+    _, sigma_m = survey_faults.displaced(listed, place_m, covariance)
+    plausible = cost[range(4), best].max() < 20 * sigma_m**2  # well below the quantile: 26 for 60 LEDs
+    assert (new[:4].tolist() == best.tolist()) or not plausible
+    np.testing.assert_array_equal(new[4:], np.arange(4, 60))
+
+
+@law(survey_faults.names)
+@given(rng=SEEDS)
+def test_light_names_leds_that_the_list_has_in_the_wrong_order(rng: np.random.Generator) -> None:
+    """Of neighbors the light decides; of LEDs farther apart the place, and an exchange is reported."""
+    levels = np.exp(np.linspace(0, -30, 60))
+    listed, place_m, covariance, table = close_group(rng, levels)
+    wrong = np.arange(60)
+    wrong[[1, 2]] = [2, 1]
+    listed[[1, 2]] = place_m[[2, 1]]  # by place alone each would have the other's name
+    mixed = replace(table, light=table.light[:, wrong])
+    _, new = survey_faults.names(mixed, listed, place_m[wrong], covariance)
+    np.testing.assert_array_equal(new, wrong)
+    far = np.arange(60)
+    far[[10, 20]] = [20, 10]
+    exchanged = replace(table, light=table.light[:, far])
+    rows, same = survey_faults.names(exchanged, listed, place_m, covariance)
+    np.testing.assert_array_equal(same, rows)
+    assert [(one.led, one.shows) for one in survey_faults.exchanged(exchanged)[0]] == [(10, 20), (20, 10)]
+    none = survey_faults.names(table, listed, place_m, np.full((60, 3, 3), np.nan))
+    assert [len(one) for one in none] == [0, 0]
+
+
+@law(survey_faults.names)
+@given(rng=SEEDS)
+def test_the_name_of_a_dark_led_goes_to_no_other(rng: np.random.Generator) -> None:
+    """LED 1 is dark, and its name was given to the light of LED 2, which is called 2 again."""
+    listed, place_m, covariance, table = close_group(rng, np.exp(np.linspace(0, -30, 60)))
+    covariance[2] = np.nan
+    light = table.light.copy()
+    light[:, 1] = table.light[:, 2]
+    light[:, 2] = np.nan
+    found_m = place_m.copy()
+    found_m[1] = place_m[2]
+    rows, new = survey_faults.names(replace(table, light=light), listed, found_m, covariance)
+    assert new[rows == 1] == [2]
+    assert 1 not in new
 
 
 @law(survey_faults.exchanged)

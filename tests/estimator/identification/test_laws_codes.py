@@ -15,7 +15,7 @@ from estimator.attitude.dome_map import Lever, project
 from estimator.core.arrays import Floats
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
-from estimator.core.types import Centroids
+from estimator.core.types import Centroids, StarMatch
 from estimator.identification.leds import codes, naming
 from estimator.identification.leds.codes import GROSS, LedCode
 from estimator.identification.leds.tracks import LightTracks
@@ -71,6 +71,28 @@ def test_a_true_word_is_seldom_suspicious() -> None:
     for measured in (3, 9, 19, 31):
         limit = codes.expected_misfit(np.array([measured]))[0] - GROSS * max(1, measured / 6)
         assert chi2.sf(2 * limit, measured) < 0.02
+
+
+@law(codes.excess_noise)
+@given(rng=SEEDS, factor=some.floats(0.3, 4.0))
+def test_noise_beyond_the_declared_is_found_from_the_misfits(rng: np.random.Generator, factor: float) -> None:
+    """Squared errors `factor`^2 times the declared ones; one light in nine is no LED. Never below 1."""
+    measured = np.full(90, 24)
+    least = factor**2 * rng.chisquare(measured) / 2
+    least[::9] = 1e4
+    found = codes.excess_noise(least, measured)
+    assert found == 1 if factor < 0.85 else found == pytest.approx(max(1.0, factor**2), rel=0.25)
+
+
+@law(naming.is_supported)
+@given(lights=some.integers(2, 6), rival=some.floats(0.0, 30.0))
+def test_names_hold_only_at_a_common_time_and_against_the_other_lights(lights: int, rival: float) -> None:
+    """Two lights that are perfect at different phases of the clock, or together at one; and lights without a name."""
+    misfit = np.full((2, lights, 4), 20.0)
+    misfit[0, 0, 1] = misfit[1, 1, 2] = 0.0
+    misfit[1, 0, 1] = misfit[0, 1, 2] = rival
+    match = StarMatch(np.array([0, 1]), np.array([1, 2]), Rotation.identity(), 0.0)
+    assert naming.is_supported(match, misfit, lights) == (lights == 2 and rival <= naming.TRUSTED * np.sqrt(2))
 
 
 def dome(count: int) -> naming.Sphere:

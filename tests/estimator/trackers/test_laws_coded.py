@@ -71,6 +71,24 @@ def test_lights_are_named_by_their_codes_or_not_at_all(
 
 
 @law(CodedTracker.solve_centroids, slow=True)
+@given(rng=SEEDS, bit_time_s=some.sampled_from([None, 0.021]), noise=some.sampled_from([0.06, 0.09]))
+def test_light_noisier_than_declared_gives_no_wrong_attitude(
+    rng: np.random.Generator, bit_time_s: float | None, noise: float
+) -> None:
+    """Two and three times `flux_sigma`, and up to seven lights that may be any LED's."""
+    eye, body_from_lab, late_s = tracker(0.5, bit_time_s), turn(rng, 0.3), rng.uniform(0, 0.5)
+    px = np.nan_to_num(project(body_from_lab, eye.leds.position_m, LEVER, CAMERA), nan=-1e9)
+    star = rng.permutation(np.flatnonzero(CAMERA.contains(px, 3)))[: rng.integers(2, 8)]
+    levels = np.where(WORDS[star] > 0, 1.0, 0.5)
+    for frame in range(24):
+        bit = frame if bit_time_s is None else int((0.02 * frame + late_s) / bit_time_s) % 24
+        light = 1e5 * levels[:, bit] * np.maximum(1 + noise * rng.standard_normal(len(star)), 0.1)
+        found = eye.solve_centroids(Centroids(px[star], np.full(len(star), 0.1), light), t_s=0.02 * frame, frame=frame)
+        if found.solved:
+            np.testing.assert_array_equal(found.match.star, star[found.match.observed])
+
+
+@law(CodedTracker.solve_centroids, slow=True)
 @given(rng=SEEDS)
 def test_a_code_of_other_leds_gives_no_attitude(rng: np.random.Generator) -> None:
     """The lights blink words that no LED has."""

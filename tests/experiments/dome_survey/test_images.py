@@ -7,6 +7,7 @@ import io as std_io
 import json
 import shutil
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.dome_survey import images, prior, procedure, stops
+from skysim.experiments.dome_survey import prior, procedure, stops
+from skysim.experiments.dome_survey.folder import images, watch
 from skysim.scene import loader
 from skysim.simulation.testbed import Testbed, build_testbed
 
@@ -155,6 +157,20 @@ def test_coverage_and_next_attitudes_are_in_the_result(result: dict[str, Any], f
 
 
 @pytest.mark.slow
+def test_the_report_has_the_numbers_and_the_faults_with_places(result: dict[str, Any], folder: Path) -> None:
+    page = (folder / "by_imu" / "report.html").read_text()
+    assert result["report"] == str(folder / "by_imu" / "report.html")
+    assert f"<b>{result['surveyed']} / {result['leds']}</b>" in page
+    assert f"<tr><td>{DEAD}</td><td>dark</td>" in page
+    place_mm = ", ".join(f"{1e3 * one:.1f}" for one in result["faults"]["found_m"][str(FAR)])
+    assert f"<tr><td>{FAR}</td><td>displaced</td>" in page
+    assert f"({place_mm}) mm" in page
+    assert page.count("<td>exchanged</td>") == 2
+    assert page.count('src="data:image/png;base64,') == 2
+    assert page.count("<tr>", page.index('id="next"')) == 1 + len(result["next"])
+
+
+@pytest.mark.slow
 def test_without_an_imu_the_tracker_identifies_the_images(folder: Path, frames: Path, result: dict[str, Any]) -> None:
     """LEDs that differ in place alone, to a millimeter: nearly all images, and the same dome."""
     alone = folder / "alone"
@@ -166,6 +182,47 @@ def test_without_an_imu_the_tracker_identifies_the_images(folder: Path, frames: 
     assert found["faults"]["dark"] == [DEAD]
     by_imu, lost = ({line["what"]: line["found"] for line in one["values"]} for one in (result, found))
     assert lost["focal length px"] == pytest.approx(by_imu["focal length px"], rel=2e-3)
+
+
+# --- images as they arrive ----------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_watch_ends_with_the_survey_of_what_is_there(
+    folder: Path, frames: Path, result: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thread drops the images in; Ctrl-C comes when all are read. The survey is that of the folder at rest."""
+    arriving = tmp_path / "arriving"
+    arriving.mkdir()
+
+    def drop() -> None:
+        shutil.copy(frames / images.ATTITUDES, arriving)
+        (arriving / "noise.png").write_bytes(b"no image")
+        for path in sorted(frames.glob("*.fits")):
+            shutil.copy(path, arriving / f".{path.name}")
+            (arriving / f".{path.name}").rename(arriving / path.name)
+
+    dropping = threading.Thread(target=drop)
+
+    def wait(_: float) -> None:
+        rested.append(dropping.is_alive())
+        if len(rested) > 3 and not any(rested[-3:]):
+            raise KeyboardInterrupt
+
+    rested: list[bool] = []
+    monkeypatch.setattr(watch.time, "sleep", wait)
+    dropping.start()
+    words = ["survey", folder / "design.yaml", "--images", arriving, "--camera", folder / "design.yaml", "--watch"]
+    words += ["--led-sigma", "1 mm", "--imu-sigma", "0.3 deg", "--tilt", TILT_DEG, "--out", tmp_path / "out"]
+    code, printed, err = command(*words)
+    dropping.join()
+    assert code == 0
+    assert err.count("\n") == 1  # for the file that is no image
+    assert "noise.png" in err
+    assert f"{STOPS} of 150 images, {STOPS} with an attitude" in printed
+    assert "LEDs measured" in printed.split("surveyed in")[0]
+    found = json.loads((tmp_path / "out" / "survey.json").read_text())
+    assert (found["surveyed"], found["faults"]) == (result["surveyed"], result["faults"])
 
 
 # --- what is refused ----------------------------------------------------------------------------------------
@@ -204,6 +261,8 @@ def test_images_that_cannot_be_surveyed_are_one_line(folder: Path, tmp_path: Pat
         (["--camera", "x.yaml"], "--camera: has no effect without --images"),
         (["--plan", "--checks", "3"], "--checks: has no effect with --plan"),
         (["--repeat", "3", "--frames-to", "x"], "--frames-to: has no effect with --repeat"),
+        (["--watch"], "--watch: has no effect without --images; allowed: with --images FOLDER"),
+        (["--images", ".", "--camera", "x.yaml", "--watch", "--checks", "3"], "--checks: has no effect with --watch"),
         (["--plan", "--repeat", "3"], "--repeat: has no effect with --plan; allowed: one of them"),
     ],
 )

@@ -299,6 +299,18 @@ def test_findings_of_many_levels_are_few(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_finding_names_the_number_of_leds_where_the_study_varies_it(tmp_path: Path) -> None:
+    """A level of another factor is checked at the first number of LEDs, which its name did not say."""
+    factors = {
+        "leds": {"key": "light.layout.count", "values": [60, 900]},
+        "disk": {"levels": {"small": {}, "large": {"light.led.disk_diameter": "10 mm"}}},
+    }
+    found = overview.overview(loaded(tmp_path, trial={"kind": "frames"}, factors=factors)).findings
+    (wide,) = [one for one in found if "px wide; local treats" in one]
+    assert wide.endswith("[disk = large, 60 LEDs]")
+
+
+@pytest.mark.slow
 def test_a_rolling_shutter_is_checked_at_the_rates_of_the_trials(tmp_path: Path) -> None:
     """The scene turns by 0.5 deg/s and its trials by up to 20: the warning is of 20, and none is given at rest."""
     shutter = {"camera.shutter": {"kind": "rolling", "row_time": "80 us"}, "tracker.assumed_row_time": "0 s"}

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
+from skysim.apps.cli.study_summary import print_front
 from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan, store
 from skysim.experiments.study.analysis import cost, search
@@ -24,6 +25,7 @@ from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.factors import Settings
 from skysim.results.files.builder.parts import parts_list
 from skysim.results.files.builder.prices import find_prices, read_prices
+from skysim.results.metrics import Summary
 from skysim.scene import loader as scene_loader
 
 pytest.importorskip("optuna")
@@ -379,10 +381,33 @@ def test_other_prices_are_another_search(tmp_path: Path) -> None:
 
 
 def test_bad_prices_are_the_study_s_fault(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.csv cannot be read .*study\.yaml"):
+    with pytest.raises(InputError, match=r"none\.csv: cannot be read: .*study\.yaml"):
         priced(tmp_path, "none.csv")
     with pytest.raises(InputError, match=r"optimize\.cost\.parts: light of kind stars has no parts; allowed: dome"):
         loaded(tmp_path, changed(cost={"parts": "assumed"}))
+
+
+def test_the_terminal_s_front_has_levels_error_and_cost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The two of three candidates that no other beats, as a table; as paragraphs where the terminal is narrow."""
+    study = loaded(tmp_path, changed(objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}])).study
+    assert study.optimize is not None
+    values = ((40.0, 100.0), (30.0, 200.0), (50.0, 300.0))
+    candidates = [
+        search.Candidate(n, {"x": 0.25 * n, "y": 0.5}, one, {"angle_arcsec_median": Summary(one[0], 20, 60, 9)}, one[1],
+                         True, False, "")
+        for n, one in enumerate(values)
+    ]  # fmt: skip
+    result = search.SearchResult(candidates, search.front(study.optimize, candidates), True)
+    heads, cells = search.front_cells(study, result)
+    assert heads == ["candidate", "x", "y", "angle_arcsec_median", "cost"]
+    assert cells == [["1", "0.25", "0.5", "30 (20..60)", "200"], ["0", "0", "0.5", "40 (20..60)", "100"]]
+    print_front(heads, cells, 3)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "front of 3 candidates:"
+    assert [line.split() for line in lines[-2:]] == [" ".join(one).split() for one in cells]
+    print_front(heads, [], 3)
+    assert capsys.readouterr().out == "no front: none of 3 candidates is feasible\n"
+    assert search.front_columns(result) == {"front": [1, 0], "costs": [100.0, 200.0, 300.0]}
 
 
 LEVELS = {"levels": {"cheap": {"trial.missing": 0.1}, "precise": {"trial.missing": 0.0}}}

@@ -5,7 +5,8 @@ from __future__ import annotations
 import shlex
 import sys
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -35,6 +36,7 @@ from skysim.apps.cli.options import (
 
 if TYPE_CHECKING:
     from skysim.core.types import FrameRow
+    from skysim.simulation.testbed import Testbed
 
 
 def run(
@@ -79,17 +81,35 @@ def run(
     for frame in terminal.progress(scored, loaded.exposure.frames, loaded.title):
         recorder.add(frame)
     views = terminal.write_3d_views(testbed, recorder.folder) if scene_3d else []
-    statistics = recorder.finish(shlex.join(["skysim", *sys.argv[1:]]), views)
+    command = shlex.join(["skysim", *sys.argv[1:]])
+    statistics = recorder.finish(command, views)
+    heads = run_heads(testbed, recorder.folder, command)
     if json:
-        terminal.print_json({"scene": loaded.name, **statistics, "rows": [asdict(row) for row in recorder.rows]})
+        rows = {"rows": [asdict(row) for row in recorder.rows]}
+        terminal.print_json({"scene": loaded.name, **statistics, **rows, **({"heads": heads} if heads else {})})
     else:
         terminal.print_rows(recorder.rows, scoring.angle_names(loaded), statistics["exposures_ms"])
         terminal.print_summary(statistics)
+        for name, head in heads.items():
+            terminal.print_head(name, head)
         for fact in plan.facts:
             if fact.name == "tracker knows":
                 terminal.print_fact(fact)
     if open_:
         typer.launch(statistics["report"])
+
+
+def run_heads(testbed: Testbed, folder: Path, command: str) -> dict[str, dict[str, Any]]:
+    """Render, solve and write the frames of the further star cameras, each to its folder; their statistics by name."""
+    from skysim.results.run import Recorder, score_frames
+
+    statistics = {}
+    for config, head in zip(testbed.scene.heads, testbed.heads, strict=True):
+        recorder = Recorder(folder / config.name, head)
+        for frame in terminal.progress(score_frames(head), head.scene.exposure.frames, config.name):
+            recorder.add(frame)
+        statistics[config.name] = recorder.finish(command)
+    return statistics
 
 
 def render(
@@ -115,16 +135,19 @@ def render(
         terminal.print_error(warning)
     with terminal.progress_callback("simulating the motion") as update:
         testbed = simulation.simulate_motion(testbed, update)
-    rendered = terminal.eager_first(simulation.render_frames(testbed))
-    recorder = Recorder(output_folder(out, loaded.name), testbed)
-    paths = [
-        str(recorder.write(frame, truth, preview))
-        for frame, truth, _ in terminal.progress(rendered, loaded.exposure.frames, loaded.title)
-    ]
+    folder, paths = output_folder(out, loaded.name), list[str]()
+    folders = [folder, *(folder / head.name for head in loaded.heads)]
+    for camera, own_folder in zip(testbed.cameras, folders, strict=True):
+        rendered = terminal.eager_first(simulation.render_frames(camera))
+        recorder = Recorder(own_folder, camera)
+        paths += [
+            str(recorder.write(frame, truth, preview))
+            for frame, truth, _ in terminal.progress(rendered, camera.scene.exposure.frames, loaded.title)
+        ]
     if json:
         terminal.print_json(paths)
     else:
-        print(f"{len(paths)} frames with their truth in {recorder.folder}")
+        print(f"{len(paths)} frames with their truth in {folder}")
 
 
 def compare(

@@ -23,6 +23,7 @@ from skysim.apps.cli.options import (
 )
 from skysim.apps.cli.study_summary import (
     print_answers,
+    print_front,
     print_points,
     print_replay,
     print_study_status,
@@ -34,6 +35,7 @@ from skysim.apps.cli.terminal import print_error, print_json, print_titles, tria
 from skysim.core.errors import InputError, printable, unknown_name
 
 if TYPE_CHECKING:
+    from skysim.experiments.study.analysis.search import SearchResult
     from skysim.experiments.study.execution.engines import Engine
     from skysim.experiments.study.plan import Plan
     from skysim.experiments.study.store import Store
@@ -308,7 +310,7 @@ def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
 
 def write_report(plan: Plan, study: str, out: Path | None, overrides: dict[str, str], json: bool, open_: bool) -> None:
     """Write the HTML report, print the table of results, and open the report in the browser if `open_`."""
-    from skysim.experiments.study.analysis import answer, table
+    from skysim.experiments.study.analysis import answer, search, table
     from skysim.experiments.study.report import page
     from skysim.experiments.study.report.overview import overview
 
@@ -321,27 +323,29 @@ def write_report(plan: Plan, study: str, out: Path | None, overrides: dict[str, 
         answers = headline + answer.ranges(plan.study, lines)
         texts: dict[str, Any] = {"about": about, "answers": answers, "replay": command(study, out, "replay")}
         shown = table.select_responses(lines, page.responses(plan.study))
-        page.write_page(path, stored, plan.study, repeat, shown, **texts, **analysis(plan, stored))
+        result = search.collect_result(plan, stored) if plan.study.optimize else None
+        page.write_page(path, stored, plan.study, repeat, shown, **texts, **analysis(plan, stored, result))
         lines = table.select_responses(lines, plan.study.responses)
         progress = study_status(plan, stored)
     if open_:
         typer.launch(str(path))
     if json:
-        points = table.to_columns(lines)
-        print_json(progress | {"report": str(path), "points": points, "answers": answers, "findings": about.findings})
+        found = {"report": str(path), "points": table.to_columns(lines), "answers": answers, "findings": about.findings}
+        print_json(progress | found | (search.front_columns(result) if result else {}))
         return
     print_points(*table.cells(lines), factors=len(plan.study.factors))
+    if result:
+        print_front(*search.front_cells(plan.study, result), len(result.candidates))
     print_answers(about.findings, headline)
     print_study_status(progress)
     print(f"report: {path}")
 
 
-def analysis(plan: Plan, stored: Store) -> dict[str, Any]:
+def analysis(plan: Plan, stored: Store, result: SearchResult | None) -> dict[str, Any]:
     """Extra content of the report: Sobol indices, or a search's Pareto front and the cost of each candidate."""
-    from skysim.experiments.study.analysis import search, sensitivity
+    from skysim.experiments.study.analysis import sensitivity
 
-    if plan.study.optimize is not None:
-        result = search.collect_result(plan, stored)
+    if result is not None:
         costs = {candidate.number: candidate.cost for candidate in result.candidates}
         return {"front": [candidate.number for candidate in result.front], "costs": costs}
     return {"indices": sensitivity.indices(plan, stored)} if plan.study.design.kind == "saltelli" else {}

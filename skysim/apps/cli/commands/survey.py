@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -13,16 +15,18 @@ import typer
 
 from skysim.apps.cli import survey_summary
 from skysim.apps.cli.options import Json, Out, Overrides, SceneArg, Seed, load, output_folder
-from skysim.apps.cli.terminal import print_json, progress, progress_callback
+from skysim.apps.cli.terminal import print_error, print_json, progress, progress_callback
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
     from estimator.core.camera import Camera
-    from skysim.experiments.dome_survey.adjust import SurveyRun
-    from skysim.experiments.dome_survey.findings import Coverage
+    from estimator.trackers.pipeline import Settings
+    from skysim.experiments.dome_survey.folder.images import SurveyImage
     from skysim.experiments.dome_survey.frames import SurveyFrame
     from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty
     from skysim.experiments.dome_survey.procedure import Plan
+    from skysim.experiments.dome_survey.results.findings import Coverage
+    from skysim.experiments.dome_survey.survey_run import SurveyRun
     from skysim.scene.scene import Scene
     from skysim.simulation.testbed import Testbed
 
@@ -48,51 +52,77 @@ class Request:
     frames: int
     distortion: bool
     next_stops: int
+    quiet: bool  # print the result alone
+
+
+FrameCount = Annotated[
+    int | None,
+    typer.Option(
+        min=2, help=f"Number of attitudes, with one frame at each; of images with --watch. Default: {FRAMES}."
+    ),
+]
+PlanOnly = Annotated[
+    bool, typer.Option("--plan", help="Print the attitudes to hold and the predicted errors; simulate nothing.")
+]
+Images = Annotated[
+    Path | None,
+    typer.Option(help="Survey from the images of a folder, with the IMU's attitudes in its attitudes.csv if any."),
+]
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(help="Camera of the images: a scene (file or name), camera file or OpenCV calibration."),
+]
+Watch = Annotated[
+    bool,
+    typer.Option(
+        "--watch",
+        help="With --images: follow the folder while the images are taken, and print which LEDs are measured and which"
+        " attitudes to hold next; after the last one, or Ctrl-C, survey.",
+    ),
+]
+Repeat = Annotated[
+    int | None, typer.Option(min=2, help="Simulate so many surveys, and compare their errors with the prediction.")
+]
+AttitudesBy = Annotated[Attitudes | None, typer.Option(help="Attitudes: by the plan (default), or random.")]
+Next = Annotated[
+    int | None, typer.Option("--next", min=1, help=f"Number of attitudes to propose next; default: {NEXT}.")
+]
+FramesTo = Annotated[
+    Path | None, typer.Option(help="Write the simulated frames and attitudes to a folder, for --images.")
+]
+Tilt = Annotated[float, typer.Option(help="Maximum tilt of the attitudes, degrees.")]
+ImuSigma = Annotated[str, typer.Option(help="Standard error of the IMU's attitude about each axis.")]
+LedSigma = Annotated[str, typer.Option(help="Standard error of an LED's assumed position along each axis.")]
+LeverSigma = Annotated[str, typer.Option(help="Standard error of the camera's assumed position.")]
+FocalError = Annotated[str, typer.Option(help="Error of the assumed focal length.")]
+Distortion = Annotated[bool, typer.Option("--distortion", help="Also fit the distortion k1, k2, p1, p2.")]
+Checks = Annotated[
+    int | None,
+    typer.Option(min=1, help=f"Further attitudes at which the tracker is tested before and after; default: {CHECKS}."),
+]
 
 
 def survey(
     scene: SceneArg,
-    frames: Annotated[
-        int | None, typer.Option(min=2, help=f"Number of attitudes, with one frame at each; default: {FRAMES}.")
-    ] = None,
-    plan: Annotated[
-        bool, typer.Option("--plan", help="Print the attitudes to hold and the predicted errors; simulate nothing.")
-    ] = False,
-    images: Annotated[
-        Path | None,
-        typer.Option(help="Survey from the images of a folder, with the IMU's attitudes in its attitudes.csv if any."),
-    ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option(help="Camera of the images: a scene (file or name), camera file or OpenCV calibration."),
-    ] = None,
-    repeat: Annotated[
-        int | None, typer.Option(min=2, help="Simulate so many surveys, and compare their errors with the prediction.")
-    ] = None,
-    attitudes: Annotated[Attitudes | None, typer.Option(help="Attitudes: by the plan (default), or random.")] = None,
-    next_: Annotated[
-        int | None, typer.Option("--next", min=1, help=f"Number of attitudes to propose next; default: {NEXT}.")
-    ] = None,
-    frames_to: Annotated[
-        Path | None, typer.Option(help="Write the simulated frames and attitudes to a folder, for --images.")
-    ] = None,
+    frames: FrameCount = None,
+    plan: PlanOnly = False,
+    images: Images = None,
+    camera: CameraFile = None,
+    watch: Watch = False,
+    repeat: Repeat = None,
+    attitudes: AttitudesBy = None,
+    next_: Next = None,
+    frames_to: FramesTo = None,
     seed: Seed = None,
     out: Out = None,
     set_: Overrides = None,
-    tilt: Annotated[float, typer.Option(help="Maximum tilt of the attitudes, degrees.")] = 25.0,
-    imu_sigma: Annotated[str, typer.Option(help="Standard error of the IMU's attitude about each axis.")] = "0.5 deg",
-    led_sigma: Annotated[
-        str, typer.Option(help="Standard error of an LED's assumed position along each axis.")
-    ] = "2 mm",
-    lever_sigma: Annotated[str, typer.Option(help="Standard error of the camera's assumed position.")] = "5 mm",
-    focal_error: Annotated[str, typer.Option(help="Error of the assumed focal length.")] = "1%",
-    distortion: Annotated[bool, typer.Option("--distortion", help="Also fit the distortion k1, k2, p1, p2.")] = False,
-    checks: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help=f"Further attitudes at which the tracker is tested before and after; default: {CHECKS}."
-        ),
-    ] = None,
+    tilt: Tilt = 25.0,
+    imu_sigma: ImuSigma = "0.5 deg",
+    led_sigma: LedSigma = "2 mm",
+    lever_sigma: LeverSigma = "5 mm",
+    focal_error: FocalError = "1%",
+    distortion: Distortion = False,
+    checks: Checks = None,
     json: Json = False,
 ) -> None:
     """Survey a dome from frames at many attitudes: LED positions, lever arm and lens, to a file for `tracker.map`.
@@ -103,20 +133,16 @@ def survey(
     from skysim.experiments.dome_survey.prior import survey_uncertainty
 
     given = {"frames": frames, "attitudes": attitudes, "next": next_, "frames-to": frames_to, "checks": checks}
-    mode = survey_mode(plan, images, camera, repeat, {name for name, value in given.items() if value is not None})
-    loaded = load(scene, None, seed, set_)
-    request = Request(
-        loaded,
+    chosen = {name for name, value in given.items() if value is not None}
+    mode = survey_mode(plan, images, camera, watch, repeat, chosen)
+    loaded, uncertainty = (
+        load(scene, None, seed, set_),
         survey_uncertainty(imu_sigma, led_sigma, lever_sigma, focal_error),
-        output_folder(out, loaded.name),
-        tilt,
-        (attitudes or Attitudes.PLAN).value,
-        frames or FRAMES,
-        distortion,
-        next_ or NEXT,
     )
+    folder, by = output_folder(out, loaded.name), (attitudes or Attitudes.PLAN).value
+    request = Request(loaded, uncertainty, folder, tilt, by, frames or FRAMES, distortion, next_ or NEXT, json)
     if images is not None and camera is not None:
-        statistics = from_images(request, images, camera)
+        statistics = from_images(request, images, camera, watch)
     elif plan:
         statistics = plan_only(request)
     elif repeat:
@@ -132,13 +158,16 @@ def survey(
 # What each mode of the command does not use.
 UNUSED = {
     "images": ("frames", "attitudes", "frames-to", "checks"),
+    "watch": ("attitudes", "frames-to", "checks"),
     "plan": ("next", "frames-to", "checks"),
     "repeat": ("next", "frames-to", "checks"),
     "simulate": (),
 }
 
 
-def survey_mode(plan: bool, images: Path | None, camera: Path | None, repeat: int | None, given: set[str]) -> str:
+def survey_mode(
+    plan: bool, images: Path | None, camera: Path | None, watch: bool, repeat: int | None, given: set[str]
+) -> str:
     """The mode that the options choose. Raises InputError for options that exclude one another or have no effect."""
     modes = [name for name, on in (("images", images), ("plan", plan), ("repeat", repeat)) if on]
     if len(modes) > 1:
@@ -147,7 +176,9 @@ def survey_mode(plan: bool, images: Path | None, camera: Path | None, repeat: in
         raise InputError("--images: no camera; allowed: with --camera FILE, a scene, camera file or OpenCV calibration")
     if camera is not None and images is None:
         raise InputError("--camera: has no effect without --images; allowed: the scene's camera is used")
-    mode = modes[0] if modes else "simulate"
+    if watch and images is None:
+        raise InputError("--watch: has no effect without --images; allowed: with --images FOLDER")
+    mode = "watch" if watch else modes[0] if modes else "simulate"
     for name in UNUSED[mode]:
         if name in given:
             raise InputError(f"--{name}: has no effect with --{mode}; allowed: none")
@@ -168,7 +199,8 @@ def planned(request: Request) -> tuple[Testbed, CalibrationPrior, Plan]:
 def plan_only(request: Request) -> dict[str, Any]:
     """The attitudes of a plan and the errors predicted."""
     from skysim.core.io import files
-    from skysim.experiments.dome_survey import findings, procedure
+    from skysim.experiments.dome_survey import procedure
+    from skysim.experiments.dome_survey.results import findings
 
     _, _, plan = planned(request)
     path = files.make_folder(request.folder) / "plan.csv"
@@ -202,7 +234,8 @@ def repeated(request: Request, repeat: int) -> dict[str, Any]:
 
 def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str, Any]:
     """A simulated survey, compared with the truth."""
-    from skysim.experiments.dome_survey import adjust, findings, frames, prior, procedure, report, stops
+    from skysim.experiments.dome_survey import adjust, frames, prior, procedure, stops
+    from skysim.experiments.dome_survey.results import findings, report
     from skysim.simulation.testbed import build_tracker
     from skysim.tracking import factory
 
@@ -221,16 +254,18 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str
     statistics |= report.compare_trackers(
         {"before": first_tracker, "after": tracker}, progress(tests, checks, "comparing")
     )
-    return statistics | {
-        "frames": len(plan.shown),
-        "predicted": findings.accuracy_statistics(plan.first(len(plan.shown))),
-    }
+    return write_report(
+        request,
+        run,
+        statistics
+        | {"frames": len(plan.shown), "predicted": findings.accuracy_statistics(plan.first(len(plan.shown)))},
+    )
 
 
-def from_images(request: Request, images: Path, camera_file: Path) -> dict[str, Any]:
+def from_images(request: Request, images: Path, camera_file: Path, watch: bool) -> dict[str, Any]:
     """A survey from the images of a folder, with the LEDs of the scene as the list before it."""
-    from skysim.experiments.dome_survey import images as survey_images
     from skysim.experiments.dome_survey import prior, procedure
+    from skysim.experiments.dome_survey.folder import images as survey_images
     from skysim.simulation.testbed import build_testbed
     from skysim.tracking import settings
 
@@ -241,12 +276,41 @@ def from_images(request: Request, images: Path, camera_file: Path) -> dict[str, 
     if gain_and_saturation is not None:
         gain_e_dn, saturation = gain_and_saturation
         stages = replace(stages, gain_e_dn=gain_e_dn, saturation=saturation)
-    total = len(survey_images.image_files(images))
-    pictures = list(progress(survey_images.read_images(images, camera, stages), total, "reading"))
+    if watch:
+        pictures = followed(request, images, before, stages)
+    else:
+        total = len(survey_images.image_files(images))
+        pictures = list(progress(survey_images.read_images(images, camera, stages), total, "reading"))
     found = survey_images.frames_with_attitude(pictures, before, request.uncertainty, stages)
     with progress_callback("adjusting") as update, coverage_shown(request, found, before, None):
         run = procedure.survey_images(pictures, found, before, request.uncertainty, stages, request.distortion, update)
-    return write_results(request, run, before, None) | {"frames": total}
+    return write_report(request, run, write_results(request, run, before, None) | {"frames": len(pictures)})
+
+
+def followed(request: Request, images: Path, before: CalibrationPrior, stages: Settings) -> list[SurveyImage]:
+    """The images of a folder while they are taken, until there are enough or Ctrl-C; prints the coverage so far."""
+    from skysim.experiments.dome_survey.folder.watch import WatchedFolder
+
+    watched = WatchedFolder(images, before.camera, stages)
+    with suppress(KeyboardInterrupt):
+        for news in watched.arrivals(request.frames):
+            for line in news.complaints:
+                print_error(line)
+            if news.read and not request.quiet:
+                print_so_far(request, watched.pictures, before, stages)
+    return watched.pictures
+
+
+def print_so_far(request: Request, pictures: list[SurveyImage], before: CalibrationPrior, stages: Settings) -> None:
+    """Print how many images there are, which LEDs they measure, and the attitudes to hold next."""
+    from skysim.experiments.dome_survey.folder.images import frames_with_attitude
+    from skysim.experiments.dome_survey.results import findings
+
+    found = frames_with_attitude(pictures, before, request.uncertainty, stages)
+    print(f"{len(pictures)} of {request.frames} images, {len(found)} with an attitude")
+    if found:
+        so_far = findings.coverage_before(found, before, request.uncertainty, before.floor_px)
+        survey_summary.print_coverage(with_next(request, so_far, before))
 
 
 def image_camera(path: Path) -> tuple[Camera, tuple[float, float] | None]:
@@ -267,7 +331,7 @@ def coverage_shown(
     request: Request, frames: list[SurveyFrame], prior: CalibrationPrior, noise_px: float | None
 ) -> Iterator[None]:
     """Print which LEDs the frames show, and the attitudes to hold next, if they are too few for a survey."""
-    from skysim.experiments.dome_survey import findings
+    from skysim.experiments.dome_survey.results import findings
 
     try:
         yield
@@ -280,10 +344,10 @@ def coverage_shown(
 
 def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> dict[str, Any]:
     """Statistics of a coverage with the attitudes to hold next, and what they will reach."""
-    from skysim.experiments.dome_survey import findings
     from skysim.experiments.dome_survey.prior import image_sizes
+    from skysim.experiments.dome_survey.results import findings
 
-    margin_px = image_sizes(request.scene, prior).margin_px
+    margin_px = image_sizes(prior).margin_px
     further = findings.next_stops(request.scene, so_far, margin_px, request.next_stops, request.tilt_deg)
     shown = so_far.model.visible(further.lab_from_body.inv(), margin_px)
     return {
@@ -296,19 +360,31 @@ def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> di
 def write_results(
     request: Request, run: SurveyRun, before: CalibrationPrior, testbed: Testbed | None
 ) -> dict[str, Any]:
-    """Write map, picture and statistics of a survey; a simulated one (with a test bed) is drawn with its errors."""
+    """Write map and picture of a survey, and return its statistics; a simulated one is drawn with its errors."""
     from skysim.core.io import files
-    from skysim.experiments.dome_survey import adjust, findings, report, stops
+    from skysim.experiments.dome_survey import adjust, stops
+    from skysim.experiments.dome_survey.results import findings, report
     from skysim.tracking import dome_map_file
 
     folder = files.make_folder(request.folder)
     path, picture = folder / "leds.ecsv", folder / "survey.png"
     dome_map_file.write_dome_map(path, adjust.dome_map(run.survey, request.uncertainty))
-    so_far, faults = findings.coverage(run), findings.find_faults(run, request.scene)
+    so_far, faults = findings.coverage(run), findings.find_faults(run)
     statistics = report.survey_statistics(run, before) | with_next(request, so_far, before)
     statistics |= {"scene": request.scene.name, "faults": asdict(faults), "map": str(path), "picture": str(picture)}
     further = stops.from_rows(statistics["next"])
     errors = report.led_errors(run.survey, before, testbed) if testbed else None
     files.write_image(picture, report.survey_figure(so_far, faults, further, errors, report.list_shifts(run)))
-    files.write_text(folder / "survey.json", files.to_json(statistics))
+    return statistics
+
+
+def write_report(request: Request, run: SurveyRun, statistics: dict[str, Any]) -> dict[str, Any]:
+    """Write the statistics of a survey as JSON and as a page, and return them with the page's path."""
+    from skysim.core.io import files
+    from skysim.experiments.dome_survey.results import page
+
+    path = request.folder / "report.html"
+    statistics |= {"report": str(path)}
+    page.write_page(path, statistics, run, shlex.join(["skysim", *sys.argv[1:]]))
+    files.write_text(request.folder / "survey.json", files.to_json(statistics))
     return statistics

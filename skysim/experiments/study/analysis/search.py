@@ -18,6 +18,7 @@ import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.experiments.study.analysis.cost import COST, check_cost, cost
+from skysim.experiments.study.analysis.table import format_level, format_summary
 from skysim.experiments.study.designs import Point, make_point
 from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.execution.outcomes import FAILED
@@ -166,6 +167,28 @@ def front(config: Search, candidates: Sequence[Candidate]) -> list[Candidate]:
     dominated = [np.any(np.all(values <= one, axis=1) & np.any(values < one, axis=1)) for one in values]
     best = [n for n in range(len(feasible)) if not dominated[n]]
     return [feasible[n] for n in sorted(best, key=lambda n: tuple(values[n]))]
+
+
+def front_cells(study: Study, result: SearchResult) -> tuple[list[str], list[list[str]]]:
+    """Column heads and cell texts of the front: candidate, levels, objectives and what the constraints bound."""
+    assert study.optimize is not None
+    named = [one.response for one in study.optimize.objectives]
+    shown = named + [name for name in study.optimize.responses if name not in (*named, COST)]
+    rows = [
+        [
+            str(one.number),
+            *map(format_level, one.levels.values()),
+            *(f"{one.cost:.4g}" if name == COST else format_summary(one.figures[name]) for name in shown),
+        ]
+        for one in result.front
+    ]
+    return ["candidate", *study.factors, *shown], rows
+
+
+def front_columns(result: SearchResult) -> dict[str, Any]:
+    """The candidates of the front, and of all candidates the cost; None for one without."""
+    costs = [None if math.isnan(one.cost) else one.cost for one in result.candidates]
+    return {"front": [one.number for one in result.front], "costs": costs}
 
 
 def collect_result(plan: Plan, store: Store) -> SearchResult:

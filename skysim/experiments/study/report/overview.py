@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -49,6 +49,7 @@ def overview(plan: Plan) -> Overview:
     """The overview of a study; scenes that cannot be built are left out, as their trials tell why."""
     rows: list[tuple[str, str]] = []
     found: dict[str, list[tuple[str, str]]] = {}
+    leds: dict[str, int] = {}
     checked, may_be_ambiguous, fixed = 0, False, dict[str, None]()
     for levels, point in checked_points(plan):
         if checked == MAX_CHECKED:
@@ -60,12 +61,14 @@ def overview(plan: Plan) -> Overview:
         except InputError:
             continue
         checked += 1
+        if isinstance(scene.light, DomeConfig):
+            leds[levels] = len(testbed.sources)
         may_be_ambiguous |= may_report_ambiguity(scene)
         fixed |= dict.fromkeys(fixed_seeds(plan.study, scene))
         rows = rows or scene_rows(plan, testbed, found_here.facts)
         for line in found_here.findings:
             found.setdefault(NUMBER.sub("#", line), []).append((line, levels))
-    findings = [finding_text(at, checked) for at in found.values()]
+    findings = [finding_text([(line, with_leds(at, leds)) for line, at in one], checked) for one in found.values()]
     return Overview(rows, findings, may_be_ambiguous, tuple(fixed))
 
 
@@ -73,6 +76,14 @@ def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:
     """The greatest tilt of a trial's random attitudes under a dome; None if there are none."""
     drawn = trial.start if isinstance(trial, FlightTrial) else trial
     return None if drawn is None or not isinstance(scene.light, DomeConfig) else float(np.max(drawn.tilt_deg))
+
+
+def with_leds(levels: str, leds: Mapping[str, int]) -> str:
+    """The name of a checked point, with its number of LEDs where a study's points differ in it.
+
+    leds : of each checked point under a dome
+    """
+    return f"{levels}, {leds[levels]} LEDs" if len(set(leds.values())) > 1 else levels
 
 
 def finding_text(at: list[tuple[str, str]], checked: int) -> str:

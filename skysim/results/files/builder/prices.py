@@ -7,7 +7,9 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError
+from skysim.core.io.text import excerpt, read_lines
+from skysim.core.io.yaml_reader import suggestion
 from skysim.core.paths import DATA
 
 ASSUMED = "assumed"
@@ -72,11 +74,7 @@ def find_prices(name: str, folder: Path | None = None) -> Path:
 
 def read_prices(path: Path) -> Prices:
     """Read a table: comments begin with #, then the columns' names and one line a part. Raises InputError, one line."""
-    try:
-        text = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, ValueError) as error:
-        raise InputError(f"prices: {path} cannot be read ({error})") from None
-    lines = [(n, line) for n, line in enumerate(text, 1) if line.strip() and not line.startswith("#")]
+    lines = [(n, line) for n, line in read_lines(path) if not line.startswith("#")]
     names = [cell.strip() for cell in lines[0][1].split(",")] if lines else []
     if {*NEEDED} - {*names} or {*names} - {*NEEDED, *FURTHER} or len({*names}) < len(names) or len(lines) < 2:
         raise InputError(
@@ -107,7 +105,7 @@ def parse_line(line: str, names: list[str]) -> tuple[str, Price]:
     part, unit = cell["part"], cell["unit"]
     survey = part.startswith(SURVEY)
     if part not in UNITS and not survey:
-        raise InputError(unknown_name("part", part, [*UNITS, f"{SURVEY}_NAME"]))
+        raise InputError(f"unknown part {excerpt(part)}{suggestion(part, [*UNITS, f'{SURVEY}_NAME'])}")
     if unit != UNITS.get(part, "each"):
         raise InputError(f"unit of {part}: {unit!r}; allowed: {UNITS.get(part, 'each')}")
     if survey != bool(cell.get("sigma_mm")):

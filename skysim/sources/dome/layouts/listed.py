@@ -82,7 +82,9 @@ def read_csv(path: Path) -> LedFile:
     try:
         text = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"light.layout.file: {path} cannot be read ({error})") from None
+        raise InputError(
+            f"light.layout.file: {path} cannot be read: {getattr(error, 'strerror', None) or error}"
+        ) from None
     lines = [(n, line) for n, line in enumerate(text, 1) if line.strip() and not line.startswith("#")]
     names = split_row(lines[0][1]) if lines else []
     chosen = next((columns for columns in COLUMNS if set(columns) <= set(names)), None)

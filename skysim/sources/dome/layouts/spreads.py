@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import pickle
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
 import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Sources
+from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import FibonacciConfig, OptimizedConfig, PoissonDiskConfig, RandomPlacesConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import cap, dimmed_sources, project_from_bearing, scattered_cap
@@ -17,6 +22,7 @@ from skysim.sources.photometry import Band
 DARTS_PER_SPACING2 = 100  # random points per spacing^2: a gap of .03 of that area is found with probability .95
 MAX_DARTS = 3_000_000
 DARTS_PER_LED = 30  # random points per LED, if a count is given
+UNDIMMED = {"levels": None, "magnitudes": None, "unique_neighbors": None}  # brightness does not move an LED
 BISECTIONS = 14  # bisection steps from the dome's width: to some tenths of a millimeter
 
 
@@ -74,10 +80,22 @@ def optimized(config: OptimizedConfig, surface: Surface, led: LedConfig, band: B
     No LED is placed where no attitude's field reaches. In the mean of the worst attitudes the layout is not worse
     than a Fibonacci spiral.
     """
+    place_m, state = optimized_places(config.model_copy(update=UNDIMMED), pickle.dumps(surface))
     rng = random_stream(config.hardware_seed)
-    options = optimize.OPTIONS
+    rng.bit_generator.state = state  # as if the search had drawn from this stream
+    return dimmed_sources(config, surface, place_m, led, band, rng)
+
+
+@lru_cache(maxsize=32)  # seconds each: a study's trials, its costs and its report ask for the same ones
+def optimized_places(config: OptimizedConfig, pickled: bytes) -> tuple[Floats, Mapping[str, Any]]:
+    """(N, 3) read-only places of `optimized`, m, and the state of the hardware's random stream after the search.
+
+    pickled : the surface, whose arrays have no hash
+    """
+    rng, options, surface = random_stream(config.hardware_seed), optimize.OPTIONS, pickle.loads(pickled)
     reach = optimize.field_reach_rad(config, surface)
     sites = project_from_bearing(surface, scattered_cap(options.sites_per_led * config.count, reach, rng))
     spirals = [project_from_bearing(surface, cap(config.count, half)) for half in (np.radians(config.cap_deg), reach)]
     place_m = optimize.optimize_places(config, sites, spirals, rng, options)
-    return dimmed_sources(config, surface, place_m, led, band, rng)
+    place_m.flags.writeable = False
+    return place_m, rng.bit_generator.state

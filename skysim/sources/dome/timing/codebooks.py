@@ -27,7 +27,7 @@ Fredricksen and Maiorana 1978, Discrete Mathematics 23, 207 (De Bruijn sequences
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,8 +46,12 @@ PREFERRED = {5: 0b111101, 6: 0b1100111, 7: 0b10001111}
 MAX_DATA_BITS = 20  # 2^20 words are listed at most
 
 
+@lru_cache(maxsize=8)  # every trial of a study asks for the same one
 def codebook(config: Code, count: int) -> Words:
-    """(count, frames) levels of a scene's code, 0 the lowest. Raises InputError if the kind has not so many words."""
+    """(count, frames) levels of a scene's code, 0 the lowest; read-only.
+
+    Raises InputError if the kind has not so many words.
+    """
     if isinstance(config, BchCodeConfig):
         words = packed(partial(bch, distance=config.distance), count, config.levels)
     elif isinstance(config, CyclicCodeConfig):
@@ -58,6 +62,7 @@ def codebook(config: Code, count: int) -> Words:
         words = packed(PLAIN[config.kind], count, config.levels)
     if len(words) < count:
         raise InputError(f"light.led.code: {count} LEDs; allowed: at most the {len(words)} words of kind {config.kind}")
+    words.flags.writeable = False
     return words
 
 

@@ -47,6 +47,14 @@ class SurveyImage(NamedTuple):
 
 def image_files(folder: Path) -> list[Path]:
     """The images of a folder by name, one of each stem. Raises InputError for too few, or no folder."""
+    paths = best_images(folder)
+    if len(paths) < MIN_IMAGES:
+        raise InputError(f"--images {folder}: {len(paths)} images; allowed: {MIN_IMAGES} or more, typically tens")
+    return paths
+
+
+def best_images(folder: Path) -> list[Path]:
+    """The images of a folder by name, of those of one stem the first of FORMATS. Raises InputError for no folder."""
     if not folder.is_dir():
         raise InputError(f"--images {folder}: no such folder")
     best: dict[str, Path] = {}
@@ -56,8 +64,6 @@ def image_files(folder: Path) -> list[Path]:
             stem = path.name[: -len(suffix)]
             if stem not in best or rank(suffix) < rank(images.image_suffix(best[stem].name)):
                 best[stem] = path
-    if len(best) < MIN_IMAGES:
-        raise InputError(f"--images {folder}: {len(best)} images; allowed: {MIN_IMAGES} or more, typically tens")
     return [best[stem] for stem in sorted(best)]
 
 
@@ -75,8 +81,12 @@ def read_images(folder: Path, camera: Camera, settings: Settings) -> Iterator[Su
         if name not in names:
             raise InputError(f"{folder / ATTITUDES}: {excerpt(name)} is no image of the folder")
     for path in paths:
-        lights = detect_lights(settings, camera, pixels_of(path, camera))
-        yield SurveyImage(path.name, lights, attitudes.get(path.name))
+        yield SurveyImage(path.name, lights_of(path, camera, settings), attitudes.get(path.name))
+
+
+def lights_of(path: Path, camera: Camera, settings: Settings) -> Centroids:
+    """The detections of an image. Raises InputError for one that cannot be used."""
+    return detect_lights(settings, camera, pixels_of(path, camera))
 
 
 def pixels_of(path: Path, camera: Camera) -> NDArray:

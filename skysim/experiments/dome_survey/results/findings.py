@@ -10,20 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration import survey_faults, survey_plan
-from estimator.calibration.survey_faults import Exchange, LightTable
 from estimator.calibration.survey_plan import Mask, SurveyAccuracy, SurveyModel
-from skysim.core.types import Floats
 from skysim.experiments.dome_survey import stops
-from skysim.experiments.dome_survey.adjust import SurveyRun, identified, stray_lights
 from skysim.experiments.dome_survey.frames import SurveyFrame
-from skysim.experiments.dome_survey.matching import GATE_SIGMAS, Ints, match_by_imu
-from skysim.experiments.dome_survey.prior import (
-    CalibrationPrior,
-    ImageSizes,
-    SurveyUncertainty,
-    image_sizes,
-    survey_model,
-)
+from skysim.experiments.dome_survey.matching import Ints, match_by_imu
+from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty, survey_model
+from skysim.experiments.dome_survey.survey_run import SurveyRun, identified, light_table, stray_lights
 from skysim.scene.scene import Scene
 
 
@@ -32,7 +24,7 @@ class Coverage:
     """The frames held so far, and which LEDs they measure.
 
     model : by which further attitudes are chosen;  held, seen : body_from_lab of F frames, and (F, N) LEDs in them
-    accuracy : that of the survey; None before there is one
+    accuracy : that of the survey, or predicted before it; None if the frames are too few
     """
 
     model: SurveyModel
@@ -56,11 +48,12 @@ def coverage(run: SurveyRun) -> Coverage:
 def coverage_before(
     frames: Sequence[SurveyFrame], prior: CalibrationPrior, uncertainty: SurveyUncertainty, noise_px: float
 ) -> Coverage:
-    """The coverage of frames that are too few for a survey: LEDs by the IMU's attitudes, none measured."""
+    """The coverage of frames before their survey: LEDs named by the IMU's attitudes, and the accuracy predicted."""
     matches = [match_by_imu(frame, prior, uncertainty) for frame in frames]
     held = Rotation.concatenate([frame.body_from_lab for frame in frames])
     model = survey_model(prior, uncertainty.led_sigma_m, noise_px)
-    return Coverage(model, held, identified(matches, len(prior.leds.id)), None)
+    seen = identified(matches, len(prior.leds.id))
+    return Coverage(model, held, seen, predicted(model, held, seen))
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +91,7 @@ class DomeFaults:
     dark      : LEDs that no frame shows though it must
     displaced : LED and its distance from the list's place, m;  list_sigma_m : error of the other places about each axis
     exchanged : LED at whose place another one shines, that other one, and others that would do as well
+    found_m   : places, m, at which displaced LEDs and lights of exchanged ones were found
     unlisted  : places, m, of lights at rest that are no LED of the list
     exchange_share : share of the pairs of LEDs whose exchange would be found; 0 if all are alike
     """
@@ -106,6 +100,7 @@ class DomeFaults:
     displaced: dict[int, float]
     list_sigma_m: float
     exchanged: list[tuple[int, int, list[int]]]
+    found_m: dict[int, list[float]]
     unlisted: list[list[float]]
     exchange_share: float
 
@@ -115,50 +110,25 @@ class DomeFaults:
         return len(self.dark) + len(self.displaced) + len(self.exchanged) + len(self.unlisted)
 
 
-def find_faults(run: SurveyRun, scene: Scene) -> DomeFaults:
+def find_faults(run: SurveyRun) -> DomeFaults:
     """The faults that a survey shows."""
     survey, leds = run.survey, run.listed
-    seen = run.seen
-    index = np.array([frame.index for frame in run.frames])
-    expected = run.prior.expected_light(index)
-    shown = run.held.shown(*margins(run, image_sizes(scene, run.prior)))
+    table = light_table(run)
     rows, sigma_m = survey_faults.displaced(leds.position_m, survey.leds.position_m, survey.led_covariance_m2)
     off_m = np.linalg.norm(survey.leds.position_m - leds.position_m, axis=1)
-    exchanges, share = _exchanged(run, shown, expected)
-    strays = stray_lights(run)
+    # The time of a code that runs freely is unknown, and with it what each LED shows.
+    code = run.prior.code
+    is_free = code is not None and code.bit_time_s is not None
+    exchanges, share = ([], 0.0) if is_free else survey_faults.exchanged(table)
     return DomeFaults(
-        leds.id[survey_faults.dark(shown & (expected > 0), seen)].tolist(),
+        leds.id[survey_faults.dark(table.shown & (table.expected > 0), run.seen)].tolist(),
         {int(leds.id[row]): float(off_m[row]) for row in rows},
         sigma_m,
         [(int(leds.id[x.led]), int(leds.id[x.shows]), leds.id[list(x.or_any_of)].tolist()) for x in exchanges],
-        [stray.position_m.tolist() for stray in strays],
+        {int(leds.id[row]): survey.leds.position_m[row].tolist() for row in (*rows, *(x.led for x in exchanges))},
+        [stray.position_m.tolist() for stray in stray_lights(run)],
         share,
     )
-
-
-def margins(run: SurveyRun, sizes: ImageSizes) -> tuple[Floats, float]:
-    """Margin of the chip for each LED, and distance between LEDs, by the errors of the places as well."""
-    place_px = run.accuracy.led_sigma_m * run.prior.px_per_m
-    return sizes.margin_px + GATE_SIGMAS * place_px, sizes.apart_px
-
-
-def _exchanged(run: SurveyRun, shown: Mask, expected: Floats) -> tuple[list[Exchange], float]:
-    """LEDs that are exchanged; none can be found if a code runs freely, since then its time is unknown."""
-    code = run.prior.code
-    if code is not None and code.bit_time_s is not None:
-        return [], 0.0
-    return survey_faults.exchanged(LightTable(light_at_unit_distance(run), shown, expected))
-
-
-def light_at_unit_distance(run: SurveyRun) -> Floats:
-    """(F, N) light of each LED in each frame, multiplied with its squared distance; NaN if it is not identified."""
-    out = np.full(run.seen.shape, np.nan)
-    survey = run.survey
-    camera_m = survey.body_from_lab.inv().apply(np.tile(survey.lever.camera_body_m, (len(out), 1)))
-    for k, (frame, match) in enumerate(zip(run.frames, run.inliers, strict=True)):
-        squared_m2 = np.sum((survey.leds.position_m[match.led] - camera_m[k]) ** 2, axis=1)
-        out[k, match.led] = np.maximum(frame.lights.flux[match.light], 1e-9) * squared_m2
-    return out
 
 
 # --- as numbers ---------------------------------------------------------------------------------------------

@@ -15,9 +15,10 @@ from estimator.calibration.dome_survey import DomeSurvey
 from estimator.core.camera import Camera
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Mount, Truth
-from skysim.experiments.dome_survey.adjust import SurveyRun, lens_sigma
-from skysim.experiments.dome_survey.findings import Coverage, DomeFaults, rows_of
+from skysim.experiments.dome_survey.adjust import lens_sigma
 from skysim.experiments.dome_survey.prior import CalibrationPrior
+from skysim.experiments.dome_survey.results.findings import Coverage, DomeFaults, rows_of
+from skysim.experiments.dome_survey.survey_run import SurveyRun
 from skysim.results import metrics
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.testbed import Testbed

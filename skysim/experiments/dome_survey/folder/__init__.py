@@ -1,0 +1,1 @@
+"""Images of a survey on disk, read at once or as they arrive."""

@@ -1,0 +1,1 @@
+"""What a survey has found: coverage, faults, statistics, pictures, and the page of its report."""
