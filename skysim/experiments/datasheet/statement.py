@@ -191,9 +191,9 @@ def unit_text(units: int, draws: int) -> str:
     freedom = units - 1
     low, high = (math.sqrt(freedom / chdtri(freedom, tail)) for tail in (0.025, 0.975))
     return (
-        f"These intervals are over the fields. Where the bias scatters among units, {units} of them know it to a factor of"
-        f" {low:.2g} to {high:.2g} (95 %), and the independent frames are of {draws} other units: a bias that dominates needs"
-        " more units before the two can agree."
+        f"These intervals are over the fields. Where the bias scatters among units, {units} of them know it to a factor"
+        f" of {low:.2g} to {high:.2g} (95 %), and the independent frames are of {draws} other units: a bias that"
+        " dominates needs more units before the two can agree."
     )
 
 

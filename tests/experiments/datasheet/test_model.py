@@ -133,7 +133,7 @@ def test_the_unit_runs_in_another_tool_with_the_same_errors(tmp_path: Path, mode
 
 
 def test_the_scatter_of_the_fields_comes_from_two_estimates_of_each():
-    """Noise whose variance is lognormal over the fields, seen by eight frames in each estimate: not widened by these."""
+    """Noise whose variance is lognormal over the fields, seen by eight frames in each estimate."""
     rng = np.random.default_rng(9)
     variance = np.exp(0.7 * rng.standard_normal(60_000))
     first, second = (variance * rng.chisquare(7, 60_000) / 7 for _ in range(2))
