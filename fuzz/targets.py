@@ -28,6 +28,7 @@ from skysim.dynamics.multibody import mjcf
 from skysim.dynamics.profiles.load import read_profile
 from skysim.dynamics.profiles.samples import check_samples
 from skysim.dynamics.profiles.spline import fit_spline
+from skysim.experiments.characterize.frames import read_settings
 from skysim.experiments.dome_survey.folder import images as survey_images
 from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study import store
@@ -124,9 +125,10 @@ def calibrations(data: bytes) -> None:
 
 
 def tables(data: bytes) -> None:
-    """CSV tables: LEDs, points of a dome, attitudes, a curve over wavelength, a point-spread function, prices."""
+    """CSV tables: LEDs, points of a dome, attitudes, exposures, a curve over wavelength, a PSF, prices."""
     path = write_file(data, "table.csv")
     rejects(lambda: survey_images.read_attitudes(path), InputError)
+    rejects(lambda: read_settings(path), InputError)
     rejects(lambda: listed.read_csv(path), InputError)
     rejects(lambda: point_cloud.fit(point_cloud.read(str(path), "m"), 2, str(path)), InputError)
     for largest in (1.0, math.inf):  # a response, the spectrum of an LED

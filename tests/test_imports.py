@@ -85,5 +85,5 @@ MOST = {
         "skysim/sources": 10,
         "skysim/scene/sections": 10,
     },
-    **{"skysim/experiments/study": 10, "skysim/apps/cli/commands": 12},
+    **{"skysim/experiments/study": 10, "skysim/apps/cli/commands": 11},
 }

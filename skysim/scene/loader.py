@@ -386,7 +386,12 @@ def load_camera(
     if isinstance(tree.get("camera"), dict):
         tree = tree | {"camera": {**(lens or {}), **tree["camera"]}}
     try:
-        own = resolve_files(path, {key: tree[key] for key in tree if key == "camera"})
-        return CameraFileConfig.model_validate(apply_preset(own, files, overrides or {})).camera
+        return CameraFileConfig.model_validate(camera_tree(path, tree, files, overrides or {})).camera
     except ValidationError as error:
         raise InputError(explain(error, CameraFileConfig, tree, files, overrides or {})) from None
+
+
+def camera_tree(path: Path, tree: dict[str, Any], files: Files, overrides: Mapping[str, str]) -> dict[str, Any]:
+    """The raw section `camera` alone of a scene's tree, with its preset and calibration."""
+    own = resolve_files(path, {key: tree[key] for key in tree if key == "camera"})
+    return apply_preset(own, files, overrides)

@@ -34,6 +34,14 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "survey": ("skysim survey afit_simsat --frames 60 --checks 5 --out out/surveyed",),
     "datasheet": ("skysim datasheet shefex2 --quick", "skysim datasheet afit_simsat --fields 200 --out out/afit_sheet"),
+    "characterize": (
+        "skysim characterize --camera imx264 --darks lab/darks --flats lab/flats --out out/mine",
+        "skysim characterize --camera mine.yaml --frames-to out/lab",
+    ),
+    "balance": (
+        "skysim balance cubesat_table",
+        "skysim balance simsat_slew --estimate-only --offset-bar '5 um'",
+    ),
     "camera": ("skysim camera", "skysim camera shefex2", "skysim camera new --out my.yaml"),
     "camera show": (
         "skysim camera shefex2 --out out/shefex2.yml",

@@ -1,7 +1,8 @@
 """Actuators in the MuJoCo model: their joints and sites, and the motors that drive them.
 
 A vehicle's MJCF places them by name: hinge joints `wheel_*`; hinge joints `gimbal_*`, each carrying a hinge
-joint `rotor_*` with the same suffix; sites `fan_*`, which push along their own z. The scene sets their limits.
+joint `rotor_*` with the same suffix; sites `fan_*`, which push along their own z; slide joints `trim_*` of trim
+masses (mass.py). The scene sets their limits.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from skysim.scene.sections.vehicle import CmgsConfig, FansConfig, VehicleConfig,
 
 TORQUES = ("torque_x", "torque_y", "torque_z")
 UNIT_GEAR = (1, 0, 0, 0, 0, 0)
-WHEEL, GIMBAL, ROTOR, FAN = "wheel_", "gimbal_", "rotor_", "fan_"
+WHEEL, GIMBAL, ROTOR, FAN, TRIM = "wheel_", "gimbal_", "rotor_", "fan_", "trim_"
+
+JOINT_TYPE = {TRIM: mujoco.mjtJoint.mjJNT_SLIDE}  # of joints that are not hinges
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +114,7 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
     for config, key, prefixes in (
         (vehicle.wheels, "wheels", (WHEEL,)),
         (vehicle.cmgs, "cmgs", (GIMBAL, ROTOR)),
+        (vehicle.trim, "trim", (TRIM,)),
     ):
         for prefix in prefixes:
             hinges = joints(spec, prefix)
@@ -120,8 +124,8 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
                     spec.delete(joint)
             elif not hinges:
                 raise InputError(f"{path}: no joint {prefix}*, which vehicle.{key} needs")
-            elif any(joint.type != mujoco.mjtJoint.mjJNT_HINGE for joint in hinges):
-                raise InputError(f"{path}: joints {prefix}* must be hinges")
+            elif any(joint.type != JOINT_TYPE.get(prefix, mujoco.mjtJoint.mjJNT_HINGE) for joint in hinges):
+                raise InputError(f"{path}: joints {prefix}* must be {'slides' if prefix in JOINT_TYPE else 'hinges'}")
             for joint in hinges if config else ():
                 check_bare(joint, path)
     if vehicle.cmgs:
@@ -129,7 +133,7 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
     if vehicle.fans and not fan_sites(spec):
         raise InputError(f"{path}: no site {FAN}*, which vehicle.fans needs")
     for actuator in spec.actuators:
-        if actuator.name in TORQUES or actuator.name.startswith((WHEEL, GIMBAL, ROTOR, FAN)):
+        if actuator.name in TORQUES or actuator.name.startswith((WHEEL, GIMBAL, ROTOR, FAN, TRIM)):
             raise InputError(
                 f"{path}: actuator {actuator.name}: skysim adds an actuator of this name; remove it from the file"
             )
@@ -145,7 +149,7 @@ def locked_joint_hint(message: str, locked: dict[str, str]) -> str:
 def check_names(spec: Any, path: Path) -> None:
     """Raise InputError for a joint or site whose name nearly matches an actuator's: it would silently not be one."""
     for element in (*spec.joints, *spec.sites):
-        prefix = next((p for p in (WHEEL, GIMBAL, ROTOR, FAN) if element.name.startswith(p[:-1])), None)
+        prefix = next((p for p in (WHEEL, GIMBAL, ROTOR, FAN, TRIM) if element.name.startswith(p[:-1])), None)
         if prefix and not element.name.startswith(prefix):
             raise InputError(
                 f"{path}: {element.name}: allowed: {prefix}{element.name[len(prefix) - 1 :]}, or another word"

@@ -1,4 +1,9 @@
-"""Mass properties: compute those of the vehicle, and set those that the scene declares."""
+"""Mass properties: compute those of the vehicle, set those that the scene declares, and move its trim masses.
+
+Trim masses are motorized masses on slides that bring the center of mass to the bearing's center. A motor with a lead
+screw holds its mass where it is, so that a mass does not move during a run: its body is moved along the joint's axis,
+and the joint is removed.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene.sections.vehicle import VehicleConfig, WheelsConfig
+from skysim.dynamics.multibody.joints import TRIM, joints
+from skysim.scene.sections.vehicle import TrimConfig, VehicleConfig, WheelsConfig
 
 CAMERA = "star_camera"
 
@@ -86,7 +92,7 @@ def is_lever_too_long(bus_inertia_kg_m2: Floats, model: Any, camera_m: Floats) -
     return not is_possible(np.linalg.eigvalsh(bus_inertia_kg_m2)) and is_possible(np.linalg.eigvalsh(without_lever))
 
 
-def unbalance(model: Any, joints: list[Any], wheels: WheelsConfig, path: Path) -> None:
+def unbalance(model: Any, wheel_joints: list[Any], wheels: WheelsConfig, path: Path) -> None:
     """Unbalance the wheels: offset each center of mass from the axle and tilt the principal axes.
 
     Static: the rotor's center is moved across the axle by static_imbalance / mass; the axle feels the force
@@ -96,7 +102,7 @@ def unbalance(model: Any, joints: list[Any], wheels: WheelsConfig, path: Path) -
     """
     if not (wheels.static_imbalance_kg_m or wheels.dynamic_imbalance_kg_m2):
         return
-    for joint in joints:
+    for joint in wheel_joints:
         rotor, own = joint.parent, model.body(joint.parent.name)
         axle = model.joint(joint.name).axis  # in the rotor's axes, whatever frame the file gave it in
         across = np.cross(axle, np.eye(3)[np.argmin(np.abs(axle))])
@@ -133,3 +139,67 @@ def set_inertial(body: Any, mass_kg: float, center_m: Floats, inertia_kg_m2: Flo
     # An orientation or full inertia that the file gives in another form would override these.
     body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     body.fullinertia = np.full(6, np.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class Trims:
+    """Trim masses, in the order of their joints' names.
+
+    axes       : (3, n) directions in body axes;  centers_m : (3, n) centers of mass at position zero
+    mass_kg    : (n,);  position_m : (n,) where they are held
+    """
+
+    names: tuple[str, ...]
+    axes: Floats
+    centers_m: Floats
+    mass_kg: Floats
+    position_m: Floats
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def added(self, position_m: Floats) -> tuple[Floats, Floats]:
+        """Inertia (3, 3) about the bearing's center and moment (3,), mass times position, that moving the masses from
+        zero to these positions (n,) adds.
+        """
+        moved_m = self.centers_m + self.axes * position_m
+        inertia = np.zeros((3, 3))
+        for mass_kg, before, after in zip(self.mass_kg, self.centers_m.T, moved_m.T, strict=True):
+            inertia += parallel_axis(mass_kg, after) - parallel_axis(mass_kg, before)
+        return inertia, np.asarray(self.axes @ (self.mass_kg * position_m))
+
+    def moved_mass(self, at_zero: MassProperties) -> MassProperties:
+        """The vehicle's mass properties with the masses where they are held, from those with all at zero."""
+        inertia, moment = self.added(self.position_m)
+        center_m = at_zero.center_m + moment / at_zero.mass_kg
+        return MassProperties(at_zero.mass_kg, center_m, at_zero.inertia_kg_m2 + inertia)
+
+
+def held_position_m(config: TrimConfig, names: tuple[str, ...]) -> Floats:
+    """(n,) positions that the motors can hold: whole steps. Raises InputError for another number of positions."""
+    if config.position_m and len(config.position_m) != len(names):
+        raise InputError(
+            f"vehicle.trim.position: {len(config.position_m)} values; allowed: {len(names)}, one for each of"
+            f" {', '.join(names)}, or none"
+        )
+    position_m = np.array(config.position_m or (0.0,) * len(names))
+    return np.asarray(config.step_m * np.round(position_m / config.step_m))
+
+
+def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Trims:
+    """Move the trim masses of a spec to their places and remove their joints; model is the compiled spec before."""
+    slides = joints(spec, TRIM) if vehicle.trim else []
+    names = tuple(joint.name for joint in slides)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    ids = [model.joint(name).id for name in names]
+    bodies = model.jnt_bodyid[ids]
+    axes, centers_m = data.xaxis[ids].T.copy(), data.subtree_com[bodies].T.copy()
+    position_m = held_position_m(vehicle.trim, names) if vehicle.trim else np.zeros(0)
+    for joint, axis, at_m in zip(slides, axes.T, position_m, strict=True):
+        body = joint.parent
+        if body.parent.name != "bus" or body.frame is not None:
+            raise InputError(f"{path}: joint {joint.name} must be on a body directly in body bus, not in another body")
+        body.pos = body.pos + at_m * axis  # the bus's axes are the lab's in the model
+        spec.delete(joint)
+    return Trims(names, axes, centers_m, model.body_subtreemass[bodies].copy(), position_m)

@@ -34,7 +34,15 @@ from skysim.dynamics.multibody.joints import (
     lock_unused,
     locked_joint_hint,
 )
-from skysim.dynamics.multibody.mass import CAMERA, MassProperties, declare_mass, tree_mass, unbalance
+from skysim.dynamics.multibody.mass import (
+    CAMERA,
+    MassProperties,
+    Trims,
+    declare_mass,
+    hold_trims,
+    tree_mass,
+    unbalance,
+)
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings, one_line
 from skysim.scene.sections.vehicle import VehicleConfig
 
@@ -57,9 +65,9 @@ class VehicleModel:
 
     spec    : mujoco.MjSpec that the model was made from
     model   : mujoco.MjModel, whose first four qpos and three qvel are the bearing's
-    mass    : mass properties of the whole vehicle, with balanced wheels
+    mass    : mass properties of the whole vehicle, with balanced wheels and the trim masses in their places
     torques : (3,) actuator numbers of the ideal torques about body x, y, z
-    wheels, gimbals, rotors, fans : the actuators, empty where they are not switched on
+    wheels, gimbals, rotors, fans, trims : the actuators, empty where they are not switched on
     """
 
     spec: Any
@@ -71,6 +79,7 @@ class VehicleModel:
     gimbals: Hinges
     rotors: Hinges
     fans: Fans
+    trims: Trims
 
     @property
     def inertia_kg_m2(self) -> Floats:
@@ -87,7 +96,7 @@ def build(vehicle: VehicleConfig) -> VehicleModel:
     """Compose and compile the vehicle, and look up its actuators. Raises InputError with one line."""
     path = SCENES / vehicle.model
     with mujoco_warnings():
-        spec, mass = compose(vehicle, path)
+        spec, mass, trims = compose(vehicle, path)
         model = compile_spec(spec, path)
     return VehicleModel(
         spec,
@@ -99,15 +108,17 @@ def build(vehicle: VehicleConfig) -> VehicleModel:
         Hinges.from_model(model, GIMBAL),
         Hinges.from_model(model, ROTOR),
         Fans.from_model(model),
+        trims,
     )
 
 
-def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties]:
-    """The vehicle's MJCF on a bearing at the lab's origin, as MjSpec, with the mass properties declared.
+def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Trims]:
+    """The vehicle's MJCF on a bearing at the lab's origin, as MjSpec; its mass properties and its trim masses.
 
     mount `air_bearing`: gravity along lab -z and a tilt stop. mount `free`: neither, and the vehicle rotates
-    about its center of mass, which must be the body's origin. Joints of actuators that the scene does not switch
-    on are locked. Raises InputError with one line.
+    about its center of mass, which must be the body's origin. Mass properties are as declared, apart from trim masses
+    in other places than zero. Joints of actuators that the scene does not switch on are locked. Raises InputError with
+    one line.
     """
     if vehicle.mount == "free" and any(vehicle.center_of_mass_m):
         raise InputError(
@@ -134,7 +145,8 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties]:
     if vehicle.wheels:
         unbalance(balanced, joints(spec, WHEEL), vehicle.wheels, path)
     add_actuators(spec, balanced, vehicle)
-    return spec, mass
+    trims = hold_trims(spec, balanced, vehicle, path)
+    return spec, trims.moved_mass(mass), trims
 
 
 def put_at_origin(spec: Any, path: Path) -> Any:

@@ -6,8 +6,11 @@ data sheet states it, otherwise `assumed` with the reason.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
+
+import yaml
 
 from skysim.core.errors import InputError, printable
 from skysim.scene.data_sheet.questions import QUESTIONS, REQUIRED, Values
@@ -141,15 +144,26 @@ def text(sheet: Sheet, name: str) -> str:
         f"# {printable(name)}. Written by `skysim camera new`.",
         "# [S1] the data sheets of camera and lens. A value marked `assumed` is not stated there.",
         *(f"# Not stated: {one.name}; {one.consequence}." for one in sheet.missing if not one.assumed),
-        "camera:",
+        *yaml_lines(sheet.lines),
     ]
-    open_: list[str] = []
-    for line in sheet.lines:
+    return "\n".join(lines) + "\n"
+
+
+def yaml_value(value: Any) -> str:
+    """A value in one line of YAML; a text with spaces is quoted."""
+    if isinstance(value, str):
+        return f'"{value}"' if " " in value else value
+    return yaml.safe_dump(value, default_flow_style=True, width=math.inf).removesuffix("\n").removesuffix("\n...")
+
+
+def yaml_lines(camera: list[Line]) -> list[str]:
+    """A section `camera` in YAML, with the comment of each value."""
+    lines, open_ = ["camera:"], list[str]()
+    for line in camera:
         *parents, last = line.key.split(".")
         depth = next((n for n, pair in enumerate(zip(open_, parents, strict=False)) if pair[0] != pair[1]), len(open_))
         lines += [f"{'  ' * (n + 1)}{parents[n]}:" for n in range(min(depth, len(parents)), len(parents))]
         open_ = parents
-        value = f'"{line.value}"' if isinstance(line.value, str) and " " in line.value else line.value
-        written = f"{'  ' * (len(parents) + 1)}{last}: {value}"
+        written = f"{'  ' * (len(parents) + 1)}{last}: {yaml_value(line.value)}"
         lines.append(f"{written.ljust(COMMENT_COLUMN)} # {line.comment}")
-    return "\n".join(lines) + "\n"
+    return lines

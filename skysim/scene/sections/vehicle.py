@@ -80,6 +80,25 @@ class CmgsConfig(ConfigModel):
     rotor_torque_limit_nm: TorqueLimit | None = None
 
 
+class TrimConfig(ConfigModel):
+    """Motorized trim masses: every slide joint `trim_*` of the model, held in its place during a run.
+
+    position : of each along its joint's axis, from its place in the model; `skysim balance` finds the balanced ones
+    travel   : largest position, either way
+    step     : of the motors: a mass is held at a multiple of it
+    """
+
+    position_m: tuple[Length, ...] = ()
+    travel_m: Annotated[Length, Field(gt=0)] = 0.02
+    step_m: Annotated[Length, Field(gt=0)] = 1e-6
+
+    @model_validator(mode="after")
+    def check_positions(self) -> TrimConfig:
+        if any(abs(position_m) > self.travel_m for position_m in self.position_m):
+            raise ValueError(f"position: beyond travel {1e3 * self.travel_m:g} mm")
+        return self
+
+
 class DragConfig(ConfigModel):
     """Air drag about each body axis independently: T = -(viscous + quadratic |rate|) rate."""
 
@@ -170,6 +189,7 @@ class VehicleConfig(ConfigModel):
     camera       : entrance pupil on the body, the housing moves with it; the MJCF's if left out
     torque_limit : of each of the ideal torques about body x, y, z
     wheels, fans, cmgs : the actuators that are switched on; joints of the others are locked
+    trim         : the trim masses' places; center_of_mass and inertia are those with all of them at zero
     """
 
     model: str
@@ -183,6 +203,7 @@ class VehicleConfig(ConfigModel):
     wheels: WheelsConfig | None = None
     fans: FansConfig | None = None
     cmgs: CmgsConfig | None = None
+    trim: TrimConfig | None = None
     drag: DragConfig = DragConfig()
     disturbances: DisturbancesConfig = DisturbancesConfig()
     imu: ImuConfig | None = None
@@ -202,6 +223,8 @@ class VehicleConfig(ConfigModel):
             raise ValueError("disturbances: a free vehicle has none; allowed: mount: air_bearing")
         if self.mount == "free" and self.imu and self.imu.earth_rate != "none":
             raise ValueError("imu.earth_rate: a free vehicle is not on the Earth; allowed: none")
+        if self.mount == "free" and self.trim:
+            raise ValueError("trim: a free vehicle rotates about its center of mass; allowed: mount: air_bearing")
         return self
 
 

@@ -10,6 +10,7 @@ from skysim.core.io.images.live import grab_frame as grab_frame
 from skysim.core.io.images.reader import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from skysim.core.io.images.reader import Picture as Picture
 from skysim.core.io.images.reader import image_suffix as image_suffix
+from skysim.core.io.images.reader import is_fits as is_fits
 from skysim.core.io.images.reader import monochrome as monochrome
 from skysim.core.io.images.reader import read_image as read_image
 from skysim.core.io.images.reader import read_picture as read_picture

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import gzip
+import math
 import re
 import tempfile
 import warnings
@@ -36,6 +37,8 @@ CARD_BYTES, MAX_CARDS = 80, 100_000  # a line of a header, and their greatest nu
 AXES, MAX_AXES = re.compile(rb"NAXIS *= *(\d+)"), 999  # FITS standard 4.0, section 4.4.1.1
 MAX_COLUMNS = 999  # of a table (FITS standard 4.0, section 7.3.1)
 TILES_CPU_S, TILES_BYTES = 10, 1 << 31  # for a compressed image
+EXPOSURE_KEYS = ("EXPTIME", "EXPOSURE")  # seconds
+TEMPERATURE_KEYS = ("CCD-TEMP", "DET-TEMP")  # of the chip, degrees Celsius: conventions of imaging programs
 TOP_DOWN = {"TOP-DOWN": True, "BOTTOM-UP": False}  # values of ROWORDER, which is a convention of imaging programs
 
 
@@ -46,11 +49,14 @@ class FitsImage(NamedTuple):
     top_down : whether the first row is the highest, by ROWORDER; None without one: the lowest is, by the standard, but
         programs that do not follow it leave the keyword out too
     date_utc : DATE-OBS; None without a valid one
+    exposure_s, temperature_c : EXPTIME or EXPOSURE, CCD-TEMP or DET-TEMP; None without a number
     """
 
     pixels: NDArray
     top_down: bool | None
     date_utc: datetime.datetime | None
+    exposure_s: float | None
+    temperature_c: float | None
 
 
 def read_fits(path: Path) -> NDArray:
@@ -74,7 +80,7 @@ def read_fits_image(path: Path) -> FitsImage:
                     place = hdu.fileinfo()
                     check_header(path, file, place["datLoc"] + place["datSpan"])  # the next one, before it is opened
                     continue
-                return FitsImage(channels_last(path, pixels), *order_and_date(hdu.header, hdus[0].header))
+                return FitsImage(channels_last(path, pixels), *header_values(hdu.header, hdus[0].header))
     except InputError:
         raise
     except Exception as error:  # a damaged header makes astropy raise exceptions of many types, KeyError too
@@ -183,14 +189,26 @@ def channels_last(path: Path, pixels: NDArray) -> NDArray:
     return pixels
 
 
-def order_and_date(*headers: Any) -> tuple[bool | None, datetime.datetime | None]:
-    """FitsImage's `top_down` and `date_utc` by the first header that has them: the image's, then the file's."""
+def header_values(
+    *headers: Any,
+) -> tuple[bool | None, datetime.datetime | None, float | None, float | None]:
+    """FitsImage's fields beside the pixels, by the first header that has them: the image's, then the file's."""
     found: dict[str, str] = {}
     for header in reversed(headers):
-        for key in ("ROWORDER", "DATE-OBS"):
+        for key in ("ROWORDER", "DATE-OBS", *EXPOSURE_KEYS, *TEMPERATURE_KEYS):
             with contextlib.suppress(Exception):  # of many types, for a damaged card
                 found[key] = str(header[key]).strip()
     date_utc = None
     with contextlib.suppress(ValueError):
         date_utc = datetime.datetime.fromisoformat(found.get("DATE-OBS", ""))
-    return TOP_DOWN.get(found.get("ROWORDER", "").upper()), date_utc
+    exposure_s, temperature_c = first_number(found, EXPOSURE_KEYS), first_number(found, TEMPERATURE_KEYS)
+    return TOP_DOWN.get(found.get("ROWORDER", "").upper()), date_utc, exposure_s, temperature_c
+
+
+def first_number(found: dict[str, str], keys: tuple[str, ...]) -> float | None:
+    """The first finite number under these keys."""
+    for key in keys:
+        with contextlib.suppress(ValueError):
+            if math.isfinite(number := float(found.get(key, ""))):
+                return number
+    return None

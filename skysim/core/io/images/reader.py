@@ -27,12 +27,15 @@ class Picture:
     focal_35mm      : focal length of the 35 mm camera with the same diagonal field, mm; None if unknown
     row_order_known : False for a FITS file without ROWORDER, whose last row is then taken for the highest, as the
         standard recommends
+    exposure_s, temperature_c : of a FITS header; None if unknown
     """
 
     pixels: NDArray
     date_utc: datetime.datetime | None = None
     focal_35mm: float | None = None
     row_order_known: bool = True
+    exposure_s: float | None = None
+    temperature_c: float | None = None
 
 
 def read_picture(path: Path) -> Picture:
@@ -44,7 +47,13 @@ def read_picture(path: Path) -> Picture:
         return Picture(check_numbers(path, encoded.upright(pixels, exif.orientation)), focal_35mm=exif.focal_35mm)
     image = fits.read_fits_image(path)
     pixels = image.pixels if image.top_down else np.ascontiguousarray(image.pixels[::-1])
-    return Picture(check_numbers(path, pixels), image.date_utc, row_order_known=image.top_down is not None)
+    return Picture(
+        check_numbers(path, pixels),
+        image.date_utc,
+        row_order_known=image.top_down is not None,
+        exposure_s=image.exposure_s,
+        temperature_c=image.temperature_c,
+    )
 
 
 def read_image(path: Path) -> NDArray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
@@ -80,22 +79,24 @@ def optimized(config: OptimizedConfig, surface: Surface, led: LedConfig, band: B
     No LED is placed where no attitude's field reaches. In the mean of the worst attitudes the layout is not worse
     than a Fibonacci spiral.
     """
-    place_m, state = optimized_places(config.model_copy(update=UNDIMMED), pickle.dumps(surface))
-    rng = random_stream(config.hardware_seed)
-    rng.bit_generator.state = state  # as if the search had drawn from this stream
+    config_of_places, rng = config.model_copy(update=UNDIMMED), random_stream(config.hardware_seed)
+    reach = optimize.field_reach_rad(config, surface)
+    sites = project_from_bearing(surface, scattered_cap(optimize.OPTIONS.sites_per_led * config.count, reach, rng))
+    spirals = [project_from_bearing(surface, cap(config.count, half)) for half in (np.radians(config.cap_deg), reach)]
+    place_m, state = optimized_places(config_of_places, *(points.tobytes() for points in (sites, *spirals)))
+    rng.bit_generator.state = state
     return dimmed_sources(config, surface, place_m, led, band, rng)
 
 
 @lru_cache(maxsize=32)  # seconds each: a study's trials, its costs and its report ask for the same ones
-def optimized_places(config: OptimizedConfig, pickled: bytes) -> tuple[Floats, Mapping[str, Any]]:
+def optimized_places(config: OptimizedConfig, sites: bytes, *spirals: bytes) -> tuple[Floats, Mapping[str, Any]]:
     """(N, 3) read-only places of `optimized`, m, and the state of the hardware's random stream after the search.
 
-    pickled : the surface, whose arrays have no hash
+    sites, spirals : (K, 3) points, m, as bytes, because arrays have no hash
     """
-    rng, options, surface = random_stream(config.hardware_seed), optimize.OPTIONS, pickle.loads(pickled)
-    reach = optimize.field_reach_rad(config, surface)
-    sites = project_from_bearing(surface, scattered_cap(options.sites_per_led * config.count, reach, rng))
-    spirals = [project_from_bearing(surface, cap(config.count, half)) for half in (np.radians(config.cap_deg), reach)]
-    place_m = optimize.optimize_places(config, sites, spirals, rng, options)
+    rng = random_stream(config.hardware_seed)
+    points = [np.frombuffer(text).reshape(-1, 3) for text in (sites, *spirals)]
+    rng.random(2 * len(points[0]))  # the numbers that the sites were drawn with
+    place_m = optimize.optimize_places(config, points[0], points[1:], rng, optimize.OPTIONS)
     place_m.flags.writeable = False
     return place_m, rng.bit_generator.state

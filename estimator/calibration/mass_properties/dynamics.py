@@ -1,0 +1,217 @@
+"""Rotational dynamics of a vehicle with wheels on an air bearing, integrated over many intervals at once.
+
+The state at an attitude is the rotation lab_from_body R, the angular momentum H about the bearing in lab axes with
+respect to inertial space, and a random torque d about lab axes:
+
+    w = J^-1 (R^T H - A (1 + e) h) - R^T W              rate in the lab, body axes
+    dR/dt = R [w]
+    dH/dt = (R m r) x g - W x H + T + d - R (v + q |w|) w
+    dd/dt = -d / tau + noise
+
+J is the inertia with the wheels locked, A the wheel axes, h the wheels' assumed momenta and e their relative errors,
+m r the mass times the center of mass, g gravity, W the Earth's rate, T a torque constant in the lab, v and q the air's
+viscous and quadratic drag about each body axis (Hughes, Spacecraft Attitude Dynamics, 1986, ch. 3). H changes by
+external torques only, so that friction and motor torques of the wheels do not enter.
+
+Arrays have their components first, (3, B) for B motions.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.calibration.mass_properties.record import (
+    DRAG,
+    INERTIA,
+    LAB_TORQUE,
+    MOMENT,
+    WHEELS,
+    BearingRecord,
+    Lab,
+    inertia_matrix,
+)
+from estimator.core.arrays import Floats, Ints
+
+MAX_STEP_S = 0.1  # of Runge-Kutta steps: relative error below 1e-7 at 0.5 rad/s
+STATE = 9  # attitude error, momentum, torque
+GAUSS_X, GAUSS_W = np.polynomial.legendre.leggauss(8)
+ATTITUDE_STEP_RAD, RELATIVE_STEP = 1e-5, 1e-5  # of the difference quotients
+
+
+class States(NamedTuple):
+    """B states: lab_from_body as quaternions (4, B) x y z w, momenta (3, B) and random torques (3, B) in the lab."""
+
+    quaternion: Floats
+    momentum: Floats
+    torque: Floats
+
+    def take(self, which: slice | Ints) -> States:
+        """Some of them."""
+        return States(*(part[:, which] for part in self))
+
+    @property
+    def rotation(self) -> Rotation:
+        return Rotation.from_quat(self.quaternion.T)
+
+    def moved(self, change: Floats) -> States:
+        """The states changed by (9, B): rotation vector in body axes, momentum, torque."""
+        turned = (self.rotation * Rotation.from_rotvec(change[:3].T)).as_quat().T
+        return States(turned, self.momentum + change[3:6], self.torque + change[6:])
+
+    def minus(self, other: States) -> Floats:
+        """(9, B) the change that leads from another's states to these."""
+        turn = (other.rotation.inv() * self.rotation).as_rotvec().T
+        return np.vstack([turn, self.momentum - other.momentum, self.torque - other.torque])
+
+
+class Transition(NamedTuple):
+    """States after K intervals, and how they change with those before and with the parameters.
+
+    by_state (K, 9, 9), by_parameter (K, 9, P) : derivatives
+    noise (K, 9, 9) : covariance of the random torque's effect
+    """
+
+    after: States
+    by_state: Floats
+    by_parameter: Floats
+    noise: Floats
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """(3, B)"""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def turn(quaternion: Floats, vector: Floats, inverse: bool = False) -> Floats:
+    """(3, B) R v, or R^T v: v + 2 s u x v + 2 u x (u x v)."""
+    u = -quaternion[:3] if inverse else quaternion[:3]
+    twice = 2 * cross(u, vector)
+    return vector + quaternion[3] * twice + cross(u, twice)
+
+
+class Motion:
+    """The equations of motion of one record, for given parameters (P, B) of B motions."""
+
+    def __init__(self, record: BearingRecord, lab: Lab, parameters: Floats) -> None:
+        inertia = inertia_matrix(parameters[INERTIA]) + record.added_inertia_kg_m2[:, :, None]
+        self.inverse: Floats = np.asarray(np.linalg.inv(inertia.transpose(2, 0, 1)), dtype=np.float64).transpose(
+            1, 2, 0
+        )
+        self.moment = parameters[MOMENT] + record.added_moment_kg_m[:, None]
+        self.lab_torque, self.drag = parameters[LAB_TORQUE], parameters[DRAG]
+        self.wheel_scale = 1 + parameters[WHEELS:]
+        self.axes, self.earth = lab.wheel_axes, lab.earth_lab_rad_s[:, None]
+        self.gravity = np.array([[0.0], [0.0], [-lab.gravity_m_s2]])
+        self.record = record
+
+    def stored(self, t_s: Floats) -> Floats:
+        """(3, B) momentum of the wheels in body axes."""
+        measured = [np.interp(t_s, self.record.wheel_t_s, one) for one in self.record.wheel_momentum_nms.T]
+        return np.asarray(self.axes @ (self.wheel_scale * np.array(measured)))
+
+    def rate(self, states: States, stored: Floats) -> Floats:
+        """(3, B) in the lab, body axes."""
+        own = turn(states.quaternion, states.momentum, inverse=True) - stored
+        turned: Floats = np.einsum("ijb,jb->ib", self.inverse, own)
+        return turned - turn(states.quaternion, np.broadcast_to(self.earth, own.shape), inverse=True)
+
+    def slope(self, t_s: Floats, states: States) -> States:
+        """Derivatives with respect to time, without the torque's decay."""
+        q, rate = states.quaternion, self.rate(states, self.stored(t_s))
+        viscous, quadratic = self.drag
+        drag = turn(q, (viscous + quadratic * np.abs(rate)) * rate)
+        torque = cross(turn(q, self.moment), self.gravity) - cross(self.earth, states.momentum)
+        vector = q[3] * rate + cross(q[:3], rate)
+        spin = np.vstack([vector, -np.sum(q[:3] * rate, axis=0)[None]]) / 2
+        return States(spin, torque + self.lab_torque + states.torque - drag, np.zeros_like(rate))
+
+    def integrate(self, begin_s: Floats, end_s: Floats, states: States, correlation_s: float) -> States:
+        """States at end_s (B,) by the fourth-order Runge-Kutta method; the torque is its mean in each step."""
+        steps = max(1, int(np.ceil(np.max(end_s - begin_s) / MAX_STEP_S)))
+        h = (end_s - begin_s) / steps
+        decay = np.exp(-h / correlation_s)
+        mean = correlation_s / h * (1 - decay)
+        for n in range(steps):
+            t_s, last = begin_s + n * h, states.torque
+            now = states._replace(torque=mean * last)
+            a = self.slope(t_s, now)
+            b = self.slope(t_s + h / 2, moved_on(now, a, h / 2))
+            c = self.slope(t_s + h / 2, moved_on(now, b, h / 2))
+            d = self.slope(t_s + h, moved_on(now, c, h))
+            q, momentum = (
+                old + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+                for old, k1, k2, k3, k4 in zip(now[:2], a[:2], b[:2], c[:2], d[:2], strict=True)
+            )
+            states = States(q / np.sqrt(np.sum(q * q, axis=0)), momentum, decay * last)
+        return states
+
+
+def moved_on(states: States, slope: States, by_s: Floats | float) -> States:
+    return States(*(one + by_s * rate for one, rate in zip(states, slope, strict=True)))
+
+
+def difference_steps(values: Floats, sigma: Floats, momentum_nms: float, torque_nm: float) -> tuple[Floats, Floats]:
+    """Steps of the difference quotients: (9,) of the states, (P,) of the parameters."""
+    state = np.repeat([ATTITUDE_STEP_RAD, RELATIVE_STEP * momentum_nms, torque_nm], 3)
+    return state, np.minimum(1e-3 * sigma, RELATIVE_STEP * np.maximum(np.abs(values), sigma))
+
+
+def transition(
+    record: BearingRecord, lab: Lab, first: int, before: States, values: Floats, sigma: Floats
+) -> Transition:
+    """Integrate K states (from attitude number `first` on) each to the next attitude's time, with derivatives.
+
+    values, sigma : (P,) parameters, and the standard deviations that scale the steps of their difference quotients
+
+    Every interval is integrated once for each element of state and parameters, a little changed, all at once.
+    """
+    count, size = before.momentum.shape[1], len(values)
+    largest = float(np.max(np.abs(before.momentum), initial=1e-3 * float(np.max(values[INERTIA]))))
+    state_step, step = difference_steps(values, sigma, largest, float(np.max(lab.torque_rms_nm)))
+    columns = 1 + STATE + size
+    change = np.zeros((STATE, columns))
+    change[:, 1 : 1 + STATE] = np.diag(state_step)
+    parameters = np.repeat(values[:, None], columns, axis=1)
+    parameters[:, 1 + STATE :] += np.diag(step)
+    pick: Ints = np.repeat(np.arange(count), columns)
+    motion = Motion(record, lab, np.tile(parameters, count))
+    t_s = record.t_s[first : first + count + 1]
+    start = before.take(pick).moved(np.tile(change, count))
+    end = motion.integrate(t_s[:-1][pick], t_s[1:][pick], start, lab.torque_correlation_s)
+    after = end.take(slice(None, None, columns))
+    slopes = end.minus(after.take(pick)).reshape(STATE, count, columns).transpose(1, 0, 2)
+    slopes = slopes[:, :, 1:] / np.concatenate([state_step, step])
+    return Transition(
+        after,
+        slopes[:, :, :STATE],
+        slopes[:, :, STATE:],
+        torque_noise(np.diff(t_s), motion.inverse[:, :, 0], before, lab, float(np.median(np.diff(record.wheel_t_s)))),
+    )
+
+
+def torque_noise(duration_s: Floats, inverse: Floats, before: States, lab: Lab, sample_s: float) -> Floats:
+    """(K, 9, 9) covariance of the states after K intervals due to the random torque and to the wheels' speed noise.
+
+    White noise of density 2 rms^2 / tau that acts at s before the end has by then changed torque, momentum and angle by
+
+        c = exp(-s / tau),   b = tau (1 - c),   a = J^-1 R^T tau (s - b)
+
+    whose products are integrated over s by Gauss's rule. Noise of a measured momentum, sigma in every sample, moves the
+    angle by J^-1 sigma times the sample's time, a random walk.
+    """
+    tau = lab.torque_correlation_s
+    s = duration_s[:, None] * (1 + GAUSS_X) / 2
+    c = np.exp(-s / tau)
+    b = tau * (1 - c)
+    moments = np.einsum("iks,jks,ks->kij", *2 * [np.array([tau * (s - b), b, c])], duration_s[:, None] * GAUSS_W / 2)
+    density = np.diag(2 * lab.torque_rms_nm**2 / tau)
+    spread = np.zeros((len(duration_s), 3, 3, 3))
+    spread[:, 0] = inverse @ before.rotation.inv().as_matrix()
+    spread[:, 1:] = np.eye(3)
+    noise = np.einsum("kij,kiab,bc,kjdc->kiajd", moments, spread, density, spread).reshape(-1, STATE, STATE)
+    walk = lab.wheel_sigma_nms**2 * sample_s * inverse @ lab.wheel_axes @ lab.wheel_axes.T @ inverse.T
+    noise[:, :3, :3] += walk * duration_s[:, None, None]
+    return np.asarray(noise)

@@ -1,0 +1,1 @@
+"""Commands that measure a dome, a camera, a vehicle or a tracker."""

@@ -1,0 +1,93 @@
+"""Command `skysim characterize`: a camera preset from darks, flats and night frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from skysim.apps.cli.commands.camera import complete_camera
+from skysim.apps.cli.options import Json, Out
+from skysim.apps.cli.terminal import print_json, print_table, print_wrapped, progress
+from skysim.core.errors import InputError
+
+
+def characterize(
+    camera: Annotated[
+        str,
+        typer.Option(
+            help="Preset, camera file or scene: what frames do not tell, such as size, pixel pitch and bits.",
+            autocompletion=complete_camera,
+        ),
+    ],
+    darks: Annotated[Path | None, typer.Option(help="Folder of darks, of two exposures or more.")] = None,
+    flats: Annotated[Path | None, typer.Option(help="Folder of flats: pairs at exposures up to saturation.")] = None,
+    night: Annotated[Path | None, typer.Option(help="Folder of frames of the night sky, stars at rest.")] = None,
+    frames_to: Annotated[
+        Path | None, typer.Option(help="Measure nothing: write the darks and flats of --camera, simulated.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the frames of --frames-to.")] = 1,
+    out: Out = None,
+    json: Json = False,
+) -> None:
+    """Measure a camera from its own frames: sensor from darks and flats, lens from the night sky, to a preset.
+
+    The method is photon transfer, in the terms of EMVA 1288. Every value has its 95 % interval.
+    """
+    from skysim.apps.cli.options import output_folder
+    from skysim.experiments.characterize import procedure
+
+    config, raw = procedure.read_camera(camera)
+    if frames_to is not None:
+        given = {"darks": darks, "flats": flats, "night": night, "out": out}
+        if conflict := next((name for name, value in given.items() if value is not None), None):
+            raise InputError(f"--{conflict}: has no effect with --frames-to; allowed: one of the two")
+        write_simulated(config, frames_to, seed, json)
+        return
+    folders = procedure.check_folders(darks, flats)
+    found = procedure.measure_sensor(config, *folders)
+    sky = procedure.measure_night(config, raw, night, found) if night else None
+    name = Path(camera).stem
+    statistics = procedure.write_results(output_folder(out, name), config, raw, found, sky, name)
+    print_json(statistics) if json else print_results(statistics)
+
+
+def write_simulated(config: Any, folder: Path, seed: int, json: bool) -> None:
+    """Write simulated darks and flats."""
+    from skysim.experiments.characterize import rendered
+
+    total = rendered.frame_count(config.detector)
+    paths = list(progress(rendered.write_frames(config, folder, seed), total, "rendering"))
+    if json:
+        print_json({"frames": len(paths), "folder": str(folder)})
+    else:
+        print_wrapped(f"{len(paths)} frames: --darks {folder / 'darks'} --flats {folder / 'flats'}")
+
+
+def print_results(statistics: dict[str, Any]) -> None:
+    """Print the table of the values, what is not known, and the file."""
+    night = statistics["night"]
+    lines = [
+        [
+            row["what"],
+            f"{row['value']:.5g}",
+            f"{row['low']:.5g} to {row['high']:.5g}",
+            "-" if row["file"] is None else f"{row['file']:.5g}",
+            row["unit"],
+        ]
+        for row in statistics["values"] + (night["values"] if night else [])
+    ]
+    print_table("", ["what", "measured", "95 %", "file", "unit"], lines)
+    print()
+    if statistics["temperature_c"] is not None:
+        print_wrapped(f"dark current at {statistics['temperature_c']:g} °C")
+    print_wrapped(f"linearity error {100 * statistics['linearity_error']:.2g} %, of 5 to 95 % of the saturation")
+    if night:
+        print_wrapped(
+            f"{night['stars']} star images in {night['frames']} frames; {night['identified']} frames identified"
+            + (f", residuals {night['rms_px']:.2g} px rms" if night["rms_px"] is not None else "")
+        )
+    for remark in statistics["remarks"]:
+        print_wrapped(f"unknown: {remark}")
+    print_wrapped(f"{statistics['preset']}: for camera.preset; {statistics['report']}")

@@ -1,0 +1,1 @@
+"""A camera from its own frames: sensor from darks and flats, lens from the night sky (`skysim characterize`)."""

@@ -1,0 +1,181 @@
+"""Frames of a camera from image files, grouped by exposure time and temperature.
+
+A frame's exposure time and temperature are those of its folder's `frames.csv` (columns file, exposure_s and, if known,
+temperature_c), else of its FITS header (EXPTIME, CCD-TEMP), else of its name or that of a folder above it: `100ms`,
+`2s`, `-5C` between other words, as in `dark_100ms_-5C_03.tif`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
+from skysim.core.io import images
+from skysim.core.io.text import excerpt, read_lines, to_numbers
+from skysim.experiments.characterize.sensor.levels import Level, LevelBuilder
+
+TABLE = "frames.csv"
+UNITS_S = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
+EXPOSURE = re.compile(r"(?:^|[_\- ])(\d+(?:\.\d+)?)(us|ms|s)(?=$|[_\- ])")
+TEMPERATURE = re.compile(r"(?:^|[_\- ])([-+]?\d+(?:\.\d+)?)C(?=$|[_\- ])")
+TEMPERATURE_STEP_C = 0.5  # temperatures are rounded to it: a cooled chip is held to a tenth of a degree
+
+
+class Setting(NamedTuple):
+    """Exposure time, and temperature of the chip if known."""
+
+    exposure_s: float
+    temperature_c: float | None
+
+
+@dataclass
+class Stack:
+    """Levels of a folder's frames, and the median of each frame."""
+
+    folder: Path
+    levels: list[Level] = field(default_factory=list)
+    medians: dict[Setting, list[tuple[float, Path]]] = field(default_factory=dict)
+    shape: tuple[int, ...] = ()
+
+
+def image_files(folder: Path, option: str) -> list[Path]:
+    """The images of a folder and its subfolders, by name; of several formats of one name FITS. Raises InputError."""
+    if not folder.is_dir():
+        raise InputError(f"--{option} {folder}: no such folder; allowed: a folder of images")
+    best: dict[Path, Path] = {}
+    for path in sorted(folder.rglob("*")):
+        if (suffix := images.image_suffix(path.name)) and path.name[0] != ".":
+            stem = path.with_name(path.name[: -len(suffix)])
+            best[stem] = min(best.get(stem, path), path, key=lambda one: not images.is_fits(one))
+    found = list(best.values())
+    if not found:
+        raise InputError(f"--{option} {folder}: no images; allowed: {', '.join(images.IMAGE_SUFFIXES)}")
+    return found
+
+
+def read_frames(folder: Path, option: str) -> Iterator[tuple[Path, Setting, NDArray[np.uint16]]]:
+    """The frames of a folder. Raises InputError for a frame that cannot be used."""
+    tables: dict[Path, dict[str, Setting]] = {}
+    for path in image_files(folder, option):
+        parent = path.parent
+        if parent not in tables:
+            tables[parent] = read_settings(parent / TABLE) if (parent / TABLE).exists() else {}
+        picture = images.read_picture(path)
+        yield path, setting_of(path, folder, picture, tables[parent]), raw_numbers(path, picture.pixels)
+
+
+def raw_numbers(path: Path, pixels: NDArray) -> NDArray[np.uint16]:
+    """The digital numbers of a frame. Raises InputError unless they are a raw monochrome frame's."""
+    if pixels.ndim != 2:
+        raise InputError(f"{path}: a color image; allowed: monochrome frames, raw, of 8 to 16 bits a pixel")
+    if images.image_suffix(path.name) in (".jpg", ".jpeg"):
+        raise InputError(f"{path}: JPEG changes the noise; allowed: raw frames in FITS, PNG or TIFF")
+    if pixels.dtype.kind == "f" and not np.all(pixels == np.rint(pixels)):
+        raise InputError(f"{path}: numbers that are not whole, as of an average; allowed: raw frames")
+    if pixels.min() < 0 or pixels.max() > 65535:
+        raise InputError(f"{path}: {pixels.min()} to {pixels.max()} DN; allowed: 0 to 65535")
+    return pixels.astype(np.uint16)
+
+
+def setting_of(path: Path, root: Path, picture: images.Picture, table: dict[str, Setting]) -> Setting:
+    """Exposure and temperature of a frame. Raises InputError without an exposure."""
+    if path.name in table:
+        return table[path.name]
+    names = [path.name[: -len(images.image_suffix(path.name))], *path.relative_to(root).parts[-2::-1]]
+    exposure_s, temperature_c = picture.exposure_s, picture.temperature_c
+    if exposure_s is None:
+        exposure_s = next((float(hit[1]) * UNITS_S[hit[2]] for name in names if (hit := EXPOSURE.search(name))), None)
+    if temperature_c is None:
+        temperature_c = next((float(hit[1]) for name in names if (hit := TEMPERATURE.search(name))), None)
+    if exposure_s is None or exposure_s < 0:
+        raise InputError(
+            f"{path}: no exposure time; allowed: EXPTIME in a FITS header, a row of {TABLE} beside it (file,"
+            " exposure_s, temperature_c), or a name such as dark_100ms_20C_01.png"
+        )
+    if temperature_c is not None:
+        temperature_c = round(temperature_c / TEMPERATURE_STEP_C) * TEMPERATURE_STEP_C
+    return Setting(float(f"{exposure_s:.6g}"), temperature_c)
+
+
+def read_settings(path: Path) -> dict[str, Setting]:
+    """Exposure and temperature by the file's name, from a CSV file. Raises InputError with one line."""
+    lines = [(n, line) for n, line in read_lines(path) if not line.startswith("#")]
+    names = [cell.strip() for cell in lines[0][1].split(",")] if lines else []
+    wanted = [name for name in ("exposure_s", "temperature_c") if name in names]
+    if len(lines) < 2 or len({*names}) < len(names) or "file" not in names or "exposure_s" not in wanted:
+        raise InputError(f"{path}: no exposures; allowed: columns file, exposure_s and, if known, temperature_c")
+    rows = [[cell.strip() for cell in line.split(",")] for _, line in lines[1:]]
+    places = [n for n, _ in lines[1:]]
+    for place, row in zip(places, rows, strict=True):
+        if len(row) != len(names):
+            raise InputError(f"{path}, line {place}: {len(row)} values; allowed: {len(names)}, as the first line has")
+    cells = [[row[names.index(name)] for name in wanted] for row in rows]
+    numbers = to_numbers(str(path), places, cells, len(wanted))
+    files = [row[names.index("file")] for row in rows]
+    repeated = next((name for n, name in enumerate(files) if name in files[:n]), None)
+    if repeated is not None:
+        raise InputError(f"{path}: {excerpt(repeated)} occurs twice; allowed: once")
+    if (numbers[:, 0] < 0).any():
+        raise InputError(f"{path}: an exposure below 0; allowed: seconds, 0 or more")
+    return {
+        name: Setting(float(row[0]), float(row[1]) if len(wanted) == 2 else None)
+        for name, row in zip(files, numbers, strict=True)
+    }
+
+
+def read_stack(folder: Path, option: str, shape: tuple[int, int], bits: int) -> Stack:
+    """The levels of a folder's frames, by exposure. Raises InputError with one line.
+
+    Numbers that a camera or program has shifted to the upper bits of 16 are shifted back, if all are multiples.
+    shape : (height, width) of the camera's frames
+    """
+    builders: dict[Setting, LevelBuilder] = {}
+    stack, shift = Stack(folder), None
+    for path, setting, frame in read_frames(folder, option):
+        if frame.shape != shape:
+            size = f"{frame.shape[1]} x {frame.shape[0]} pixels"
+            raise InputError(f"{path}: {size}; allowed: {shape[1]} x {shape[0]}, as --camera has them")
+        shift = padding_bits(frame, bits) if shift is None else shift
+        numbers = np.right_shift(frame, np.uint16(shift))
+        if numbers.max() >= 2**bits:
+            raise InputError(f"{path}: {numbers.max()} DN; allowed: up to {2**bits - 1}, the {bits} bits of --camera")
+        builders.setdefault(setting, LevelBuilder()).add(numbers)
+        stack.medians.setdefault(setting, []).append((float(np.median(numbers)), path))
+    check_settings(stack, builders)
+    for setting in sorted(builders, key=lambda one: (one.exposure_s, one.temperature_c or 0.0)):
+        stack.levels.append(builders[setting].level(*setting))
+    return stack
+
+
+def padding_bits(frame: NDArray[np.uint16], bits: int) -> int:
+    """By how many bits the numbers are shifted to the left, if they are beyond the camera's range; otherwise 0."""
+    if frame.max() < 2**bits:
+        return 0
+    union = int(np.bitwise_or.reduce(frame, axis=None))
+    zeros = (union & -union).bit_length() - 1
+    return min(zeros, 16 - bits)
+
+
+def check_settings(stack: Stack, builders: dict[Setting, LevelBuilder]) -> None:
+    """Raise InputError for a single frame of an exposure, and if the temperature of some frames only is known."""
+    for setting, builder in builders.items():
+        if builder.frames < 2:
+            path = stack.medians[setting][0][1]
+            raise InputError(f"{path}: the only frame of {describe(setting)}; allowed: 2 or more, alike")
+    unknown = [setting for setting in builders if setting.temperature_c is None]
+    if unknown and len(unknown) < len(builders):
+        path = stack.medians[unknown[0]][0][1]
+        raise InputError(f"{path}: no temperature, which other frames have; allowed: of all frames, or of none")
+
+
+def describe(setting: Setting) -> str:
+    """An exposure and temperature for a message."""
+    at = "" if setting.temperature_c is None else f" at {setting.temperature_c:g} °C"
+    return f"{setting.exposure_s:g} s{at}"

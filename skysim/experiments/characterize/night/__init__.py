@@ -1,0 +1,1 @@
+"""A lens from frames of the night sky: image size over the field, and focal length and distortion."""

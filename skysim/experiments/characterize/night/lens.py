@@ -1,0 +1,199 @@
+"""Frames of the night sky: detection, identification and calibration by the estimator, and the size of star images."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from estimator.calibration.star_field import Calibration, self_calibrate
+from estimator.catalog import catalog
+from estimator.core.camera import Camera
+from estimator.core.errors import ImageError
+from estimator.core.types import Centroids
+from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
+from estimator.trackers.star_tracker import StarTracker
+from skysim.core.errors import InputError
+from skysim.core.io import images
+from skysim.core.types import Floats
+from skysim.experiments.characterize.frames import image_files, padding_bits, raw_numbers
+from skysim.experiments.characterize.night import star_images
+from skysim.experiments.characterize.night.star_images import HALF_PX, ImageSize, StarImages
+from skysim.experiments.characterize.sensor.estimate import Estimate
+from skysim.experiments.characterize.sensor.photon_transfer import BLACK, GAIN, READ, Transfer
+from skysim.scene.sections.camera import CameraConfig
+from skysim.tracking.onboard_model import calibration, onboard_catalog
+
+CATALOG, DEFAULT_EPOCH_YR = "gaia_v8.0", 2020.0
+STARS_A_FIELD = 300.0  # of the catalog, on average
+FOCAL_UNCERTAINTY = 0.05  # of the focal length in the camera's file
+LEAST_SNR, MAX_PEAK = 40.0, 0.8  # of a star whose image is measured; its peak over saturation
+LEAST_STARS, LEAST_FRAMES, LEAST_TRAILED = 20, 3, 3
+MEDIAN_COST = 1.25  # standard error of a median over that of a mean
+MAX_STRETCH = 0.25  # of the images, over their variance
+LENS = ("focal_px", "center_x_px", "center_y_px", "k1", "k2", "p1", "p2", "k3")
+
+
+class Night(NamedTuple):
+    """Image size, and the lens with its covariance if the sky was identified; remarks on what is unknown."""
+
+    size: ImageSize
+    lens: Calibration | None
+    frames: int
+    identified: int
+    remarks: list[str]
+
+
+class NightFrame(NamedTuple):
+    """A frame of the night: its stars' centroids and images."""
+
+    path: Path
+    centroids: Centroids
+    stars: StarImages
+    date_utc: datetime.datetime | None
+
+
+def measure_night(config: CameraConfig, folder: Path, transfer: Transfer, saturation_dn: float) -> Night:
+    """The lens from frames of the sky. Raises InputError for frames that do not tell."""
+    frames = [read_frame(path, config, transfer, saturation_dn) for path in image_files(folder, "night")]
+    still = [without_trail(one.stars) for one in frames]
+    stars = StarImages(*(np.concatenate(part) for part in zip(*still, strict=True)))
+    if len(stars.chi2) < LEAST_STARS:
+        raise InputError(
+            f"--night {folder}: {len(stars.chi2)} single stars of a signal to noise of {LEAST_SNR:g}, not saturated, in"
+            f" {len(frames)} frames; allowed: {LEAST_STARS} or more: more frames, or longer exposures"
+        )
+    check_trails(frames)
+    lens, remarks = find_lens(config, frames, transfer, saturation_dn)
+    center_px = lens.camera.center_px if lens else config.center_px
+    size = star_images.image_size(stars, center_px, config.corner_px)
+    if size is None:
+        raise InputError(f"--night {folder}: no star's image is a Gaussian; allowed: stars in focus, not trailed")
+    if size.left_out > 0.5 * len(stars.chi2):
+        remarks.append(f"psf: {size.left_out} of {len(stars.chi2)} star images are no Gaussians, and were left out")
+    identified = int(lens.report.tied.sum()) if lens else 0
+    return Night(size, lens, len(frames), identified, remarks)
+
+
+def read_frame(path: Path, config: CameraConfig, transfer: Transfer, saturation_dn: float) -> NightFrame:
+    """Detect and fit the stars of a frame. Raises InputError for one of another camera."""
+    picture = images.read_picture(path)
+    numbers = raw_numbers(path, picture.pixels)
+    if numbers.shape != (config.height_px, config.width_px):
+        size = f"{numbers.shape[1]} x {numbers.shape[0]} pixels"
+        raise InputError(f"{path}: {size}; allowed: {config.width_px} x {config.height_px}, as --camera has them")
+    numbers = np.right_shift(numbers, np.uint16(padding_bits(numbers, config.detector.bits)))
+    try:
+        centroids = detect_and_centroid(numbers, calibration(config), settings_of(transfer, saturation_dn), Clock())
+    except ImageError as error:
+        raise InputError(f"{path}: {error}") from None
+    signal = transfer.linear_dn(numbers - transfer.values[BLACK])
+    chosen = measurable(numbers, centroids, transfer, saturation_dn)
+    gain, read = float(transfer.values[GAIN]), float(transfer.values[READ])
+    return NightFrame(path, centroids, star_images.fit_images(signal, chosen, gain, read), picture.date_utc)
+
+
+def settings_of(transfer: Transfer, saturation_dn: float) -> Settings:
+    """Settings of the tracker for this camera."""
+    return Settings(gain_e_dn=float(1 / transfer.values[GAIN]), saturation=saturation_dn, centroid_sigma_px=0.02)
+
+
+def measurable(numbers: NDArray[Any], centroids: Centroids, transfer: Transfer, saturation_dn: float) -> Floats:
+    """(N, 2) pixels of stars that are bright, not saturated, away from the border and from other stars."""
+    xy = centroids.xy_px
+    if not len(xy):
+        return np.zeros((0, 2))
+    height, width = numbers.shape
+    inside = np.all((xy >= HALF_PX) & (xy <= np.array([width, height]) - 1 - HALF_PX), axis=1)
+    near = cKDTree(xy).query(xy, k=2)[0][:, 1] if len(xy) > 1 else np.array([np.inf])
+    x, y = np.rint(xy).astype(int).T
+    background = float(np.median(numbers))
+    peak = numbers[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+    dark_e2 = (background - transfer.values[BLACK]) / transfer.values[GAIN] + transfer.values[READ] / transfer.values[
+        GAIN
+    ] ** 2
+    flux_e = centroids.flux / transfer.values[GAIN]
+    snr = flux_e / np.sqrt(np.maximum(flux_e + 12 * max(dark_e2, 0.0), 1.0))
+    kept = inside & (near > HALF_PX * math.sqrt(2)) & (peak < MAX_PEAK * saturation_dn) & (snr > LEAST_SNR)
+    return np.asarray(xy[kept])
+
+
+def trail_px2(stars: StarImages) -> tuple[float, float]:
+    """Median difference of the variances along the rows and along the columns, and twice the median covariance."""
+    if len(stars.chi2) < LEAST_TRAILED:
+        return 0.0, 0.0
+    along, across = np.median(stars.stretch_px2, axis=0)
+    return float(along), float(across)
+
+
+def without_trail(stars: StarImages) -> StarImages:
+    """The images without what a common trail adds to their mean variance: half of the stretch, less its own error."""
+    count = max(len(stars.chi2), 1)
+    noise2 = float(np.sum(np.var(stars.stretch_px2, axis=0))) * MEDIAN_COST**2 / count if count > 1 else 0.0
+    added = math.sqrt(max(math.hypot(*trail_px2(stars)) ** 2 - noise2, 0.0)) / 2
+    return stars._replace(variance_px2=stars.variance_px2 - added)
+
+
+def check_trails(frames: list[NightFrame]) -> None:
+    """Raise InputError for a frame whose stars trail: their images are longer in one direction."""
+    for one in frames:
+        if not len(one.stars.chi2):
+            continue
+        along, across = trail_px2(one.stars)
+        stretch, variance = math.hypot(along, across), float(np.median(one.stars.variance_px2))
+        if stretch > MAX_STRETCH * variance:
+            trail_px = math.sqrt(12 * stretch)  # a uniform streak of length L has the variance L^2 / 12
+            angle_deg = math.degrees(math.atan2(across, along)) / 2
+            raise InputError(
+                f"{one.path}: stars trail by {trail_px:.2g} px at {angle_deg:.0f}° from the rows; allowed:"
+                f" {math.sqrt(12 * MAX_STRETCH * variance):.2g} px: a shorter exposure, or a mount that follows the sky"
+            )
+
+
+def find_lens(
+    config: CameraConfig, frames: list[NightFrame], transfer: Transfer, saturation_dn: float
+) -> tuple[Calibration | None, list[str]]:
+    """The lens by stars that are identified, from the focal length in the camera's file; or why it is unknown."""
+    if len(frames) < LEAST_FRAMES:
+        lacking = LEAST_FRAMES - len(frames)
+        return None, [f"focal length, distortion: {len(frames)} frames of the night; allowed: {lacking} more elsewhere"]
+    camera, settings = calibration(config), settings_of(transfer, saturation_dn)
+    stars = onboard_catalog("--night", CATALOG)
+    narrow_sr = config.width_px * config.height_px / (camera.focal_px * (1 + FOCAL_UNCERTAINTY)) ** 2
+    stars = stars.take(stars.v_mag <= catalog.limit_for_density(stars, narrow_sr, STARS_A_FIELD))
+    dates = [one.date_utc for one in frames if one.date_utc is not None]
+    vectors = (
+        catalog.apparent(stars, catalog.on_earth(dates[0])) if dates else catalog.at_epoch(stars, DEFAULT_EPOCH_YR)
+    )
+
+    def tracker(model: Camera, uncertainty: float) -> StarTracker:
+        return StarTracker(model, stars, vectors, settings, uncertainty)
+
+    try:
+        found = self_calibrate([one.centroids for one in frames], tracker, camera, FOCAL_UNCERTAINTY)
+    except ValueError as error:
+        return None, [f"focal length, distortion: {error}; --camera states {camera.focal_px:.5g} px, to 5 %"]
+    return found, [] if dates else ["date: no frame has one; allowed: DATE-OBS in a FITS header, for aberration to 20″"]
+
+
+def lens_estimates(config: CameraConfig, found: Calibration) -> dict[str, Estimate]:
+    """Focal length in millimeters, principal point in pixels, and coefficients of distortion.
+
+    The calibration measures the distance of the image in pixels; by the thin lens the focal length is
+    1 / (1 / v + 1 / u).
+    """
+    errors = np.sqrt(np.diag(found.covariance))
+    camera = found.camera
+    image_m = camera.focal_px * config.pixel_m
+    focal_m = 1 / (1 / image_m + 1 / config.focus_m)
+    focal = Estimate.normal(1e3 * focal_m, 1e3 * float(errors[0]) * config.pixel_m * (focal_m / image_m) ** 2)
+    values = [*camera.center_px, *camera.distortion]
+    rest = {
+        name: Estimate.normal(value, error) for name, value, error in zip(LENS[1:], values, errors[1:], strict=True)
+    }
+    return {"focal_length_mm": focal, **rest}

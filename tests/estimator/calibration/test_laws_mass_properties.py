@@ -1,0 +1,161 @@
+"""Laws of the mass properties on an air bearing."""
+
+from __future__ import annotations
+
+import numpy as np
+from bearing_motion import SMALL, prior, record
+from hypothesis import given
+from laws import SEEDS, assert_covariance, law, turn
+from scipy.spatial.transform import Rotation
+
+from estimator.calibration.mass_properties import batch, dynamics, recursive
+from estimator.calibration.mass_properties.dynamics import STATE, Motion, States
+from estimator.calibration.mass_properties.record import (
+    MassEstimate,
+    Prior,
+    inertia_matrix,
+    inertia_six,
+)
+
+RECORD = record(SMALL, np.random.default_rng(11), 26.0)
+
+
+def drawn_states(rng: np.random.Generator, count: int) -> States:
+    rotations = Rotation.concatenate([turn(rng) for _ in range(count)])
+    return States(rotations.as_quat().T, *(1e-2 * rng.standard_normal((2, 3, count))))
+
+
+@law(States.take, States.rotation, States.moved, States.minus, dynamics.cross, dynamics.turn, dynamics.moved_on)
+@given(rng=SEEDS)
+def test_a_change_of_states_is_found_again(rng: np.random.Generator) -> None:
+    states, change = drawn_states(rng, 5), 0.1 * rng.standard_normal((STATE, 5))
+    np.testing.assert_allclose(states.moved(change).minus(states), change, rtol=0, atol=1e-12)
+    a, b = rng.standard_normal((2, 3, 5))
+    np.testing.assert_allclose(dynamics.cross(a, b), np.cross(a, b, axis=0), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(dynamics.turn(states.quaternion, a).T, states.rotation.apply(a.T), rtol=0, atol=1e-12)
+    back = dynamics.turn(states.quaternion, dynamics.turn(states.quaternion, a), inverse=True)
+    np.testing.assert_allclose(back, a, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(states.take(slice(1, 3)).momentum, states.momentum[:, 1:3])
+    moved = dynamics.moved_on(states, states, 2.0)
+    np.testing.assert_allclose(moved.torque, 3 * states.torque, rtol=1e-12)
+
+
+@law(Motion.stored, Motion.rate, Motion.slope, Motion.integrate)
+@given(rng=SEEDS)
+def test_momentum_in_the_lab_changes_by_external_torques_only(rng: np.random.Generator) -> None:
+    """Without gravity's moment, drag and torques H stays, whatever the wheels do; rate and slope agree."""
+    free = SMALL.truth.copy()
+    free[6:14] = 0
+    motion = Motion(RECORD, SMALL.lab, np.tile(free[:, None], 4))
+    states = drawn_states(rng, 4)._replace(torque=np.zeros((3, 4)))
+    begin = rng.uniform(0, 10, 4)
+    after = motion.integrate(begin, begin + 3.0, states, 2.0)
+    np.testing.assert_allclose(after.momentum, states.momentum, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(np.linalg.norm(after.quaternion, axis=0), 1, rtol=1e-12)
+    rate, short = motion.rate(states, motion.stored(begin)), 1e-5
+    turned = motion.integrate(begin, begin + short, states, 2.0).minus(states)[:3] / short
+    np.testing.assert_allclose(turned, rate, rtol=0, atol=1e-4)
+    spin = motion.slope(begin, states).quaternion
+    np.testing.assert_allclose(np.sum(spin * states.quaternion, axis=0), 0, rtol=0, atol=1e-12)
+
+
+@law(dynamics.difference_steps, dynamics.transition, dynamics.torque_noise)
+@given(rng=SEEDS)
+def test_a_transition_predicts_small_changes(rng: np.random.Generator) -> None:
+    """Of a state and of the parameters, by its derivatives; its noise is a covariance."""
+    assumed, _ = prior(SMALL, rng)
+    states = batch.first_states(RECORD, SMALL.lab, assumed.values).take(slice(0, 6))
+    link = dynamics.transition(RECORD, SMALL.lab, 0, states, assumed.values, assumed.sigma)
+    change = np.outer(np.repeat([1e-4, 1e-6, 1e-8], 3), np.ones(6)) * rng.standard_normal((STATE, 6))
+    by = 1e-3 * assumed.sigma * rng.standard_normal(20)
+    other = dynamics.transition(RECORD, SMALL.lab, 0, states.moved(change), assumed.values + by, assumed.sigma)
+    expected = np.einsum("kij,jk->ik", link.by_state, change) + (link.by_parameter @ by).T
+    scale = np.repeat([1e-6, 1e-8, 1e-10], 3)[:, None]
+    np.testing.assert_allclose((other.after.minus(link.after) - expected) / scale, 0, atol=1)
+    for one in link.noise:
+        assert_covariance(one)
+    steps = dynamics.difference_steps(assumed.values, assumed.sigma, 1.0, 1.0)
+    assert all((step > 0).all() for step in steps)
+
+
+@law(
+    batch.estimate_mass,
+    batch.estimate_with_noise,
+    batch.first_states,
+    batch.reduced,
+    batch.whitened_links,
+    batch.add_measured,
+    batch.lower_band,
+    batch.measured_minus,
+)
+@given(rng=SEEDS)
+def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) -> None:
+    """The band of the states and their elimination against a dense inverse; more records, smaller errors."""
+    assumed, vehicle = prior(SMALL, rng)
+    lab, values = vehicle.lab, assumed.values
+    states = batch.first_states(RECORD, lab, values)
+    part = batch.reduced(RECORD, states, lab, values, assumed.sigma)
+    rows = batch.whitened_links(RECORD, states, lab, values, assumed.sigma)
+    count, size = len(RECORD.t_s), len(values)
+    whole = np.zeros((STATE * count + size + 1,) * 2)
+    for k, row in enumerate(rows):
+        at = np.r_[STATE * k : STATE * (k + 2), STATE * count : len(whole)]
+        whole[np.ix_(at, at)] += row.T @ row
+    diagonal, border = np.zeros((count, STATE, STATE)), np.zeros((count, STATE, size + 1))
+    corner = np.zeros((size + 1, size + 1))
+    batch.add_measured(RECORD, states, lab, values, (diagonal, border, corner))
+    whole[STATE * count :, STATE * count :] += corner
+    for k in range(count):
+        at = slice(STATE * k, STATE * (k + 1))
+        whole[at, at] += diagonal[k]
+        whole[at, STATE * count :] += border[k]
+    inner, outer = whole[: STATE * count, : STATE * count], whole[: STATE * count, STATE * count :]
+    schur = whole[STATE * count :, STATE * count :] - outer.T @ np.linalg.solve(inner, outer)
+    scale = np.outer(assumed.sigma, assumed.sigma)
+    np.testing.assert_allclose(part.normal * scale, schur[:-1, :-1] * scale, rtol=1e-4, atol=1e-4)
+    band = batch.lower_band(diagonal, np.zeros((count - 1, STATE, STATE)))
+    np.testing.assert_array_equal(band[0], diagonal[:, range(STATE), range(STATE)].ravel())
+
+
+@law(MassEstimate.inertia_kg_m2, MassEstimate.moment_kg_m, MassEstimate.sigma, inertia_matrix, inertia_six)
+@given(rng=SEEDS)
+def test_an_estimate_reads_its_vector(rng: np.random.Generator) -> None:
+    half = rng.standard_normal((3, 3))
+    values = rng.standard_normal(20)
+    values[:6] = inertia_six(half + half.T)
+    estimate = MassEstimate(values, np.diag(np.arange(1.0, 21.0) ** 2), 1.0)
+    np.testing.assert_array_equal(estimate.inertia_kg_m2, inertia_matrix(values[:6]))
+    np.testing.assert_array_equal(estimate.inertia_kg_m2, half + half.T)
+    np.testing.assert_array_equal(estimate.moment_kg_m, values[6:9])
+    np.testing.assert_allclose(estimate.sigma, np.arange(1.0, 21.0))
+
+
+@law(
+    recursive.filter_mass, recursive.filter_from, recursive.cut, recursive.first_covariance, recursive.joseph, slow=True
+)
+@given(rng=SEEDS)
+def test_a_filter_grows_only_surer(rng: np.random.Generator) -> None:
+    assumed, vehicle = prior(SMALL, rng)
+    estimates = list(recursive.filter_mass(RECORD, vehicle.lab, assumed))
+    assert len(estimates) == len(RECORD.t_s) - recursive.START - 2
+    last = assumed.sigma
+    for one in estimates:
+        assert_covariance(one.covariance / np.outer(assumed.sigma, assumed.sigma))
+        assert (one.sigma <= last * (1 + 1e-9)).all()
+        last = one.sigma
+    begun = batch.estimate_mass([recursive.cut(RECORD, slice(0, 20))], vehicle.lab, assumed)
+    whole = recursive.first_covariance(begun, RECORD, vehicle.lab)
+    scale = np.sqrt(np.diag(whole))
+    assert_covariance(whole / np.outer(scale, scale))
+    rest = recursive.cut(RECORD, slice(20, None))
+    first = next(recursive.filter_from(begun, rest, vehicle.lab, assumed.sigma))
+    np.testing.assert_array_equal(first.values, estimates[0].values)
+
+
+def test_a_longer_record_is_surer() -> None:
+    assumed, vehicle = prior(SMALL, np.random.default_rng(3))
+    short, long = (
+        batch.estimate_mass([recursive.cut(RECORD, slice(0, n))], vehicle.lab, Prior(SMALL.truth, assumed.sigma)).sigma
+        for n in (12, 26)
+    )
+    assert (long <= short * (1 + 1e-3)).all()

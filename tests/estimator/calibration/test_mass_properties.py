@@ -1,0 +1,168 @@
+"""Mass properties on an air bearing: analytic motions, an independent integration, errors as large as claimed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bearing_motion import GRAVITY_M_S2, INERTIA, SMALL, Vehicle, prior, record
+from scipy.special import ellipj, ellipkinc
+from scipy.stats import chi2
+
+from estimator.calibration.mass_properties.batch import estimate_mass, estimate_with_noise
+from estimator.calibration.mass_properties.dynamics import Motion, States
+from estimator.calibration.mass_properties.record import BearingRecord, Lab, MassEstimate
+from estimator.calibration.mass_properties.recursive import filter_mass
+from estimator.core.arrays import Floats
+from estimator.core.errors import ImageError
+
+NINE = slice(0, 9)
+
+
+def flown(vehicle: Vehicle, rate_rad_s: Floats, t_s: Floats) -> tuple[States, Floats]:
+    """Motion from rest of the wheels, level, with this rate; its states at all times and its rates (3, N)."""
+    still = replace(record(SMALL, np.random.default_rng(0), 4.0), wheel_momentum_nms=np.zeros((41, 3)))
+    equations = Motion(still, vehicle.lab, np.tile(vehicle.truth[:, None], len(t_s)))
+    count = len(t_s)
+    momentum = np.tile((vehicle.inertia_kg_m2 @ rate_rad_s)[:, None], count)
+    start = States(np.tile([[0.0], [0], [0], [1]], count), momentum, np.zeros((3, count)))
+    states = equations.integrate(np.zeros(count), t_s, start, 1.0)
+    return states, equations.rate(states, np.zeros((3, count)))
+
+
+def test_free_rigid_body_follows_jacobis_elliptic_functions() -> None:
+    """Landau & Lifshitz, Mechanics, 37.10: rates of an asymmetric top about its principal axes, I1 < I2 < I3."""
+    I1, I2, I3 = 0.09, 0.11, 0.13
+    w0 = np.array([0.3, 0.0, 0.4])
+    energy2, square = I1 * w0[0] ** 2 + I3 * w0[2] ** 2, (I1 * w0[0]) ** 2 + (I3 * w0[2]) ** 2
+    assert square > energy2 * I2
+    t_s = np.linspace(0.5, 20, 9)
+    tau = t_s * np.sqrt((I3 - I2) * (square - energy2 * I1) / (I1 * I2 * I3))
+    sn, cn, dn, _ = ellipj(tau, (I2 - I1) * (energy2 * I3 - square) / ((I3 - I2) * (square - energy2 * I1)))
+    expected = [
+        np.sqrt((energy2 * I3 - square) / (I1 * (I3 - I1))) * cn,
+        np.sqrt((energy2 * I3 - square) / (I2 * (I3 - I2))) * sn,
+        np.sqrt((square - energy2 * I1) / (I3 * (I3 - I1))) * dn,
+    ]
+    _, rate = flown(Vehicle(np.diag([I1, I2, I3]), np.zeros(3), np.zeros(3)), w0, t_s)
+    np.testing.assert_allclose(rate, expected, rtol=0, atol=1e-6)
+
+
+def test_unbalanced_body_swings_with_a_pendulums_period() -> None:
+    """theta'' = -(m g r / J) sin(theta): a quarter period from the bottom to the amplitude theta0 takes
+    sqrt(J / (m g r)) K(sin(theta0 / 2)).
+    """
+    J, moment, amplitude = 0.1, 4e-4, 0.3
+    frequency = np.sqrt(moment * GRAVITY_M_S2 / J)
+    quarter_s = ellipkinc(np.pi / 2, np.sin(amplitude / 2) ** 2) / frequency
+    rate = np.array([2 * frequency * np.sin(amplitude / 2), 0, 0])
+    vehicle = Vehicle(np.diag([J, 0.12, 0.09]), np.array([0, 0, -moment]), np.zeros(3))
+    states, rates = flown(vehicle, rate, np.array([quarter_s, 4 * quarter_s]))
+    assert states.rotation[0].as_rotvec() == pytest.approx([amplitude, 0, 0], abs=1e-6)
+    assert states.rotation[1].as_rotvec() == pytest.approx(np.zeros(3), abs=1e-6)
+    assert rates[:, 1] == pytest.approx(rate, abs=1e-7)
+
+
+def nees(estimate: MassEstimate, vehicle: Vehicle) -> float:
+    """Squared error of the nine mass properties in units of their covariance."""
+    error = (estimate.values - vehicle.truth)[NINE]
+    return float(error @ np.linalg.solve(estimate.covariance[NINE, NINE], error))
+
+
+def draws(count: int, seed: int) -> list[tuple[BearingRecord, Lab, float, MassEstimate]]:
+    """Records of draws of noise, random torque and assumptions: each with the NEES of the batch."""
+    rows = []
+    for child in np.random.SeedSequence(seed).spawn(count):
+        rng = np.random.default_rng(child)
+        assumed, vehicle = prior(SMALL, rng)
+        one = record(vehicle, rng)
+        estimate = estimate_mass([one], vehicle.lab, assumed)
+        rows.append((one, vehicle.lab, nees(estimate, vehicle), estimate))
+    return rows
+
+
+def test_inertia_and_offset_are_found_with_errors_as_claimed() -> None:
+    """Inertia to 1 % of the largest, the horizontal moment to 1e-6 kg m; squared errors as their covariance says."""
+    rng = np.random.default_rng(7)
+    assumed, vehicle = prior(SMALL, rng)
+    estimate = estimate_mass([record(vehicle, rng)], vehicle.lab, assumed)
+    assert nees(estimate, vehicle) < chi2.ppf(0.9999, 9)
+    assert estimate.misfit == pytest.approx(1, abs=0.35)
+    assert (estimate.sigma[:6] < 0.01 * np.max(INERTIA)).all()
+    assert (estimate.sigma[6:8] < 1e-6).all()
+    np.testing.assert_allclose(estimate.inertia_kg_m2, INERTIA, rtol=0, atol=0.03 * np.max(INERTIA))
+
+
+@pytest.mark.long
+def test_a_hundred_draws_err_as_their_covariance_says() -> None:
+    """The sum of 100 NEES of nine values is chi-square of 900 degrees of freedom."""
+    values = [value for _, _, value, _ in draws(100, 1)]
+    assert chi2.ppf(1e-4, 900) < sum(values) < chi2.ppf(1 - 1e-4, 900)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.2, 5.0])
+def test_wrong_tracker_covariance_is_found_from_the_misfit(factor: float) -> None:
+    rng = np.random.default_rng(10)
+    assumed, vehicle = prior(SMALL, rng)
+    one = record(vehicle, rng)
+    wrong = replace(one, covariance_rad2=factor * one.covariance_rad2)
+    estimate = estimate_with_noise([wrong], vehicle.lab, assumed)
+    right = estimate_mass([one], vehicle.lab, assumed)
+    assert estimate.attitude_factor * factor == pytest.approx(1, rel=0.4)
+    assert nees(estimate, vehicle) < chi2.ppf(0.9999, 9)
+    np.testing.assert_allclose(estimate.sigma[NINE], right.sigma[NINE], rtol=0.3)
+
+
+@pytest.mark.slow
+def test_filter_in_flight_ends_where_the_batch_does() -> None:
+    for one, lab, _, batch in draws(3, 2):
+        rng = np.random.default_rng(5)
+        *_, last = filter_mass(one, lab, prior(SMALL, rng)[0])
+        assert (np.abs(last.values - batch.values)[NINE] < 3 * batch.sigma[NINE]).all()
+        np.testing.assert_allclose(last.sigma[NINE], batch.sigma[NINE], rtol=0.25)
+
+
+def test_free_swing_tells_only_the_ratio_of_inertia_and_offset() -> None:
+    """Without wheels the equations are homogeneous in J and m r: their common scale stays as uncertain as assumed."""
+    rng = np.random.default_rng(8)
+    vehicle = replace(SMALL, moment_kg_m=np.array([1e-5, -2e-5, -4e-4]), lab_torque_nm=np.zeros(3))
+    assumed, _ = prior(vehicle, rng)
+    estimate = estimate_mass([record(vehicle, rng, wheels=False)], vehicle.lab, assumed)
+    scale = vehicle.truth[NINE] / np.linalg.norm(vehicle.truth[NINE])
+    information = np.linalg.inv(estimate.covariance[NINE, NINE])
+    assumed_information = np.sum((scale / assumed.sigma[NINE]) ** 2)
+    assert scale @ information @ scale < 30 * assumed_information
+    vertical = estimate.values[8] / estimate.values[0]
+    assert vertical == pytest.approx(vehicle.truth[8] / vehicle.truth[0], rel=0.02)
+
+
+@pytest.mark.slow
+def test_a_motion_of_known_trim_adds_the_scale() -> None:
+    """Two free swings, the second with a known moment added: the inertia follows without wheels."""
+    rng = np.random.default_rng(9)
+    vehicle = replace(SMALL, moment_kg_m=np.array([1e-5, -2e-5, -4e-4]), lab_torque_nm=np.zeros(3))
+    added = np.array([5e-5, 3e-5, -4e-4])
+    assumed, vehicle = prior(vehicle, rng)
+    trimmed = replace(vehicle, moment_kg_m=vehicle.moment_kg_m + added)
+    one, two = record(vehicle, rng, wheels=False), record(trimmed, rng, wheels=False)
+    alone = estimate_mass([one], vehicle.lab, assumed)
+    both = estimate_mass([one, replace(two, added_moment_kg_m=added)], vehicle.lab, assumed)
+    assert both.sigma[0] < alone.sigma[0] / 5
+    assert nees(both, vehicle) < chi2.ppf(0.9999, 9)
+
+
+def test_too_few_attitudes_and_missing_wheel_speeds_are_refused() -> None:
+    whole = record(SMALL, np.random.default_rng(0), 10.0)
+    with pytest.raises(ImageError, match=r"^mass properties: 3 attitudes; allowed: 4 or more$"):
+        replace(whole, t_s=whole.t_s[:3])
+    with pytest.raises(ImageError, match=r"wheel speeds from 0 to 5 s; allowed: over all attitudes, 0 to 10 s$"):
+        replace(whole, wheel_t_s=whole.wheel_t_s[:51])
+    with pytest.raises(ImageError, match=r"^mass properties: times do not ascend$"):
+        replace(whole, t_s=whole.t_s[::-1])
+    assumed, _ = prior(SMALL, np.random.default_rng(1))
+    with pytest.raises(ImageError, match=r"11 attitudes; allowed for a filter: 24 or more$"):
+        next(filter_mass(whole, SMALL.lab, assumed))
+    with pytest.raises(ImageError, match=r"standard deviations above 0$"):
+        replace(assumed, sigma=0 * assumed.sigma)

@@ -1,0 +1,289 @@
+"""A sensor from darks and flats: each estimator against a law written anew here, all against simulated chips."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+from two_samples import histogram_p
+
+from skysim.camera.detector import detector
+from skysim.camera.detector.detector import Detector
+from skysim.core.types import Floats
+from skysim.experiments.characterize import rendered
+from skysim.experiments.characterize.sensor import dark_current, photon_transfer, sensor, uniformity
+from skysim.experiments.characterize.sensor.dark_current import RateNoise
+from skysim.experiments.characterize.sensor.estimate import Estimate, propagate
+from skysim.experiments.characterize.sensor.levels import Level, Moments, level
+from skysim.experiments.characterize.sensor.photon_transfer import Point
+from skysim.experiments.characterize.sensor.sensor import Sensor
+from skysim.scene.sections.camera import CameraConfig, DetectorConfig
+
+CHIP = {
+    **{"quantum_efficiency": 0.6, "bits": 12, "gain_e_dn": 2.64, "offset_dn": 100, "full_well_e": 10700},
+    **{"read_noise_e": 6.0, "nonlinearity": 0.03, "prnu": 0.01, "column_offset_e": 2.0},
+    **{"dark_e_s": 5.0, "dsnu": 0.3, "hot_pixels": 2e-3, "hot_e_s": 100.0},
+    **{"dark_temperature_c": 20.0, "dark_doubling_c": 7.0},
+}
+FLAT_S = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.65, 0.8, 1.3, 1.5)
+Z_95 = stats.norm.ppf(0.975)
+
+
+def camera(side_px: int, seed: int = 0, **changes: Any) -> CameraConfig:
+    lens = {"pixel": "5 um", "focal_length": "25 mm", "f_number": 2, "height_px": side_px, "width_px": side_px}
+    return CameraConfig.model_validate(lens | {"detector": CHIP | {"hardware_seed": seed} | changes})
+
+
+def measured(side_px: int, seed: int, darks: int = 8, **changes: Any) -> Sensor:
+    """Darks of three exposures at two temperatures, and flats in pairs, of one simulated chip."""
+    rng = np.random.default_rng(1000 + seed)
+
+    def frames(temperature_c: float, rate_e_s: float, exposure_s: float, count: int) -> Level:
+        made = Detector.from_camera(camera(side_px, seed, **(changes | {"temperature_c": temperature_c})))
+        light_e = np.full((side_px, side_px), rate_e_s * exposure_s, np.float32)
+        shots = (detector.expose(light_e.copy(), exposure_s, made, rng) for _ in range(count))
+        return level(exposure_s, temperature_c, shots)
+
+    rate_e_s = float((CHIP | changes)["full_well_e"])
+    dark_levels = [frames(at_c, 0.0, t_s, darks) for at_c in (20.0, 30.0) for t_s in (0.1, 5.0, 20.0)]
+    return sensor.characterize(dark_levels, [frames(20.0, rate_e_s, t_s, 2) for t_s in FLAT_S])
+
+
+def test_half_the_variance_of_a_pair_s_difference_is_the_noise_without_pattern_and_flicker() -> None:
+    rng = np.random.default_rng(1)
+    pattern, sigma = rng.uniform(200, 4000, (200, 300)), 7.0
+    frames = [np.rint(pattern * lamp + rng.normal(0, sigma, pattern.shape)) for lamp in (1, 1.0, 1, 1.0)]
+    shifted = [frame.astype(np.uint16) + np.uint16(n) for n, frame in enumerate(frames)]
+    found = level(0.1, 20.0, shifted)
+    moments = found.moments(np.ones(pattern.shape, bool))
+    assert found.count == 4
+    assert abs(moments.variance_dn2 - sigma**2 - 1 / 12) < 4 * moments.variance_sigma_dn2
+    assert moments.variance_sigma_dn2 == pytest.approx(sigma**2 * np.sqrt(2 / 2 / pattern.size), rel=0.02)
+    assert abs(moments.mean_dn - pattern.mean() - 1.5) < 4 * sigma / np.sqrt(4 * pattern.size)
+    assert found.difference_dn2 == pytest.approx(1.0, rel=0.2)
+
+
+def test_an_odd_last_frame_is_left_out() -> None:
+    rng = np.random.default_rng(2)
+    frames = [rng.integers(90, 110, (20, 30)).astype(np.uint16) for _ in range(5)]
+    odd, even = level(1.0, None, frames), level(1.0, None, frames[:4])
+    assert odd.count == 4
+    np.testing.assert_array_equal(odd.variance_dn2, even.variance_dn2)
+
+
+def exact_points(gain_dn_e: float, curvature: float, read_dn: float, black_dn: float) -> list[Point]:
+    """Points of the law, from 10^7 numbers drawn for none: by the moments of a Poisson variable up to the fourth."""
+    points = []
+    for lit, rate_e_s, times in ((0, 3.0, (0.1, 5.0, 20.0)), (1, 2003.0, (0.1, 0.4, 1.0, 2.0, 3.0))):
+        for t_s in times:
+            n = rate_e_s * t_s
+            # y = x - c x^2 of x = K N + r: exact variance with E[N^k] of Poisson and a Gaussian r.
+            support = np.arange(int(n + 12 * np.sqrt(n)) + 20)
+            weight = stats.poisson.pmf(support, n)
+            nodes, by = np.polynomial.hermite_e.hermegauss(9)
+            x = gain_dn_e * support[:, None] + read_dn * nodes
+            y, w = x - curvature * x**2, weight[:, None] * by / by.sum()
+            mean = float((w * y).sum())
+            variance = float((w * (y - mean) ** 2).sum()) + 1 / 12
+            points.append(Point(t_s, lit, 0, Moments(black_dn + mean, 1e-3, variance, 1e-3 * variance)))
+    return points
+
+
+def test_the_fit_returns_the_law_of_its_points() -> None:
+    gain, curvature, read, black = 0.4, 4e-6, 2.5, 100.0
+    found = photon_transfer.fit(exact_points(gain, curvature, read, black), 0.0)
+    assert found.gain_e_dn.value == pytest.approx(1 / gain, rel=2e-3)
+    assert found.read_noise_e.value == pytest.approx(read / gain, rel=2e-3)
+    assert found.values[photon_transfer.CURVATURE] == pytest.approx(curvature, rel=5e-3)
+    assert found.offset_dn.value == pytest.approx(black, abs=2e-3)
+    assert found.light_e_s.value == pytest.approx(2000, rel=2e-3)
+    assert found.values[photon_transfer.FIRST_DARK] / gain == pytest.approx(3, rel=2e-3)
+
+
+def test_linear_signal_is_the_inverse_of_the_amplifier() -> None:
+    x = np.linspace(0, 4000, 9)
+    for curvature in (0.0, 1e-5, -1e-5):
+        np.testing.assert_allclose(photon_transfer.linear_dn(x - curvature * x**2, curvature), x, rtol=1e-12, atol=1e-9)
+
+
+def test_the_lamp_s_flicker_is_what_noise_does_not_explain() -> None:
+    rng, pixels, flicker = np.random.default_rng(3), 4000, 0.004
+    points, changes = [], []
+    for mean in np.linspace(500, 3000, 400):
+        points.append(Point(1.0, 1, 0, Moments(100 + mean, 0.0, mean, 0.0)))
+        change = rng.normal(0, np.sqrt(2 * (flicker * mean) ** 2 + 2 * mean / pixels))
+        changes.append(change**2)
+    assert photon_transfer.lamp_flicker(points, changes, 100.0, pixels) == pytest.approx(flicker, rel=0.1)
+
+
+def drawn_rates(rng: np.random.Generator, pixels: int, noise: RateNoise, hot: float = 0.004) -> Floats:
+    mean, dsnu, excess = 2.0, 0.4, 30.0
+    s2 = np.log1p(dsnu**2)
+    rates = mean * rng.lognormal(-s2 / 2, np.sqrt(s2), pixels)
+    rates += np.where(rng.random(pixels) < hot, rng.exponential(excess, pixels), 0.0)
+    return rates + rng.normal(0, np.sqrt(noise.reading + noise.counting * rates))
+
+
+@pytest.mark.parametrize("reading", [0.001, 0.3])
+def test_the_law_of_the_dark_current_is_that_of_drawn_pixels(reading: float) -> None:
+    rng, noise = np.random.default_rng(4), RateNoise(reading, 0.01)
+    rates = drawn_rates(rng, 400_000, noise)
+    theta = np.array([np.log(2.0), np.log(0.4), np.log(0.004 / 0.996), np.log(30.0)])
+    edges = np.quantile(rates, np.linspace(0.002, 0.998, 60))
+    expected = len(rates) * dark_current.probabilities(theta, edges, noise)
+    counts = np.bincount(np.searchsorted(edges, rates), minlength=len(edges) + 1)
+    assert expected.sum() == pytest.approx(len(rates))
+    chi2 = np.sum((counts - expected) ** 2 / expected)
+    assert 1e-4 < stats.chi2.sf(chi2, len(edges)) < 1
+
+
+@pytest.mark.slow
+def test_dark_current_of_drawn_pixels_is_found_within_its_interval() -> None:
+    """Over twenty chips of 60,000 pixels: mean pulls below 1, so that no parameter is biased by half a sigma."""
+    pulls = []
+    for seed in range(20):
+        noise = RateNoise(0.3, 0.01)
+        found = dark_current.fit(drawn_rates(np.random.default_rng(seed), 60_000, noise), noise, np.inf)
+        assert found.hot is not None
+        pairs = ((found.mean, 2.0), (found.dsnu, 0.4), (found.hot_pixels, 0.004), (found.hot, 30.0))
+        pulls.append([(one.value - truth) / one.sigma for one, truth in pairs])
+    mean, spread = np.mean(pulls, axis=0), np.std(pulls, axis=0, ddof=1)
+    assert np.all(np.abs(mean) < 4 / np.sqrt(20))
+    assert np.all((spread > 0.5) & (spread < 1.6))
+
+
+def test_few_hot_pixels_are_counted() -> None:
+    noise = RateNoise(0.3, 0.01)
+    rates = drawn_rates(np.random.default_rng(7), 60_000, noise, hot=0.0)
+    rates[[5, 900, 40_000]] = 80.0
+    found = dark_current.fit(rates, noise, np.inf)
+    assert found.hot is None
+    assert found.hot_pixels.value == pytest.approx(3 / 60_000)
+    exact = stats.binomtest(3, 60_000).proportion_ci()
+    assert (found.hot_pixels.low, found.hot_pixels.high) == pytest.approx((exact.low, exact.high), rel=1e-6)
+
+
+def test_a_dark_current_below_the_noise_is_not_resolved() -> None:
+    rng, noise = np.random.default_rng(8), RateNoise(4.0, 0.01)
+    assert not dark_current.is_resolved(rng.normal(0.3, 2.0, 50_000), noise)
+    assert dark_current.is_resolved(drawn_rates(rng, 50_000, noise), noise)
+
+
+def test_the_light_s_distribution_is_no_prnu() -> None:
+    """A slope of 20 % over the flat, of which the polynomial leaves nothing."""
+    y, x = np.mgrid[0:96, 0:128]
+    image = 500 * (1 + 0.1 * (x - 64) / 64 - 0.06 * ((y - 48) / 48) ** 2)
+    trend = uniformity.smooth(image, np.ones(image.shape, bool))
+    np.testing.assert_allclose(trend, image, rtol=3e-4)  # means of a block are not its center's
+
+
+def test_propagation_of_errors_is_that_of_a_product() -> None:
+    covariance = np.array([[0.04, 0.01], [0.01, 0.09]])
+    value, sigma = propagate(lambda p: p[0] * p[1], np.array([2.0, 5.0]), covariance)
+    slope = np.array([5.0, 2.0])
+    assert value == pytest.approx(10)
+    assert sigma == pytest.approx(np.sqrt(slope @ covariance @ slope), rel=1e-6)
+
+
+def test_intervals_are_those_of_their_laws() -> None:
+    assert Estimate.normal(3.0, 0.5)[2:] == pytest.approx((3 - 0.5 * Z_95, 3 + 0.5 * Z_95))
+    assert Estimate.lognormal(3.0, 0.3)[2:] == pytest.approx((3 * np.exp(-0.1 * Z_95), 3 * np.exp(0.1 * Z_95)))
+    root = Estimate.root(9.0, 0.6)
+    assert root == pytest.approx((3.0, 0.1, np.sqrt(9 - 0.6 * Z_95), np.sqrt(9 + 0.6 * Z_95)))
+    assert Estimate.root(-1.0, 0.1).low == Estimate.root(-1.0, 0.1).high == 0
+    logistic = Estimate.logistic(-4.0, 0.2)
+    assert logistic.low == pytest.approx(1 / (1 + np.exp(4 + 0.2 * Z_95)))
+
+
+# Simulated chips
+
+
+@pytest.mark.slow
+def test_a_chip_comes_back_within_two_percent() -> None:
+    """All but the hot pixels and the columns, whose number on a chip limits them: those within 3 sigma."""
+    found = measured(400, 1, darks=16)
+    assert set(found.estimates) == {*CHIP} - {"quantum_efficiency", "bits", "dark_temperature_c"}
+    for key, one in found.estimates.items():
+        truth = float(CHIP[key])
+        if key in ("hot_pixels", "hot_e_s", "column_offset_e"):
+            assert abs(one.value - truth) < 3 * one.sigma, key
+        else:
+            assert one.value == pytest.approx(truth, rel=0.02), key
+    assert not found.remarks
+    assert 0.5 < found.transfer.misfit < 1.6
+
+
+@pytest.mark.slow
+def test_a_converter_that_ends_before_the_well_bounds_it() -> None:
+    found = measured(128, 2, full_well_e=30_000.0, gain_e_dn=2.0, nonlinearity=0.0)
+    assert found.estimates["full_well_e"].value == pytest.approx((4095 - 100) * 2.0, rel=0.02)
+    assert found.estimates["gain_e_dn"].value == pytest.approx(2.0, rel=0.03)
+
+
+@pytest.mark.slow
+def test_the_linearity_error_is_that_of_a_parabola() -> None:
+    found = measured(128, 3)
+    t = np.array([one for one in FLAT_S if 0.04 < one < 0.95])
+    x = np.minimum(t, 1.0) * (1 - 0.03 * np.minimum(t, 1.0))
+    slope, intercept = np.polyfit(t, x, 1, w=1 / x)
+    expected = np.mean(np.abs(x - slope * t - intercept) / (slope * t + intercept))
+    assert found.linearity_error == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.long
+def test_intervals_cover_the_truth_in_95_percent_of_400_cameras() -> None:
+    """128 x 128 pixels. A parameter's count is binomial, so 95 +- 2 % is asked of all together, 3.3 sigma of each."""
+    cameras = 400
+    covered: dict[str, list[bool]] = {}
+    for seed in range(cameras):
+        for key, one in measured(128, seed).estimates.items():
+            covered.setdefault(key, []).append(one.low <= float(CHIP[key]) <= one.high)
+    assert {len(one) for one in covered.values()} == {cameras}
+    share = {key: float(np.mean(one)) for key, one in covered.items()}
+    assert np.mean(list(share.values())) == pytest.approx(0.95, abs=0.02), share
+    assert min(share.values()) > 0.95 - 3.3 * np.sqrt(0.95 * 0.05 / cameras), share
+
+
+# Two samples
+
+
+@pytest.mark.slow
+def test_frames_of_the_measured_camera_are_indistinguishable_and_those_of_a_wrong_one_are_not() -> None:
+    """Another chip of the same preset: darks, warm darks and flats. Columns are the same along a column, so without."""
+    side, changes = 256, {"column_offset_e": 0.0}
+    found = measured(side, 11, darks=16, **changes).estimates
+    values = {key: max(one.value, 0.0) for key, one in found.items()} | changes
+    light = found["gain_e_dn"].value / CHIP["gain_e_dn"]  # the lamp as the flats measured it, not as it is
+
+    def numbers(config: DetectorConfig, shot: rendered.Shot, seed: int) -> Floats:
+        one = camera(side).model_copy(update={"detector": config})
+        return np.concatenate([frame.ravel() for frame in rendered.frames_of(one, shot, seed)]).astype(float)
+
+    true = DetectorConfig.model_validate(CHIP | changes | {"hardware_seed": 21})
+    ours = DetectorConfig.model_validate(CHIP | values | {"hardware_seed": 22})
+    wrong = ours.model_copy(update={"dsnu": 1.08 * ours.dsnu, "prnu": 1.2 * ours.prnu})
+    for kind, exposure_s, at_c, rate_e_s in (
+        ("darks", 20.0, 20.0, 0.0),
+        ("darks", 5.0, 32.0, 0.0),
+        ("flats", 0.5, 20.0, 8000.0),
+    ):
+        shot = rendered.Shot(kind, exposure_s, at_c, rate_e_s, 1)
+        measured_shot = shot._replace(light_e_s=rate_e_s * light)
+        same, other = (numbers(config, measured_shot, 5) for config in (ours, wrong))
+        assert histogram_p(numbers(true, shot, 4), same) > 0.01, (kind, at_c)
+        assert histogram_p(numbers(true, shot, 4), other) < 1e-3, (kind, at_c)
+
+
+def test_tracks_of_particles_are_neither_noise_nor_hot_pixels() -> None:
+    """Twelve tracks of six pixels in one dark of eight: as many pixels as would be hot, with a fivefold variance."""
+    rng, shape = np.random.default_rng(12), (96, 96)
+    frames = [np.rint(100 + rng.normal(0, 3, shape) + rng.poisson(20, shape)).astype(np.uint16) for _ in range(8)]
+    for x, y in rng.integers(0, 90, (12, 2)):
+        frames[3][y, x : x + 6] += 400
+    hit = level(10.0, None, frames)
+    usable = sensor.usable_pixels([hit])
+    assert 70 <= (~usable).sum() <= 76
+    assert hit.moments(usable).variance_dn2 == pytest.approx(9 + 20 + 1 / 12, rel=0.04)
+    assert hit.moments(np.ones(shape, bool)).variance_dn2 > 2 * 29

@@ -1,0 +1,200 @@
+"""`skysim balance`: the vehicle that MuJoCo moves is weighed and balanced; what cannot be weighed is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from estimator.calibration.mass_properties.record import BearingRecord, MassEstimate, Prior
+from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
+from skysim.core.types import Floats
+from skysim.dynamics import guidance, multibody
+from skysim.experiments.balance import assumptions, flight, observability, procedure, report
+from skysim.experiments.balance.procedure import Plan
+from skysim.experiments.configs import with_config
+from skysim.scene import loader
+from skysim.scene.scene import Scene
+from skysim.simulation.testbed import Testbed
+
+SIGMA_RAD = 5e-5
+UNCERTAINTY = assumptions.parse_uncertainty("10%", "500 um", "0.1%", "0.03 deg", 1.0)
+BALANCE = Plan("wheels", 8.0, 5e-5, 4, True)
+
+
+def noisy_truth(testbed: Testbed, watch: object) -> list[tuple[float, Rotation, Floats]]:
+    """The attitudes of a tracker of 10 arcsec, in place of rendered and solved frames: two a second."""
+    log, rng = testbed.log, random_stream(testbed.scene.seed, 999)
+    every = round(0.5 / log.period_s)
+    turned = Rotation.from_rotvec(SIGMA_RAD * rng.standard_normal((len(log.t_s[::every]), 3)))
+    attitudes = log.lab_from_body[::every] * turned
+    return [(float(t), one, SIGMA_RAD**2 * np.eye(3)) for t, one in zip(log.t_s[::every], attitudes, strict=True)]
+
+
+def scene_of(name: str, **overrides: str) -> Scene:
+    return loader.load(name, {key.replace("__", "."): value for key, value in overrides.items()})
+
+
+@pytest.mark.slow
+def test_table_is_balanced_below_the_published_torque(monkeypatch: pytest.MonkeyPatch) -> None:
+    """5e-5 N m (Bahu & Modenini 2020): MuJoCo's mass, center and inertia are the truth."""
+    monkeypatch.setattr(flight, "measured_attitudes", noisy_truth)
+    scene = scene_of("cubesat_table")
+    last = list(procedure.balance(scene, BALANCE, UNCERTAINTY))[-1]
+    assert last.true_torque_nm < 5e-5
+    assert last.torque_bound_nm <= 5e-5
+    result = report.statistics(scene.name, BALANCE, [last])
+    assert result["balanced"]
+    assert result["nees"] < chi2.ppf(0.9999, 9)
+    for row in result["estimates"][:3]:
+        assert row["estimate"] == pytest.approx(row["truth"], rel=0.01)
+    for row in result["estimates"][6:]:
+        assert row["estimate"] == pytest.approx(row["truth"], abs=1.0)
+
+
+@pytest.mark.slow
+def test_simsat_is_weighed_to_a_percent_and_a_micrometer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In-plane offset, without trim masses; NEES of the nine as their covariance says."""
+    monkeypatch.setattr(flight, "measured_attitudes", noisy_truth)
+    scene, plan = scene_of("simsat_slew"), replace(BALANCE, moves=False)
+    (one,) = procedure.balance(scene, plan, UNCERTAINTY)
+    rows = report.statistics(scene.name, plan, [one])
+    for row in rows["estimates"][:3]:
+        assert row["estimate"] == pytest.approx(row["truth"], rel=0.01)
+    for row in rows["estimates"][6:8]:
+        assert row["sigma"] < 0.33
+        assert row["estimate"] == pytest.approx(row["truth"], abs=1.0)
+    assert rows["nees"] < chi2.ppf(0.9999, 9)
+
+
+@pytest.mark.parametrize("name", ["simsat_slew", "cubesat_table"])
+def test_maneuver_stays_within_what_wheels_and_stop_allow(name: str) -> None:
+    scene = scene_of(name)
+    vehicle = multibody.build(scene.vehicle)
+    moved = flight.excited_by_wheels(scene, vehicle, 8.0)
+    reference = guidance.plan(moved.motion)
+    wheels = scene.vehicle.wheels
+    assert wheels is not None
+    inertia = np.linalg.eigvalsh(vehicle.inertia_kg_m2)[2]
+    states = [reference.state_at(t) for t in np.arange(0, reference.duration_s, 0.05)]
+    rates, accelerations = (np.array([state[n] for state in states]) for n in (1, 2))
+    capacity = vehicle.wheels.inertia_kg_m2.min() * wheels.speed_limit_rpm * 2 * np.pi / 60
+    assert inertia * np.linalg.norm(accelerations, axis=1).max() < 0.6 * wheels.torque_limit_nm
+    assert inertia * np.linalg.norm(rates, axis=1).max() < 0.6 * capacity
+    attitudes = Rotation.from_quat([state[0] for state in states], scalar_first=True)
+    assert multibody.tilt_deg(attitudes).max() == pytest.approx(7.3, abs=0.1)  # the sine fades in and out
+    turned = (attitudes[0].inv() * attitudes).as_rotvec()
+    assert np.degrees(np.abs(turned[:, 2]).max()) > 115
+
+
+def test_masses_go_where_the_moment_vanishes() -> None:
+    scene = scene_of("cubesat_table", vehicle__trim="{position: [1 mm, 2 mm, -3 mm], step: 0.001 um}")
+    vehicle = multibody.build(scene.vehicle)
+    moment = vehicle.mass.mass_kg * vehicle.mass.center_m
+    position_m = procedure.balanced_position_m(vehicle, moment, scene)
+    moved = multibody.build(with_config(scene, "vehicle.trim", position_m=tuple(position_m)).vehicle)
+    np.testing.assert_allclose(moved.mass.center_m, 0, atol=1e-10)
+    assert np.abs(position_m - vehicle.trims.position_m).max() > 1e-3
+    with pytest.raises(
+        InputError, match=r"trim_. would have to go to .* mm; allowed: vehicle.trim.travel 20 mm: first"
+    ):
+        procedure.balanced_position_m(vehicle, 10 * np.ones(3) * 1e-3, scene)
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides", "message"),
+    [
+        ("simsat_slew", {}, "vehicle.trim: none, so nothing can be moved; allowed: joints trim_"),
+        ("shefex2", {}, "vehicle.mount: a free vehicle has no bearing"),
+        ("tas2_vscmg", {}, "vehicle.cmgs: the stored momentum must be that of wheels"),
+        (
+            "cubesat_table",
+            {"vehicle.disturbances.cable": "{stiffness: 1e-4 N m / rad}"},
+            "vehicle.disturbances.cable: its",
+        ),
+    ],
+)
+def test_what_cannot_be_balanced_is_refused(name: str, overrides: dict[str, str], message: str) -> None:
+    with pytest.raises(InputError) as refused:
+        next(procedure.balance(loader.load(name, overrides), BALANCE, UNCERTAINTY))
+    assert str(refused.value).startswith(message)
+    assert "\n" not in str(refused.value)
+
+
+def record_of(rate_deg_s: float) -> BearingRecord:
+    """Yaw at a constant rate, level."""
+    t_s = np.arange(10.0)
+    attitudes = Rotation.from_rotvec(np.outer(np.radians(rate_deg_s) * t_s, [0, 0, 1]))
+    return BearingRecord(t_s, attitudes, np.tile(1e-9 * np.eye(3), (10, 1, 1)), t_s, np.zeros((10, 3)))
+
+
+def test_what_a_flight_has_not_shown_is_named_with_what_would_do() -> None:
+    """Information beyond the assumed grows with time and with the square of the motion."""
+    sigma = np.array([*[0.1] * 3, *[0.05] * 3, *[1e-3] * 3, *[1.0] * 11])
+    prior = Prior(np.array([1.0] * 3 + [0.0] * 17), sigma)
+    known = sigma.copy()
+    known[:9] = 1e-3, 1e-3, 0.04, *[1e-3] * 3, 1e-6, 1e-6, 1e-6
+
+    def refusal(sigmas: Floats) -> str:
+        estimate = MassEstimate(prior.values, np.diag(sigmas**2), 1.0)
+        with pytest.raises(InputError) as refused:
+            observability.check_observed(estimate, prior, [record_of(2.0)], 0.01, np.full(3, 1e-5))
+        return str(refused.value)
+
+    gained, needed = 0.04**-2 - 0.1**-2, 0.01**-2 - 0.1**-2
+    times = needed / gained
+    text = refusal(known)
+    assert text == (
+        f"balance: inertia about z is known to 4 %, not 1 %, after turns of 2 deg/s: turn"
+        f" {np.sqrt(times):.1f} times as far, or fly {times:.1f} times as long"
+    )
+    known[2], known[0] = 1e-3, 0.1
+    assert refusal(known) == (
+        "balance: inertia about x is known to 10 %, not 1 %, after no turn about it: a turn is needed that the wheels'"
+        " known momentum or a known trim weighs"
+    )
+    known[0], known[8] = 1e-3, 1e-3
+    assert refusal(known).startswith(
+        "balance: moment along z is known to 1000 g mm, not 10, after tilts of 0.0 deg: a tilt"
+    )
+    known[8] = 1e-6
+    estimate = MassEstimate(prior.values, np.diag(known**2), 1.0)
+    observability.check_observed(estimate, prior, [record_of(2.0)], 0.01, np.full(3, 1e-5))
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (("10", "500 um", "0.1%", "0.03 deg", 1.0), "--inertia-sigma 10: allowed: 0.001 to 0.5"),
+        (("10%", "5 s", "0.1%", "0.03 deg", 1.0), "--offset-sigma: '5 s' is not a length"),
+        (("10%", "1 m", "0.1%", "0.03 deg", 1.0), "--offset-sigma 1 m: allowed: 1e-07 to 0.01 m"),
+        (("10%", "1 mm", "0.1%", "0.03 deg", -1.0), "--tacho-sigma -1: allowed: 0 to 1000 rpm"),
+    ],
+)
+def test_wrong_uncertainties_are_refused(texts: tuple[str, str, str, str, float], message: str) -> None:
+    with pytest.raises(InputError) as refused:
+        assumptions.parse_uncertainty(*texts)
+    assert str(refused.value).startswith(message)
+
+
+def test_wrong_bars_are_refused() -> None:
+    for torque, offset, message in (
+        ("5 m", None, "--torque: '5 m' is not a torque"),
+        ("0 N m", None, "--torque 0 N m: allowed: above 0"),
+        ("1e-5 N m", "1 s", "--offset-bar: '1 s' is not a length"),
+    ):
+        with pytest.raises(InputError) as refused:
+            procedure.parse_bars(torque, 1.0, offset)
+        assert str(refused.value).startswith(message)
+    vehicle = multibody.build(scene_of("cubesat_table").vehicle)
+    weight = vehicle.mass.mass_kg * vehicle.gravity_m_s2
+    np.testing.assert_allclose(
+        procedure.parse_bars("4e-5 N m", 1.0, None).moment_kg_m(vehicle), 2e-5 / weight * vehicle.mass.mass_kg
+    )
+    np.testing.assert_allclose(
+        procedure.parse_bars("4e-5 N m", 1.0, "1 um").moment_kg_m(vehicle), 1e-6 * vehicle.mass.mass_kg
+    )
