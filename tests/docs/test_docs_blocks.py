@@ -42,6 +42,7 @@ LONG = {
     "findings/validation.md",
     "howto/build_a_dome.md",
     "howto/camera.md",
+    "howto/datasheet.md",
     "howto/cluster.md",
     "howto/dome.md",
     "howto/photo.md",

@@ -33,6 +33,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "skysim solve night.png --time 2012-06-22T21:00:00",
     ),
     "survey": ("skysim survey afit_simsat --frames 60 --checks 5 --out out/surveyed",),
+    "datasheet": ("skysim datasheet shefex2 --quick", "skysim datasheet afit_simsat --fields 200 --out out/afit_sheet"),
     "characterize": (
         "skysim characterize --camera imx264 --darks lab/darks --flats lab/flats",
         "skysim characterize --camera mine.yaml --frames-to out/lab",

@@ -68,9 +68,11 @@ class RandomAttitude(AttitudeRange):
     """A random attitude in every trial, and its noise.
 
     noise_seed : selects the noise at unchanged attitudes; as a factor it makes noise an input, as Sobol indices need
+    attitude_seed : selects the attitudes; at points of a paired study that have the same one they are the same
     """
 
     noise_seed: Annotated[int, Field(ge=0)] = 0
+    attitude_seed: Annotated[int, Field(ge=0)] = 0
 
 
 class AxisConfig(ConfigModel):
@@ -123,12 +125,17 @@ class FrameTrial(RandomAttitude):
     """One frame, rendered with all camera noise, then solved.
 
     rate_deg_s : rate about rate_axis
+    acceleration_deg_s2 : about the same axis, in the direction of the rate
+    turn_deg   : rotation about the same axis from the random attitude to that of the frame, such as rate times time in
+        a sequence of frames, or a fraction of a pixel
     rate_axis  : perpendicular: a random axis perpendicular to the boresight; boresight; or an axis of body or camera
     gyro : whether the tracker receives the streak vector of the stars
     """
 
     kind: Literal["frames"]
     rate_deg_s: NotNegative = 0.0
+    acceleration_deg_s2: NotNegative = 0.0
+    turn_deg: Number = 0.0
     rate_axis: RateAxis = "perpendicular"
     gyro: bool = False
 

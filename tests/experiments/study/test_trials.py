@@ -376,3 +376,38 @@ def test_a_flight_from_a_random_start_is_flown_from_there():
     (row,) = trials.run_segments(spec, (trials.Segment(0, {}, 0, range(1)),))
     assert row.error is None
     assert row.outcome.frames == 2
+
+
+def rendered(settings: dict[str, Any], seed: int = 5) -> Any:
+    """The truth of a frame trial of the shipped scene with stars."""
+    return trials.render_trial_frame(setups.prepared_setup(AT_REST, settings), seed)[1]
+
+
+AT_REST = TrialSpec("shefex2", ".", 1, {}, {"kind": "frames"}, True)
+
+
+def test_a_turn_is_about_the_rates_axis():
+    """By this angle across the boresight, the same axis at every angle; other attitudes have another seed."""
+    first, small, large = (rendered({"trial.turn_deg": turn}) for turn in (0.0, 0.5, 2.0))
+    turns = [(one.cam_from_lab * first.cam_from_lab.inv()).as_rotvec(degrees=True) for one in (small, large)]
+    assert np.linalg.norm(turns, axis=1) == pytest.approx([0.5, 2.0], rel=1e-9)
+    assert turns[0] * 4 == pytest.approx(turns[1], abs=1e-9)
+    assert turns[0][2] == pytest.approx(0, abs=1e-12)
+    moving = rendered({"trial.rate_deg_s": 1.0})
+    assert np.cross(moving.rate_cam_rad_s, turns[0]) == pytest.approx(0, abs=1e-12)
+    other = rendered({"trial.attitude_seed": 1})
+    assert (other.cam_from_lab * first.cam_from_lab.inv()).magnitude() > 0.1
+
+
+def test_accelerated_lights_are_seen_where_the_law_puts_them():
+    """From rest at mid-exposure they move by a t^2 / 2: their mean is a T^2 / 24 away, and they are a T^2 / 8 long."""
+    acceleration, time_s = 200.0, 0.04
+    truth = rendered({"trial.acceleration_deg_s2": acceleration})
+    focal_px = 25e-3 / 9.9e-6
+    sources = truth.sources
+    near = np.hypot(*(sources.xy_px - [329, 246]).T) < 150  # where the image's scale is that of the center
+    lag_px = np.hypot(*(sources.flux_xy_px - sources.xy_px)[near].T)
+    bend_px = np.radians(acceleration) * time_s**2 * focal_px
+    assert near.sum() >= 3
+    assert lag_px == pytest.approx(bend_px / 24, rel=0.03)
+    assert np.linalg.norm(truth.rate_cam_rad_s) == pytest.approx(0, abs=1e-12)

@@ -134,7 +134,8 @@ def streams(setup: Setup, seed: int) -> tuple[np.random.Generator, np.random.Gen
     """Random generators of a trial's attitude and of its noise; `noise_seed` changes the noise only."""
     trial = setup.trial
     assert isinstance(trial, CentroidTrial | FrameTrial)
-    return random_stream(seed, 0), random_stream(seed, 1, trial.noise_seed)
+    attitude = (0, trial.attitude_seed) if trial.attitude_seed else (0,)
+    return random_stream(seed, *attitude), random_stream(seed, 1, trial.noise_seed)
 
 
 def run_frame_trial(setup: Setup, seed: int) -> Outcome:
@@ -251,10 +252,14 @@ def render_trial_frame(setup: Setup, seed: int) -> tuple[Frame, Truth, tuple[flo
     middle = random_attitude(setup, attitude_rng)
     axis_cam = rate_axis(trial.rate_axis, attitude_rng.uniform(0, 2 * math.pi), testbed.mount)
     rate_cam = math.radians(trial.rate_deg_s) * axis_cam
-    rate_body = testbed.mount.cam_from_body.inv().apply(rate_cam)
-    frame, truth = exposure.render_frame(
-        replace(testbed, trajectory=constant_rate(testbed.scene, middle, rate_body)), 0
+    body_from_cam = testbed.mount.cam_from_body.inv()
+    rate_body, turn_body, acceleration_body = (
+        body_from_cam.apply(math.radians(value) * axis_cam)
+        for value in (trial.rate_deg_s, trial.turn_deg, trial.acceleration_deg_s2)
     )
+    middle = middle * Rotation.from_rotvec(turn_body)
+    trajectory = constant_acceleration(testbed.scene, middle, rate_body, acceleration_body)
+    frame, truth = exposure.render_frame(replace(testbed, trajectory=trajectory), 0)
     streak_px = exposure_window(testbed.scene, 0).exposure_s * testbed.scene.camera.focal_px
     # For a star on the boresight: d(x / z)/dt = -w_y, d(y / z)/dt = w_x.
     return frame, truth, (-rate_cam[1] * streak_px, rate_cam[0] * streak_px) if trial.gyro else None
@@ -277,7 +282,17 @@ def rate_axis(axis: str | AxisConfig, azimuth_rad: float, mount: Mount) -> Float
 
 def constant_rate(scene: Scene, middle: Rotation, rate_body: Floats) -> Trajectory:
     """A trajectory around the first frame's exposure: lab_from_body `middle` at mid-exposure, and a constant rate."""
+    return constant_acceleration(scene, middle, rate_body, np.zeros(3))
+
+
+def constant_acceleration(scene: Scene, middle: Rotation, rate_body: Floats, acceleration_body: Floats) -> Trajectory:
+    """A trajectory around the first frame's exposure, with the attitude and the rate `rate_body` at mid-exposure.
+
+    The acceleration is along the rate or there is no rate: the rotation vector is rate t + acceleration t^2 / 2.
+    """
     window, rows = exposure_window(scene, 0), scene.camera.height_px
     t_s = np.linspace(window.open_s - MARGIN_S, window.close_s(rows) + MARGIN_S, KNOTS)
-    rotation = Rotation.from_rotvec(np.outer(t_s - window.middle_s(rows), rate_body))
-    return Trajectory(t_s, middle * rotation, np.tile(rate_body, (KNOTS, 1)))
+    since_s = t_s - window.middle_s(rows)
+    turned = np.outer(since_s, rate_body) + np.outer(since_s**2 / 2, acceleration_body)
+    rate = rate_body + np.outer(since_s, acceleration_body)
+    return Trajectory(t_s, middle * Rotation.from_rotvec(turned), rate)

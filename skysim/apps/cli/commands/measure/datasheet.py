@@ -1,0 +1,93 @@
+"""Command `skysim datasheet`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from skysim.apps.cli.options import Json, OpenReport, Overrides, SceneArg, Seed, load
+from skysim.apps.cli.terminal import print_json, print_table, print_wrapped, trial_progress
+from skysim.core.errors import InputError
+
+if TYPE_CHECKING:
+    from skysim.experiments.datasheet.statement import Statement
+
+
+def datasheet(
+    scene: SceneArg,
+    quick: Annotated[bool, typer.Option("--quick", help="Smaller experiments; the intervals are wider.")] = False,
+    fields: Annotated[
+        int | None,
+        typer.Option(min=2, help="Number of fields (attitudes) of each experiment; more narrow the intervals."),
+    ] = None,
+    seed: Seed = None,
+    set_: Overrides = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; default: number of cores.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output folder; default: out/NAME_datasheet.")] = None,
+    markdown: Annotated[
+        Path | None, typer.Option(help="Also write a Markdown page, as docs/findings/datasheets/shefex2.md.")
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            help="Also write a fast model of the errors to a folder: a module for NumPy, its constants in JSON."
+        ),
+    ] = None,
+    fmu: Annotated[
+        bool, typer.Option("--fmu", help="With --model: also as a co-simulation unit of FMI 3 (needs pythonfmu3).")
+    ] = False,
+    open_: OpenReport = False,
+    json: Json = False,
+) -> None:
+    """State the performance of a scene's star tracker: error terms, probabilities, limits, robustness.
+
+    Stopped or killed, it goes on where it was when it is called again.
+    """
+    from skysim.core.io.yaml_reader import parse_overrides
+    from skysim.experiments.datasheet import page, run
+    from skysim.experiments.datasheet.model import export, fit
+    from skysim.experiments.datasheet.statement import numbers, state
+
+    if fmu and model is None:
+        raise InputError("--fmu: has no effect without --model; allowed: --model FOLDER --fmu")
+    if fmu:
+        export.require_fmu_builder()
+    loaded = load(scene, None, seed, set_)
+    overrides = parse_overrides(set_) | ({} if seed is None else {"seed": str(seed)})
+    folder = out or Path("out") / f"{loaded.name}_datasheet"
+    with ExitStack() as stack:
+
+        def watch(trials: int) -> Callable[[Any], Any]:
+            return stack.enter_context(trial_progress(f"datasheet of {loaded.name}", trials))
+
+        sheet = run.measure(scene, loaded, overrides, folder, quick=quick, fields=fields, workers=workers, watch=watch)
+    statement = state(sheet)
+    paths = page.write_all(folder, statement, quick)
+    if markdown:
+        page.write_markdown(markdown, statement, quick)
+    if model:
+        written = export.write_model(model, fit.constants(sheet)) + ([export.write_fmu(model)] if fmu else [])
+    if json:
+        print_json(numbers(statement))
+    else:
+        print_statement(statement)
+        print(f"report: {paths['report']}")
+        for path in written if model else ():
+            print(path)
+    if open_:
+        typer.launch(str(paths["report"]))
+
+
+def print_statement(statement: Statement) -> None:
+    """Print the sections of the terms, of their causes and of the probabilities; the report has the others."""
+    from skysim.experiments.datasheet.statement import sections
+
+    for section in sections(statement)[:3]:
+        print_table(section.title, section.headers, section.rows)
+        for text in section.texts:
+            print_wrapped(text)
+        print()

@@ -1,0 +1,284 @@
+"""The experiments of a datasheet as one study: each cell sets keys of the scene and of the trial, in the same fields.
+
+A field is a replicate: a random attitude, the same in all cells whose `attitude_seed` is the same. A cell draws units,
+thermal state, attitude and noise by number, so that terms can be told apart and causes compared on the same frames.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from skysim.camera import thermal
+from skysim.core.errors import InputError
+from skysim.experiments.study.factors import Settings
+from skysim.experiments.study.loader import has_survey_errors
+from skysim.scene.scene import BODIES_YEARS, Scene
+from skysim.scene.sections.layouts import OnPoints
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
+
+SCAN_PX = 3.37  # from one attitude of a field to the next: other phases in the pixels, the same stars
+STREAKS_PX = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # of the rates
+SEQUENCE = (0, 1, 2, 3, 5, 8, 13, 21)  # frames of a sequence at a constant rate
+SEQUENCE_RATES = 4  # beside rest, the slowest ones
+FAINTER = (-1.0, -0.5, 0.5)  # magnitudes by which the limit of the tracker's catalog is varied
+FALSE_STARS_PX, TRUE_STARS = 0.05, 20  # error and number of the centroids beside which false ones are drawn
+BENDS_PX = (1.0, 4.0, 16.0, 64.0)  # acceleration times the exposure time's square
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Numbers of fields, of units, of thermal states, of attitudes and frames in a field, and of independent draws.
+
+    draws : cells in which all is drawn anew in the fields of the terms;  sky : likewise with new attitudes
+    pairs : cells with all drawn anew to compare a cause with
+    """
+
+    fields: int
+    units: int
+    states: int
+    attitudes: int
+    frames: int
+    draws: int
+    sky: int
+    pairs: int
+
+
+QUICK = Size(fields=60, units=2, states=3, attitudes=2, frames=2, draws=8, sky=8, pairs=2)
+FULL = Size(fields=300, units=4, states=4, attitudes=3, frames=2, draws=24, sky=24, pairs=4)
+
+
+class Cell(NamedTuple):
+    """One cell: its experiment, its levels there, and its settings."""
+
+    experiment: str
+    levels: dict[str, Any]
+    settings: Settings
+
+    @property
+    def name(self) -> str:
+        """The name of its level in the study."""
+        return " ".join([self.experiment, *(f"{key} {value}" for key, value in self.levels.items())])
+
+
+class Draw(NamedTuple):
+    """Numbers of the unit, thermal state and attitude in the field; the noise is another one in every cell."""
+
+    unit: int = 0
+    state: int = 0
+    attitude: int = 0
+
+
+def check_scene(scene: Scene) -> None:
+    """Raise InputError for a scene whose tracker gives no attitude for a single frame."""
+    if isinstance(scene.light, CollimatedDisplayConfig):
+        raise InputError("light.kind: collimated_display has one field only; allowed: stars, dome")
+    if scene.tracker.decoder:
+        raise InputError(
+            "tracker.decoder: gives no attitude for one frame; allowed: none (--set tracker.decoder=null and"
+            " --set light.led.code=null)"
+        )
+    if scene.tracker.exposure_control:
+        raise InputError(
+            "tracker.exposure_control: the frames of a datasheet have one exposure time; allowed: none (--set"
+            " tracker.exposure_control=null)"
+        )
+
+
+def unit_seeds(scene: Scene) -> list[str]:
+    """Keys of the seeds that make another unit: chip, survey, LEDs."""
+    chip = scene.camera.detector
+    seeds = (
+        ["camera.detector.hardware_seed"] if chip.prnu or chip.dsnu or chip.hot_pixels or chip.column_offset_e else []
+    )
+    seeds += ["tracker.survey.seed"] if has_survey_errors(scene) and not scene.tracker.map else []
+    layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
+    points, prefix = (layout.points, ".points") if isinstance(layout, OnPoints) else (layout, "")
+    seeds += [f"light.layout{prefix}.hardware_seed"] if hasattr(points, "hardware_seed") else []
+    return seeds
+
+
+def states_c(scene: Scene, count: int) -> list[float]:
+    """Temperatures of `count` thermal states: the scene's own history at equal steps; none without the section.
+
+    The history is a period of a sine, a table from its first to its last time, or a day.
+    """
+    config = scene.thermal
+    if config is None:
+        return []
+    history = config.temperature
+    hours = np.linspace(0, getattr(history, "period_s", 86_400.0) / 3600, count, endpoint=False)
+    if history.kind == "table":
+        hours = np.linspace(history.hours[0], history.hours[-1], count)
+    if history.kind == "steady":
+        hours = hours[:1]
+    return [float(thermal.TEMPERATURES[history.kind](history, hour)) for hour in hours]
+
+
+class Designer:
+    """Makes the cells of a scene."""
+
+    def __init__(self, scene: Scene, size: Size) -> None:
+        self.scene, self.size = scene, size
+        self.seeds, self.temperatures_c = unit_seeds(scene), states_c(scene, size.states)
+        self.pixel_deg = math.degrees(1 / scene.camera.focal_px)
+        self.under_stars = isinstance(scene.light, StarsConfig)
+        self.noise = 0
+
+    @property
+    def units(self) -> int:
+        """Number of units; 1 if all units of the scene are equal."""
+        return self.size.units if self.seeds else 1
+
+    @property
+    def states(self) -> int:
+        """Number of thermal states."""
+        return max(len(self.temperatures_c), 1)
+
+    def settings(self, draw: Draw, turn_deg: float = 0.0) -> Settings:
+        """Settings of a draw, with new noise. turn_deg : in addition to that of the draw's attitude"""
+        self.noise += 1
+        chosen: Settings = {key: 1000 + draw.unit for key in self.seeds}
+        if self.temperatures_c:
+            temperature_c = self.temperatures_c[draw.state % self.states]
+            chosen["thermal.temperature"] = {"kind": "steady", "temperature_c": temperature_c}
+        turn_deg += draw.attitude * SCAN_PX * self.pixel_deg
+        return chosen | {"trial.noise_seed": self.noise, "trial.turn_deg": turn_deg}
+
+    def independent(self, number: int) -> Draw:
+        """A draw that shares nothing but the field with those of other numbers, and none with those of the terms."""
+        return Draw(100 + number, number, 10 + number)
+
+    def cells(self) -> Iterator[Cell]:
+        """All cells, in the order in which they are run."""
+        yield from self.terms()
+        yield from self.draws("total", self.size.draws)
+        for number in range(self.size.sky):
+            settings = self.settings(self.independent(200 + number)) | {"trial.attitude_seed": 1 + number}
+            yield Cell("sky", {"draw": number}, settings)
+        yield from self.rates()
+        yield from self.sequences()
+        yield from self.accelerations()
+        yield from self.magnitudes()
+        for name, change in self.causes().items():
+            yield from self.draws("cause", self.size.pairs, change, cause=name)
+        for name, change in self.disturbances().items():
+            yield from self.draws("disturbance", 1, change, disturbance=name)
+
+    def terms(self) -> Iterator[Cell]:
+        """The crossed and nested design of `components`."""
+        for unit in range(self.units):
+            for state in range(self.states):
+                for attitude in range(self.size.attitudes):
+                    for frame in range(self.size.frames):
+                        levels = {"unit": unit, "state": state, "attitude": attitude, "frame": frame}
+                        yield Cell("terms", levels, self.settings(Draw(unit, state, attitude)))
+
+    def draws(self, experiment: str, count: int, change: Settings | None = None, **levels: str) -> Iterator[Cell]:
+        """Independent draws; with a change the same as without it, noise included, so that they can be compared."""
+        for number in range(count):
+            settings = self.settings(self.independent(number)) | {"trial.noise_seed": 10_000 + number}
+            settings |= change or {}
+            if settings.get("trial.kind") == "centroids":
+                del settings["trial.turn_deg"]
+            yield Cell(experiment, {**levels, "draw": number}, settings)
+
+    @property
+    def rates_deg_s(self) -> list[float]:
+        """Rates whose streaks are as long as STREAKS_PX, to two digits."""
+        per_px = self.pixel_deg / self.scene.exposure.time_s
+        return [float(f"{streak * per_px:.2g}") for streak in STREAKS_PX]
+
+    def rates(self) -> Iterator[Cell]:
+        """At each rate two frames of each attitude that differ in their noise alone."""
+        for rate in self.rates_deg_s:
+            for frame in range(2):
+                yield Cell(
+                    "rate", {"rate_deg_s": rate, "frame": frame}, self.settings(Draw()) | {"trial.rate_deg_s": rate}
+                )
+
+    def sequences(self) -> Iterator[Cell]:
+        """Frames of one unit at the scene's frame rate, at rest and at constant rates."""
+        for rate in (0.0, *self.rates_deg_s[:SEQUENCE_RATES]):
+            for step in SEQUENCE:
+                settings = self.settings(Draw(), rate * step / self.scene.exposure.rate_hz)
+                yield Cell("sequence", {"rate_deg_s": rate, "step": step}, settings | {"trial.rate_deg_s": rate})
+
+    def accelerations(self) -> Iterator[Cell]:
+        """One frame of each attitude at accelerations with no rate at mid-exposure."""
+        for bend in BENDS_PX:
+            acceleration = float(f"{bend * self.pixel_deg / self.scene.exposure.time_s**2:.2g}")
+            change = {"trial.acceleration_deg_s2": acceleration}
+            yield Cell("acceleration", {"acceleration_deg_s2": acceleration}, self.settings(Draw()) | change)
+
+    def magnitudes(self) -> Iterator[Cell]:
+        """Pairs of frames with other limits of the tracker's catalog, under the stars."""
+        if not self.under_stars:
+            return
+        for step in (0.0, *FAINTER):
+            limit = self.scene.tracker.limit_mag + step
+            for frame in range(2):
+                settings = self.settings(Draw()) | {"tracker.limit_mag": limit}
+                yield Cell("magnitude", {"limit_mag": limit, "frame": frame}, settings)
+
+    def causes(self) -> dict[str, Settings]:
+        """What would lower the error, as changes of the scene; those that it has no use for are left out."""
+        camera, chip, survey = self.scene.camera, self.scene.camera.detector, self.scene.tracker.survey
+        exposure, period_s = self.scene.exposure, 1 / self.scene.exposure.rate_hz
+        changes: dict[str, Settings] = {
+            "twice the light (aperture)": {"camera.f_number": camera.f_number / math.sqrt(2)}
+        }
+        if 2 * exposure.time_s + exposure.trigger_jitter_s <= period_s:
+            changes["twice the exposure time"] = {"exposure.time": f"{2 * exposure.time_s} s"}
+        if chip.read_noise_e:
+            changes["half the read noise"] = {"camera.detector.read_noise_e": chip.read_noise_e / 2}
+        if chip.prnu or chip.dsnu or chip.hot_pixels or chip.column_offset_e:
+            none = ("prnu", "dsnu", "hot_pixels", "column_offset_e")
+            changes["no fixed pattern"] = {f"camera.detector.{key}": 0 for key in none}
+        if chip.cti_parallel or chip.cti_serial:
+            changes["no transfer loss"] = {"camera.detector.cti_parallel": 0, "camera.detector.cti_serial": 0}
+        if survey.lever_sigma_m:
+            changes["the lever known"] = {"tracker.survey.lever_sigma": "0 mm"}
+        if survey.led_sigma_m or survey.instrument:
+            changes["the LEDs' map known"] = {"tracker.survey.led_sigma": "0 mm", "tracker.survey.instrument": None}
+        if survey.focal_length_sigma_m:
+            changes["the focal length known"] = {"tracker.survey.focal_length_sigma": "0 mm"}
+        if self.scene.thermal:
+            reference = {"kind": "steady", "temperature_c": self.scene.thermal.reference_c}
+            changes["the temperature held"] = {"thermal.temperature": reference}
+        if self.under_stars:
+            changes["half a magnitude more stars known"] = {"tracker.limit_mag": self.scene.tracker.limit_mag + 0.5}
+        return changes
+
+    def disturbances(self) -> dict[str, Settings]:
+        """Disturbances that the scene supports, beyond its own."""
+        chip, exposure_s = self.scene.camera.detector, self.scene.exposure.time_s
+        hot = {"camera.detector.hot_e_s": max(chip.hot_e_s, 1000.0)}
+        own = self.scene.model_dump(mode="json", by_alias=True)["background"]
+        found: dict[str, Settings] = {
+            "protons, 1e3 /cm²/s": {"camera.detector.particles": [{"per_cm2_s": 1e3}]},
+            "protons, 1e4 /cm²/s": {"camera.detector.particles": [{"per_cm2_s": 1e4}]},
+            "hot pixels, 0.1 %": {"camera.detector.hot_pixels": 1e-3} | hot,
+            "hot pixels, 1 %": {"camera.detector.hot_pixels": 1e-2} | hot,
+            "stray light, 100 e- a pixel": {"background": [*own, {"kind": "uniform", "e_s": 100 / exposure_s}]},
+            "stray light, 1000 e- a pixel": {"background": [*own, {"kind": "uniform", "e_s": 1000 / exposure_s}]},
+        }
+        if not self.under_stars:
+            return found
+        for count in (5, 20):
+            centroids = {"trial.kind": "centroids", "trial.noise_px": FALSE_STARS_PX, "trial.lights": TRUE_STARS}
+            found[f"false stars, {count} among {TRUE_STARS} true"] = centroids | {"trial.false_lights": count}
+        if BODIES_YEARS[0] <= self.scene.start_time.year <= BODIES_YEARS[1]:
+            near = {"trial.near": {"body": "moon", "off_deg": [0, float(f"{self.half_field_deg:.2g}")]}}
+            found["Moon in the field"] = near | {"light.bodies": {}}
+        return found
+
+    @property
+    def half_field_deg(self) -> float:
+        """Half of the field's smaller side."""
+        side_px = min(self.scene.camera.width_px, self.scene.camera.height_px)
+        return math.degrees(math.atan(side_px / 2 / self.scene.camera.focal_px))

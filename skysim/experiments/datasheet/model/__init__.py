@@ -1,0 +1,1 @@
+"""A measurement model from a datasheet: attitude errors without frames, for simulations of others."""

@@ -1,0 +1,123 @@
+"""Fit the constants of a measurement model to the frames of a datasheet."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from skysim.core.types import Floats
+from skysim.experiments.datasheet.components import components, effects, mean_known
+from skysim.experiments.datasheet.model.errors import AXES
+from skysim.experiments.datasheet.run import Sheet
+from skysim.experiments.datasheet.terms import GROUPS, term_errors
+
+GRID = 60  # correlation angles that are tried
+LEAST_NOISE = 0.05  # of the mean square at a rate: noise below it is not told from the slow terms
+
+
+def constants(sheet: Sheet) -> dict[str, Any]:
+    """The constants of `errors.ErrorModel` for the scene of a datasheet."""
+    errors, _ = term_errors(sheet)
+    found = [components(one) for one in errors]
+    field, pixel = (np.sqrt(np.maximum([getattr(one, name) for one in found], 0)) for name in ("field", "pixel"))
+    bias = [bias_terms(one) for one in errors]
+    across, about = (log_scale(*field_variances(sheet, axes)) for axes in GROUPS.values())
+    rates, squares = squares_by_rate(sheet)
+    slow = np.array([one[0] ** 2 for one in bias]) + field**2 + pixel**2
+    noise = np.sqrt(np.maximum(squares - slow, LEAST_NOISE * squares))
+    rest = np.sqrt([one.temporal for one in found])
+    return {
+        "scene": sheet.scene.name,
+        "axes": list(AXES),
+        "mean": [one[0] for one in bias],
+        "unit": [one[1] for one in bias],
+        "field": field.tolist(),
+        "pixel": pixel.tolist(),
+        "scale": [across, across, about],
+        "field_deg": field_angle_deg(sheet, field, pixel, [one[0] for one in bias]),
+        "pixel_deg": sheet.designer.pixel_deg,
+        "scale_deg": sheet.designer.half_field_deg,
+        "rates_deg_s": rates,
+        "noise": [rest.tolist(), *noise[1:].tolist()],
+    }
+
+
+def bias_terms(errors: Floats) -> tuple[float, float]:
+    """Mean and standard deviation among units of the (fields, units, states, attitudes, frames) errors of one axis."""
+    means = errors.mean(axis=(3, 4))
+    present = [axis for axis in range(3) if means.shape[axis] > 1]
+    scatter = effects(means, present).get((1,), 0.0)
+    return float(errors.mean()), math.sqrt(max(scatter, 0.0))
+
+
+def log_scale(first: Floats, second: Floats) -> float:
+    """Standard deviation of the logarithm of a field's noise variance, from two estimates of it in each of (F,) fields.
+
+    A lognormal variance has E[v^2] / E[v]^2 = exp(scale^2). The estimates are of other frames, so their errors are
+    independent and the mean of their product is E[v^2].
+    """
+    ratio = float(np.mean(first * second) / (first.mean() * second.mean()))
+    return math.sqrt(math.log(max(ratio, 1.0)))
+
+
+def field_variances(sheet: Sheet, axes: slice) -> tuple[Floats, Floats]:
+    """Two estimates of the noise variance in each field: of the terms' frames, and of the sequence at rest."""
+    errors, solved = term_errors(sheet)
+    terms = np.var(errors[axes], axis=-1, ddof=1).mean(axis=(0, 2, 3, 4))
+    rest = sequences(sheet, 0.0)[1][axes][:, :, solved]
+    known = np.isfinite(rest).all(axis=(0, 1))
+    return terms[known], np.var(rest[:, :, known], axis=1, ddof=1).mean(axis=0)
+
+
+def sequences(sheet: Sheet, rate_deg_s: float) -> tuple[list[int], Floats]:
+    """Steps and (3, steps, fields) errors of the sequences at one rate."""
+    rows = sheet.rows("sequence", rate_deg_s=rate_deg_s)
+    return [sheet.cells[row].levels["step"] for row in rows], sheet.errors(rows)
+
+
+def squares_by_rate(sheet: Sheet) -> tuple[list[float], Floats]:
+    """Rates, and (rates, 3) mean squares of the errors: of the sequences, and of the faster pairs of frames."""
+    sequenced = sheet.levels("sequence", "rate_deg_s")
+    faster = [rate for rate in sheet.levels("rate", "rate_deg_s") if rate > max(sequenced)]
+    errors = [sequences(sheet, rate)[1] for rate in sequenced]
+    errors += [sheet.errors(sheet.rows("rate", rate_deg_s=rate)) for rate in faster]
+    return [*sequenced, *faster], np.array([mean_known(one**2, (1, 2)) for one in errors])
+
+
+def lagged(sheet: Sheet, mean: list[float]) -> tuple[Floats, Floats]:
+    """Angles in degrees between frames of the sequences, and the products of their errors over the axes' mean squares.
+
+    (M,) each, the mean over the fields and the axes across the boresight, without the mean error.
+    """
+    angles, products = [], []
+    for rate in sheet.levels("sequence", "rate_deg_s"):
+        steps, errors = sequences(sheet, rate)
+        errors = errors[:2] - np.array(mean)[:2, None, None]
+        square = mean_known(errors**2)
+        for first in range(len(steps)):
+            for second in range(first + 1, len(steps)):
+                apart = steps[second] - steps[first]
+                angles.append(rate * apart / sheet.scene.exposure.rate_hz)
+                products.append(mean_known(errors[:, first] * errors[:, second]) / square)
+    return np.array(angles), np.array(products)
+
+
+def field_angle_deg(sheet: Sheet, field: Floats, pixel: Floats, mean: list[float]) -> float:
+    """The correlation angle of the field term: that with the least squares of the lagged products.
+
+    They are fitted by a exp(-angle / field_deg) + b exp(-angle / pixel_deg) with a : b as the terms at rest; between a
+    pixel and four fields.
+    """
+    angles, products = lagged(sheet, mean)
+    pixel_deg, weight = sheet.designer.pixel_deg, float(np.sum(field[:2] ** 2))
+    total = weight + float(np.sum(pixel[:2] ** 2))
+    trials = np.geomspace(pixel_deg, 8 * sheet.designer.half_field_deg, GRID)
+    if not total:
+        return float(trials[-1])
+    shapes = [
+        (weight * np.exp(-angles / angle) + (total - weight) * np.exp(-angles / pixel_deg)) / total for angle in trials
+    ]
+    left = [float(np.sum((products - shape * (shape @ products) / (shape @ shape)) ** 2)) for shape in shapes]
+    return float(trials[int(np.argmin(left))])

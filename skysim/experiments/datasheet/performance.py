@@ -1,0 +1,178 @@
+"""Performance of a tracker: probabilities with exact bounds, quantiles, and limits in rate, acceleration, magnitude."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from skysim.core.types import Floats
+from skysim.experiments.datasheet.components import mean_known
+from skysim.experiments.datasheet.run import Sheet
+from skysim.experiments.datasheet.terms import GROUPS, rms
+from skysim.results import metrics
+from skysim.results.metrics import Summary
+
+CLAIMS = (0.95, 0.99, 0.997)  # probabilities of a right attitude
+LEVELS = (0.683, 0.954, 0.997)  # of the quantiles
+LIMIT = 0.95  # probability of a right attitude that bounds a rate or an acceleration
+
+
+class Counts(NamedTuple):
+    """Numbers of frames: all, with a right attitude, refused, and with a false one."""
+
+    frames: int
+    right: int
+    refused: int
+    false: int
+
+    def share(self, kind: str) -> Summary:
+        """The share of one kind with its exact one-sided bounds, each at 95 % (Clopper & Pearson 1934)."""
+        hits = getattr(self, kind)
+        return Summary(hits / self.frames, *metrics.exact_bounds(hits, self.frames), self.frames)
+
+
+def counts(sheet: Sheet, rows: list[int]) -> Counts:
+    """The outcomes of some cells."""
+    right, false = sheet.right(rows), sheet.false(rows)
+    return Counts(right.size, int(right.sum()), int((~right & ~false).sum()), int(false.sum()))
+
+
+def runs_needed(share: float, failures: int = 0, confidence: float = metrics.CONFIDENCE) -> int:
+    """Fewest runs with so many failures that show a probability of success of `share` at this confidence.
+
+    Without a failure n = ln(1 - c) / ln(share), rounded up; with failures the n whose exact upper bound of the
+    probability of a failure is 1 - share.
+    """
+    low = metrics.trials_for_bound(1 - share, confidence)
+    if not failures:
+        return low
+    high = low
+    while metrics.exact_bounds(failures, high, confidence)[1] > 1 - share:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (
+            (middle, high) if metrics.exact_bounds(failures, middle, confidence)[1] > 1 - share else (low, middle)
+        )
+    return high
+
+
+def claims(found: Counts) -> list[dict[str, Any]]:
+    """Which probabilities of a right attitude the frames show, and how many more they need if none of those fails."""
+    failures = found.frames - found.right
+    return [
+        {
+            "share": share,
+            "shown": found.share("right").low >= share,
+            "runs": found.frames,
+            "failures": failures,
+            "without_failure": runs_needed(share),
+            "more": max(runs_needed(share, failures) - found.frames, 0),
+        }
+        for share in CLAIMS
+    ]
+
+
+def quantiles(sheet: Sheet) -> list[dict[str, Any]]:
+    """Quantiles of the errors' magnitude over independent frames, with intervals between order statistics."""
+    errors = sheet.errors(sheet.rows("sky")).reshape(3, -1)
+    errors = errors[:, np.isfinite(errors).all(axis=0)]
+    sizes = {"across": np.hypot(errors[0], errors[1]), "about": np.abs(errors[2])}
+    return [
+        {"level": level, **{name: metrics.quantile(values, level) for name, values in sizes.items()}}
+        for level in LEVELS
+    ]
+
+
+def noise_equivalent_angle(first: Floats, second: Floats) -> float:
+    """Standard deviation of the temporal noise, rms(a - b) / sqrt(2), from pairs of frames that differ in noise."""
+    return float(np.sqrt(mean_known((first - second) ** 2) / 2))
+
+
+def pair_row(sheet: Sheet, rows: list[int]) -> dict[str, Any]:
+    """Outcomes, temporal noise and rms error about one axis of a pair of cells, arcseconds."""
+    first, second = (sheet.errors([row]) for row in rows[:2])
+    return {
+        "counts": counts(sheet, rows),
+        **{f"nea_{name}": noise_equivalent_angle(first[axes], second[axes]) for name, axes in GROUPS.items()},
+        **{f"rms_{name}": rms(sheet, rows, axes) for name, axes in GROUPS.items()},
+    }
+
+
+def by_rate(sheet: Sheet) -> list[dict[str, Any]]:
+    """Noise-equivalent angle, error and outcomes by rate; that at rest is of the terms' first attitude."""
+    rest = sheet.rows("terms", unit=0, state=0, attitude=0)
+    rates = sheet.levels("rate", "rate_deg_s")
+    found = [{"rate_deg_s": 0.0, "streak_px": 0.0, **pair_row(sheet, rest)}]
+    for rate in rates:
+        rows = sheet.rows("rate", rate_deg_s=rate)
+        streak_px = float(mean_known(sheet.column("streak_px", rows)))
+        found.append({"rate_deg_s": rate, "streak_px": streak_px, **pair_row(sheet, rows)})
+    return found
+
+
+def by_magnitude(sheet: Sheet) -> list[dict[str, Any]]:
+    """The same by the limit of the tracker's catalog; empty under a dome."""
+    return [
+        {"limit_mag": limit, **pair_row(sheet, sheet.rows("magnitude", limit_mag=limit))}
+        for limit in sorted(sheet.levels("magnitude", "limit_mag"))
+    ]
+
+
+def by_acceleration(sheet: Sheet) -> list[dict[str, Any]]:
+    """Error and outcomes by acceleration, beside the error that the streaks' asymmetry predicts.
+
+    From no rate at mid-exposure all lights move by a t^2 / 2, to one side. Their mean is a T^2 / 24 away from where
+    they are at mid-exposure, so the attitude errs by this angle about the axis of the motion.
+    """
+    found = []
+    for acceleration in sheet.levels("acceleration", "acceleration_deg_s2"):
+        rows = sheet.rows("acceleration", acceleration_deg_s2=acceleration)
+        lag_arcsec = 3600 * acceleration * sheet.scene.exposure.time_s**2 / 24
+        at_rest = rms(sheet, sheet.rows("terms", unit=0, state=0, attitude=0), GROUPS["across"])
+        predicted = math.sqrt(at_rest**2 + lag_arcsec**2 / 2)  # about one of two axes
+        errors = {f"rms_{name}": rms(sheet, rows, axes) for name, axes in GROUPS.items()}
+        found.append(
+            {
+                "acceleration_deg_s2": acceleration,
+                "counts": counts(sheet, rows),
+                "predicted_across": predicted,
+                **errors,
+            }
+        )
+    return found
+
+
+def bracket(rows: list[dict[str, Any]], key: str) -> tuple[float, float]:
+    """Between which levels the probability of a right attitude falls below LIMIT, each shown at 95 % confidence.
+
+    The highest level up to which all are shown to be above it, NaN if none is; and the lowest that is shown to be below
+    it, infinite if none is.
+    """
+    above, below = math.nan, math.inf
+    for row in rows:
+        if row["counts"].share("right").low < LIMIT:
+            break
+        above = row[key]
+    for row in reversed(rows):
+        if row["counts"].share("right").high >= LIMIT:
+            break
+        below = row[key]
+    return above, below
+
+
+def disturbances(sheet: Sheet) -> list[dict[str, Any]]:
+    """Outcomes and errors under each disturbance, the undisturbed frames first."""
+    undisturbed = [row for row in sheet.rows("total") if sheet.cells[row].levels["draw"] == 0]
+    cases = {"none": undisturbed}
+    cases |= {name: sheet.rows("disturbance", disturbance=name) for name in sheet.levels("disturbance", "disturbance")}
+    return [
+        {
+            "disturbance": name,
+            "counts": counts(sheet, rows),
+            **{f"rms_{group}": rms(sheet, rows, axes) for group, axes in GROUPS.items()},
+        }
+        for name, rows in cases.items()
+    ]

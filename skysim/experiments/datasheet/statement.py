@@ -1,0 +1,357 @@
+"""The statement of a datasheet: what was measured, as numbers for JSON and as sections of tables for pages."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from skysim.experiments.datasheet import performance, terms
+from skysim.experiments.datasheet.components import Bounded, Components
+from skysim.experiments.datasheet.performance import LIMIT, Counts
+from skysim.experiments.datasheet.run import Sheet
+from skysim.results.metrics import Summary
+
+NAMES = {
+    "bias": "bias",
+    "thermal": "thermo-elastic",
+    "field": "field-of-view spatial",
+    "pixel": "pixel spatial",
+    "temporal": "temporal noise",
+    "total": "sum",
+}
+ENSEMBLE = "ensemble: over fields, units and noise, each frame on its own"
+TEMPORAL = "temporal: over frames of one attitude that differ in their noise"
+
+
+class Section(NamedTuple):
+    """A section of the statement: what the numbers are, their table, and names of figures (see `figures`)."""
+
+    title: str
+    texts: Sequence[str]
+    headers: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    figures: Sequence[str] = ()
+
+
+class Statement(NamedTuple):
+    """All numbers of a datasheet, and the sheet they are from."""
+
+    sheet: Sheet
+    terms: dict[str, terms.TermTable]
+    fields: int
+    bias: list[Bounded]
+    causes: list[dict[str, Any]]
+    counts: Counts
+    claims: list[dict[str, Any]]
+    quantiles: list[dict[str, Any]]
+    rates: list[dict[str, Any]]
+    accelerations: list[dict[str, Any]]
+    magnitudes: list[dict[str, Any]]
+    disturbances: list[dict[str, Any]]
+
+
+def state(sheet: Sheet) -> Statement:
+    """The statement of a measured sheet. Raises InputError where too few frames are solved."""
+    _, solved = terms.term_errors(sheet)
+    found = performance.counts(sheet, sheet.rows("sky"))
+    return Statement(
+        sheet,
+        terms.term_tables(sheet),
+        int(solved.sum()),
+        terms.mean_errors(sheet),
+        terms.causes(sheet),
+        found,
+        performance.claims(found),
+        performance.quantiles(sheet),
+        performance.by_rate(sheet),
+        performance.by_acceleration(sheet),
+        performance.by_magnitude(sheet),
+        performance.disturbances(sheet),
+    )
+
+
+# As numbers.
+
+
+def as_numbers(value: Any) -> Any:
+    """A value for JSON: named tuples as mappings, numbers that are not finite as None."""
+    if isinstance(value, Counts):
+        shares = {kind: value.share(kind)._asdict() for kind in ("right", "refused", "false")}
+        return value._asdict() | {"shares": shares}
+    if hasattr(value, "_asdict"):
+        return as_numbers(value._asdict())
+    if isinstance(value, dict):
+        return {key: as_numbers(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_numbers(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def numbers(statement: Statement) -> dict[str, Any]:
+    """The statement for JSON; squares in arcsec^2 of one axis."""
+    sheet = statement.sheet
+    head = {
+        "scene": sheet.scene.name,
+        "title": sheet.scene.title,
+        "overrides": dict(sheet.overrides),
+        "seed": sheet.scene.seed,
+        "fields": sheet.size.fields,
+        "units": sheet.designer.units,
+        "states_c": sheet.designer.temperatures_c,
+        "frames": int(sheet.columns["trial"].size),
+        "fields_solved": statement.fields,
+        "limits": limits(statement),
+    }
+    parts = statement._asdict()
+    del parts["sheet"], parts["fields"]
+    return head | as_numbers(parts)
+
+
+def limits(statement: Statement) -> dict[str, Any]:
+    """The brackets of the limits in rate and acceleration."""
+    rate = performance.bracket(statement.rates, "rate_deg_s")
+    acceleration = performance.bracket(statement.accelerations, "acceleration_deg_s2")
+    return as_numbers({"rate_deg_s": rate, "acceleration_deg_s2": acceleration})
+
+
+# As sections.
+
+
+def size(square: Bounded) -> str:
+    """A root mean square with its interval; where the square is not known to be above 0, what it is below."""
+    if square.low <= 0:
+        return f"< {math.sqrt(max(square.high, 0.0)):.3g}"
+    low, value, high = (math.sqrt(one) for one in (square.low, square.value, square.high))
+    return f"{value:.3g} ({low:.3g} to {high:.3g})"
+
+
+def bounded(value: Bounded, digits: int = 3) -> str:
+    return f"{value.value:.{digits}g} ({value.low:.{digits}g} to {value.high:.{digits}g})"
+
+
+def percent(share: Summary) -> str:
+    """A share in percent with its exact bounds."""
+    return f"{100 * share.value:.4g} ({100 * share.low:.4g} to {100 * share.high:.4g})"
+
+
+def arcsec(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3g}"
+
+
+def sections(statement: Statement) -> list[Section]:
+    """All sections, in order."""
+    made = [
+        term_section(statement),
+        lowering_section(statement),
+        probability_section(statement),
+        quantile_section(statement),
+        rate_section(statement),
+        acceleration_section(statement),
+    ]
+    made += [magnitude_section(statement)] if statement.magnitudes else []
+    return [*made, disturbance_section(statement)]
+
+
+def term_section(statement: Statement) -> Section:
+    """The terms, and their sum beside the total measured at once."""
+    sheet, tables = statement.sheet, statement.terms
+    rows = []
+    for name in (*Components._fields, "total"):
+        if name == "thermal" and sheet.designer.states < 2:
+            rows.append(
+                [NAMES[name], "not in the scene", "-", "not in the scene", "-", "a scene with section thermal has it"]
+            )
+            continue
+        row = [NAMES[name]]
+        for table in tables.values():
+            share = table.squares[name].value / table.squares["total"].value
+            row += [size(table.squares[name]), f"{100 * share:.1f}"]
+        rows.append([*row, terms.TERMS.get(name, "all terms together")])
+    ratios = ", ".join(f"{bounded(table.ratio)} {name}" for name, table in tables.items())
+    x, y, roll = (bounded(one, 2) for one in statement.bias)
+    texts = [
+        "Errors of one axis, 1 σ in arcseconds, with 95 % intervals over the fields: across the boresight the mean of x"
+        f" and y, about it the roll. Statistical interpretation: {ENSEMBLE}; temporal noise: {TEMPORAL}."
+        f" {statement.fields} fields, {sheet.designer.units} units, {sheet.designer.states} thermal states,"
+        f" {sheet.size.attitudes} attitudes a few pixels apart, {sheet.size.frames} frames each.",
+        f"Sum of the terms' variances over the mean square of {sheet.size.draws} independent frames in each of these"
+        f" fields, with all drawn anew: {ratios}.",
+        f"Mean error about the camera's axes, arcseconds: x {x}, y {y}, roll {roll}.",
+    ]
+    if sheet.designer.units > 1:
+        texts.insert(2, unit_text(sheet.designer.units, sheet.size.draws))
+    return Section("Error terms", texts, ["term", "across ″", "%", "about ″", "%", "what it is"], rows, ["terms"])
+
+
+def unit_text(units: int, draws: int) -> str:
+    """What the intervals over the fields leave out: that units are few (chi-square of a variance)."""
+    from scipy.special import chdtri
+
+    freedom = units - 1
+    low, high = (math.sqrt(freedom / chdtri(freedom, tail)) for tail in (0.025, 0.975))
+    return (
+        f"These intervals are over the fields. Where the bias scatters among units, {units} of them know it to a factor"
+        f" of {low:.2g} to {high:.2g} (95 %), and the independent frames are of {draws} other units: a bias that"
+        " dominates needs more units before the two can agree."
+    )
+
+
+def lowering_section(statement: Statement) -> Section:
+    """Which term dominates, and what is left of the mean square after each change of the scene."""
+    texts = [
+        f"{name.capitalize()} the boresight {NAMES[table.dominant]} dominates:"
+        f" {100 * table.squares[table.dominant].value / table.squares['total'].value:.0f} % of the variance."
+        for name, table in statement.terms.items()
+    ]
+    texts.append(
+        "Each change alone, on the same fields, units and noise as before: what is left of the error's mean square, in"
+        " percent, with 95 % intervals. Below 100 the change lowers the error."
+    )
+    rows = [
+        [one["cause"], *(bounded(Bounded(*(100 * part for part in one[name]))) for name in terms.GROUPS)]
+        for one in statement.causes
+    ]
+    return Section(
+        "What dominates, and what would lower it", texts, ["change", "across %", "about %"], rows, ["causes"]
+    )
+
+
+def probability_section(statement: Statement) -> Section:
+    """Probabilities of right, refused and false attitudes, and what may be claimed."""
+    counts = statement.counts
+    where = "the whole sky" if statement.sheet.designer.under_stars else "the tilts of the vehicle"
+    shares = ", ".join(f"{kind} {percent(counts.share(kind))} %" for kind in ("right", "refused", "false"))
+    texts = [
+        f"{counts.frames} frames lost in space at rest, each with its own attitude from {where}, unit and noise"
+        f" ({ENSEMBLE}). Shares with exact one-sided bounds, each at 95 %: {shares}. A false attitude"
+        " is off by more than ten arcminutes and by more than its covariance allows (`metrics.is_wrong`).",
+        "A claim needs so many runs without a failure that the upper bound of the failures' probability is below its"
+        " complement: n = ln(1 - c) / ln(p), rounded up.",
+    ]
+    if statement.sheet.designer.under_stars:
+        texts.append(
+            f"Sky coverage, the share of the sky in which a frame is solved: {percent(counts.share('right'))} %."
+        )
+    rows = [
+        [
+            f"{100 * one['share']:g} %",
+            "yes" if one["shown"] else "no",
+            str(one["runs"]),
+            str(one["failures"]),
+            str(one["without_failure"]),
+            str(one["more"]) if not one["shown"] else "-",
+        ]
+        for one in statement.claims
+    ]
+    headers = [
+        "right attitude in",
+        "shown",
+        "runs",
+        "failures",
+        "runs needed without failure",
+        "more runs, if none fails",
+    ]
+    return Section("Right, refused and false attitudes", texts, headers, rows, ["sky"])
+
+
+def quantile_section(statement: Statement) -> Section:
+    """Quantiles of the errors."""
+    texts = [
+        "Errors that a frame stays below with the probability at the left, over independent frames"
+        f" ({ENSEMBLE}), with 95 % intervals between order statistics; across is the angle between the boresights."
+    ]
+    rows = [
+        [f"{100 * one['level']:g} %", *(quantile_text(one[name]) for name in terms.GROUPS)]
+        for one in statement.quantiles
+    ]
+    return Section("Performance at a confidence", texts, ["probability", "across ″", "about ″"], rows)
+
+
+def quantile_text(found: Summary) -> str:
+    """A quantile with its interval, or how many more frames it needs for one."""
+    if math.isnan(found.low):
+        return f"{found.value:.3g} (an interval needs {found.needs} more frames)"
+    return f"{found.value:.3g} ({found.low:.3g} to {found.high:.3g})"
+
+
+def outcome_cells(row: dict[str, Any]) -> list[str]:
+    """Cells of a row's outcomes."""
+    return [percent(row["counts"].share("right")), str(row["counts"].refused), str(row["counts"].false)]
+
+
+def pair_cells(row: dict[str, Any]) -> list[str]:
+    """Cells of a pair of frames: noise-equivalent angle and error."""
+    return [arcsec(row[f"{kind}_{name}"]) for name in terms.GROUPS for kind in ("nea", "rms")]
+
+
+PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about ″"]
+OUTCOME_HEADERS = ["right %", "refused", "false"]
+
+
+def bracket_text(what: str, ends: tuple[float, float], unit: str) -> str:
+    """A sentence on a limit."""
+    above = "at no level tested" if math.isnan(ends[0]) else f"up to {ends[0]:g} {unit}"
+    below = "at none tested" if math.isinf(ends[1]) else f"from {ends[1]:g} {unit} on"
+    share = f"{100 * LIMIT:g} %"
+    return f"Limit of acquisition in {what}: {share} of right attitudes are shown {above}, fewer are shown {below}."
+
+
+def rate_section(statement: Statement) -> Section:
+    """Noise-equivalent angle, error and acquisition by rate."""
+    texts = [
+        "Two frames of each attitude that differ in their noise, at a constant rate across the boresight, each lost in"
+        f" space. NEA: temporal noise of one axis, 1 σ ({TEMPORAL}). rms: all errors of one axis ({ENSEMBLE}).",
+        bracket_text("rate", performance.bracket(statement.rates, "rate_deg_s"), "°/s"),
+    ]
+    rows = [
+        [f"{row['rate_deg_s']:g}", f"{row['streak_px']:.2g}", *pair_cells(row), *outcome_cells(row)]
+        for row in statement.rates
+    ]
+    headers = ["rate °/s", "streak px", *PAIR_HEADERS, *OUTCOME_HEADERS]
+    return Section("By rate", texts, headers, rows, ["rates"])
+
+
+def acceleration_section(statement: Statement) -> Section:
+    """Error and acquisition by acceleration."""
+    texts = [
+        "One frame of each attitude, with no rate at mid-exposure and a constant acceleration across the boresight"
+        f" ({ENSEMBLE}). All lights move to one side, so their mean is a T² / 24 from where they are at mid-exposure:"
+        " predicted, with the error at rest.",
+        bracket_text("acceleration", performance.bracket(statement.accelerations, "acceleration_deg_s2"), "°/s²"),
+    ]
+    rows = [
+        [
+            f"{row['acceleration_deg_s2']:g}",
+            arcsec(row["rms_across"]),
+            arcsec(row["predicted_across"]),
+            arcsec(row["rms_about"]),
+            *outcome_cells(row),
+        ]
+        for row in statement.accelerations
+    ]
+    headers = ["acceleration °/s²", "rms across ″", "predicted ″", "rms about ″", *OUTCOME_HEADERS]
+    return Section("By acceleration", texts, headers, rows)
+
+
+def magnitude_section(statement: Statement) -> Section:
+    """Noise-equivalent angle by the limit of the catalog."""
+    texts = [
+        "The faintest stars of the tracker's catalog, at rest: two frames of each attitude that differ in their noise"
+        f" (NEA: {TEMPORAL}; rms: {ENSEMBLE})."
+    ]
+    rows = [[f"{row['limit_mag']:g}", *pair_cells(row), *outcome_cells(row)] for row in statement.magnitudes]
+    return Section("By magnitude limit", texts, ["limit V", *PAIR_HEADERS, *OUTCOME_HEADERS], rows, ["magnitudes"])
+
+
+def disturbance_section(statement: Statement) -> Section:
+    """Outcomes and errors under disturbances."""
+    texts = [
+        f"One frame in each field with a disturbance beyond what the scene has ({ENSEMBLE}); the Moon's frames have"
+        " attitudes of their own, with the Moon in the field. rms: of one axis, right attitudes alone."
+    ]
+    rows = [
+        [row["disturbance"], *outcome_cells(row), arcsec(row["rms_across"]), arcsec(row["rms_about"])]
+        for row in statement.disturbances
+    ]
+    return Section("Under disturbances", texts, ["disturbance", *OUTCOME_HEADERS, "rms across ″", "rms about ″"], rows)

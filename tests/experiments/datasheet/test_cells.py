@@ -1,0 +1,65 @@
+"""The cells of a datasheet: what each draws anew, and scenes that have none."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from skysim.core.errors import InputError
+from skysim.experiments.datasheet.cells import FULL, QUICK, Designer, check_scene, states_c, unit_seeds
+from skysim.scene.loader import load
+
+
+@pytest.mark.parametrize("scene", ["shefex2", "afit_simsat", "thermal_drift"])
+def test_every_cell_is_another(scene):
+    """Names are distinct; only frames that are compared share their noise: a change, and the draw before it."""
+    cells = list(Designer(load(scene, {}), QUICK).cells())
+    assert len({cell.name for cell in cells}) == len(cells)
+    noise = Counter(cell.settings["trial.noise_seed"] for cell in cells)
+    shared = {seed for seed, count in noise.items() if count > 1}
+    paired = {cell.settings["trial.noise_seed"] for cell in cells if cell.experiment in ("cause", "disturbance")}
+    assert shared == paired & {cell.settings["trial.noise_seed"] for cell in cells if cell.experiment == "total"}
+
+
+def test_draws_share_no_unit_with_the_terms():
+    designer = Designer(load("afit_simsat", {}), FULL)
+    cells = list(designer.cells())
+    assert designer.seeds == ["camera.detector.hardware_seed", "tracker.survey.seed", "light.layout.hardware_seed"]
+    seeds = {
+        name: [one.settings["tracker.survey.seed"] for one in cells if one.experiment == name]
+        for name in ("terms", "total", "sky")
+    }
+    assert len(set(seeds["terms"])) == FULL.units
+    assert len(set(seeds["total"])) == FULL.draws
+    assert len(set(seeds["sky"])) == FULL.sky
+    assert not set(seeds["terms"]) & set(seeds["total"] + seeds["sky"])
+
+
+def test_units_are_equal_without_a_pattern():
+    plain = {f"camera.detector.{key}": "0" for key in ("prnu", "dsnu", "hot_pixels")}
+    assert unit_seeds(load("shefex2", {})) == ["camera.detector.hardware_seed"]
+    assert unit_seeds(load("shefex2", plain)) == []
+    assert Designer(load("shefex2", plain), QUICK).units == 1
+
+
+def test_thermal_states_are_those_of_the_scene():
+    """A period of the sine of 3 K about 21 C in four steps; none without a section."""
+    scene = load("thermal_drift", {})
+    assert states_c(scene, 4) == pytest.approx([21, 24, 21, 18])
+    assert states_c(load("shefex2", {}), 4) == []
+
+
+@pytest.mark.parametrize(
+    ("scene", "overrides", "message"),
+    [
+        ("collimated_display", {}, "light.kind: collimated_display"),
+        ("coded_spiral", {}, "tracker.decoder: gives no attitude for one frame"),
+        ("shefex2", {"tracker.exposure_control": "{mean_dn: 500}"}, "tracker.exposure_control"),
+    ],
+)
+def test_a_scene_without_attitudes_of_single_frames_is_refused(scene, overrides, message):
+    with pytest.raises(InputError, match=message) as refused:
+        check_scene(load(scene, overrides))
+    assert "allowed" in str(refused.value)
+    assert "\n" not in str(refused.value)

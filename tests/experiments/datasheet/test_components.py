@@ -1,0 +1,110 @@
+"""Variance components: terms of known size come back, and their sum is the total."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from skysim.experiments.datasheet.components import (
+    Components,
+    components,
+    mean_square_ratio,
+    of_axes,
+    sum_over_total,
+    with_intervals,
+)
+
+
+def generated(rng, shape, bias=0.0, **sigma):
+    """Errors with terms of known size: each is drawn for the levels that its name lists, f, u, s, p, t."""
+    errors = np.full(shape, bias)
+    for name, size in sigma.items():
+        levels = [shape[axis] if letter in name else 1 for axis, letter in enumerate("fuspt")]
+        errors = errors + size * rng.standard_normal(levels)
+    return errors
+
+
+def test_injected_terms_come_back_to_five_percent():
+    """Over many experiments, whose mean is the expectation; only the units' own draws are few."""
+    rng = np.random.default_rng(1)
+    sizes = {"u": 0.5, "f": 2.0, "fu": 1.0, "s": 0.8, "fs": 0.6, "us": 0.3, "fusp": 0.7, "fuspt": 3.0}
+    found = np.mean([components(generated(rng, (60, 6, 4, 2, 2), 1.5, **sizes)) for _ in range(900)], axis=0)
+    expected = Components(1.5**2 + 0.5**2, 0.8**2 + 0.6**2 + 0.3**2, 2.0**2 + 1.0**2, 0.7**2, 3.0**2)
+    assert found == pytest.approx(np.array(expected), rel=0.05)
+
+
+@pytest.mark.parametrize("name", ["bias", *Components._fields[2:]])
+def test_a_term_alone_comes_back_alone(name):
+    """One large experiment for each: to 5 %, and nothing of it in the others."""
+    rng, shape = np.random.default_rng(2), (2000, 2, 1, 4, 2)
+    drawn = {"bias": {}, "field": {"f": 2.0}, "pixel": {"fusp": 2.0}, "temporal": {"fuspt": 2.0}}
+    found = components(generated(rng, shape, 2.0 if name == "bias" else 0.0, **drawn[name]))
+    assert getattr(found, name) == pytest.approx(4.0, rel=0.05)
+    others = [value for one, value in found._asdict().items() if one != name]
+    assert others == pytest.approx([0.0] * 4, abs=0.12)
+
+
+def test_the_sum_is_the_mean_square_without_bias():
+    """E[e^2] exactly: the mean square of independent draws is the same within its error."""
+    rng = np.random.default_rng(3)
+    sizes = {"u": 0.4, "f": 1.0, "fu": 0.5, "s": 0.3, "fusp": 0.7, "fuspt": 1.2}
+    sums = [components(generated(rng, (40, 3, 2, 2, 2), 0.6, **sizes)).total for _ in range(400)]
+    expected = 0.6**2 + sum(size**2 for size in sizes.values())
+    assert np.mean(sums) == pytest.approx(expected, abs=4 * np.std(sums) / 20)
+    assert np.std(sums) / 20 < 0.02 * expected
+
+
+@pytest.mark.parametrize(("units", "states"), list(itertools.product((1, 3), (1, 2))))
+def test_a_factor_with_one_level_is_left_out(units, states):
+    rng = np.random.default_rng(4)
+    found = components(generated(rng, (3000, units, states, 2, 2), f=1.0, fuspt=1.0))
+    assert found.field == pytest.approx(1.0, rel=0.08)
+    assert found.temporal == pytest.approx(1.0, rel=0.05)
+    assert (found.thermal == 0) == (states == 1)
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth_as_often_as_they_say():
+    """Over 60 experiments 95 % hold each variance: or a little fewer: the bootstrap of 60 fields is short."""
+    rng, held = np.random.default_rng(5), []
+    for _ in range(60):
+        found = with_intervals(generated(rng, (60, 2, 1, 2, 2), f=1.0, fuspt=1.5)[None])
+        held.append(
+            [found[name].low <= truth <= found[name].high for name, truth in (("field", 1), ("temporal", 2.25))]
+        )
+    assert (np.mean(held, axis=0) > 0.85).all()
+
+
+def test_a_ratio_is_sharp_where_both_have_the_same_fields():
+    rng = np.random.default_rng(6)
+    squares = rng.lognormal(0, 1, 200)
+    assert mean_square_ratio(0.5 * squares, squares) == pytest.approx((0.5, 0.5, 0.5), rel=1e-12)
+    apart = mean_square_ratio(0.5 * rng.lognormal(0, 1, 200), squares)
+    assert apart.low < 0.5 < apart.high
+    missing = np.where(np.arange(200) < 7, np.nan, squares)
+    assert mean_square_ratio(missing, squares) == pytest.approx((1, 1, 1), rel=1e-12)
+
+
+def experiment(rng, fields):
+    """Errors of the design, and independent frames with new units, attitudes and noise in the same fields."""
+    field = 2 * rng.standard_normal((1, fields, 1))
+    errors = field[..., None, None, None] + generated(rng, (fields, 3, 1, 3, 2), fu=0.5, fusp=0.8, fuspt=1.5)
+    return errors, field + np.hypot(np.hypot(0.5, 0.8), 1.5) * rng.standard_normal((1, fields, 20))
+
+
+def test_terms_add_up_to_what_independent_frames_have():
+    """Within 3 %: the mean of 40 experiments, and the interval of one."""
+    rng = np.random.default_rng(7)
+    ratios = [
+        of_axes(errors).total / np.mean(at_once**2) for errors, at_once in (experiment(rng, 400) for _ in range(40))
+    ]
+    assert np.mean(ratios) == pytest.approx(1, abs=0.01)
+    assert np.std(ratios) < 0.03
+    errors, at_once = experiment(rng, 400)
+    found = sum_over_total(errors, at_once)
+    assert found.low < 1 < found.high
+    assert (found.high - found.low) / 4 == pytest.approx(np.std(ratios), rel=0.3)
+    at_once[0, :5] = np.nan
+    assert sum_over_total(errors, 1.2 * at_once).high < 1

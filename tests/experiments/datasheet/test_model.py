@@ -1,0 +1,142 @@
+"""The error model: its processes follow their law, draws and steps agree, the module stands alone, the unit runs."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skysim.experiments.datasheet.model import export, fit
+from skysim.experiments.datasheet.model.errors import ErrorModel, State, correlated
+
+CONSTANTS: dict[str, Any] = {
+    "mean": [0.3, -0.2, 1.0],
+    "unit": [0.5, 0.5, 4.0],
+    "field": [1.0, 0.8, 5.0],
+    "pixel": [0.6, 0.6, 3.0],
+    "scale": [0.6, 0.6, 0.9],
+    "field_deg": 3.0,
+    "pixel_deg": 0.02,
+    "scale_deg": 6.0,
+    "rates_deg_s": [0.0, 1.0, 4.0],
+    "noise": [[1.0, 1.0, 10.0], [1.5, 1.5, 12.0], [4.0, 4.0, 30.0]],
+}
+
+
+@pytest.fixture
+def model() -> ErrorModel:
+    return ErrorModel(CONSTANTS)
+
+
+def test_a_process_follows_its_recursion():
+    """Beside the loop over the times, with steps that change: the same numbers from the same draws."""
+    steps = np.random.default_rng(1).uniform(0, 0.5, 300)
+    found = correlated(steps, np.array([0.7, -1.2]), np.random.default_rng(2))
+    normal, left = np.random.default_rng(2).standard_normal((300, 2)), np.exp(-steps)
+    value = np.array([0.7, -1.2])
+    for k in range(1, 300):
+        value = left[k] * value + np.sqrt(1 - left[k] ** 2) * normal[k]
+        assert found[k] == pytest.approx(value, abs=1e-12)
+
+
+def test_a_process_is_stationary_and_forgets_exponentially():
+    steps = np.full(200_000, 0.1)
+    values = correlated(steps, np.random.default_rng(3).standard_normal(), np.random.default_rng(4))
+    assert np.var(values) == pytest.approx(1, abs=0.03)
+    for lag in (1, 5, 20):
+        assert np.mean(values[lag:] * values[:-lag]) == pytest.approx(np.exp(-0.1 * lag), abs=0.03)
+
+
+def test_all_is_constant_at_rest_but_the_noise(model):
+    """Of one state: the mean is the slow part, the deviation the noise at the field's scale."""
+    state = State(np.array([1.0, -1.0, 0.5]), np.array([0.3, 0.2, -1.0]), 0.8, np.array([2.0, -3.0, 7.0]))
+    errors = model.draw(np.zeros(40_000), 0.1, np.random.default_rng(5), state)
+    scales = np.exp(0.5 * (0.8 * model.scale - model.scale**2 / 2))
+    slow = state.bias + scales * (model.field * state.field + model.pixel * state.pixel)
+    assert errors.mean(axis=0) == pytest.approx(slow, abs=0.3)
+    assert errors.std(axis=0) == pytest.approx(scales * model.noise[0], rel=0.02)
+
+
+def test_over_many_units_and_fields_the_variance_is_the_sum_of_the_terms(model):
+    rng = np.random.default_rng(6)
+    errors = np.array([model.draw(np.full(2, 1.0), 0.1, rng)[1] for _ in range(30_000)])
+    expected = model.mean**2 + model.unit**2 + model.field**2 + model.pixel**2 + model.noise[1] ** 2
+    assert np.mean(errors**2, axis=0) == pytest.approx(expected, rel=0.05)
+
+
+def test_steps_have_the_statistics_of_draws(model):
+    """Mean square and correlation from one step to the next at 2 degrees per second."""
+    rng, pairs = np.random.default_rng(7), []
+    for _ in range(8000):
+        state = model.start(rng, unit=False)
+        state, first = model.step(state, 2.0, 0.1, rng)
+        pairs.append((first, model.step(state, 2.0, 0.1, rng)[1]))
+    stepped = np.array(pairs) - model.mean
+    drawn = np.array([model.draw(np.full(2, 2.0), 0.1, rng, model.start(rng, unit=False)) for _ in range(8000)])
+    drawn -= model.mean
+    for one, other in ((0, 0), (0, 1)):
+        found, expected = (np.mean(each[:, one] * each[:, other], axis=0) for each in (stepped, drawn))
+        spread = np.sqrt(np.mean(stepped[:, 0] ** 2, axis=0) * np.mean(drawn[:, 0] ** 2, axis=0))
+        assert (found - expected) / spread == pytest.approx(np.zeros(3), abs=0.08)
+
+
+def test_more_than_a_hundred_thousand_errors_a_second(model):
+    """A million in the best of three runs: ten times what is asked, even on a busy machine."""
+    rng, rates = np.random.default_rng(8), np.full(100_000, 1.0)
+    seconds = []
+    for _ in range(3):
+        begun = time.process_time()
+        model.draw(rates, 0.1, rng)
+        seconds.append(time.process_time() - begun)
+    assert min(seconds) < 1.0
+
+
+def test_the_module_stands_alone(tmp_path: Path) -> None:
+    """Copied away it needs NumPy and its constants, and nothing of skysim."""
+    export.write_model(tmp_path, CONSTANTS)
+    code = (
+        "import sys, numpy; from tracker_error import ErrorModel; m = ErrorModel.read('tracker_error.json');"
+        " print(m.draw(numpy.full(5, 1.0), 0.1, numpy.random.default_rng(1)).shape,"
+        " [name for name in sys.modules if name.startswith(('skysim', 'estimator', 'scipy'))])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env={"PATH": ""}, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split("\n")[0] == "(5, 3) []"
+
+
+@pytest.mark.slow
+def test_the_unit_runs_in_another_tool_with_the_same_errors(tmp_path: Path, model: ErrorModel) -> None:
+    """fmpy runs it at 1.5 degrees per second: the errors are those of the model's own steps with that seed."""
+    fmpy = pytest.importorskip("fmpy")
+    pytest.importorskip("pythonfmu3")
+    export.write_model(tmp_path, CONSTANTS)
+    path = export.write_fmu(tmp_path)
+    assert fmpy.read_model_description(str(path)).fmiVersion == "3.0"
+    outputs = ["x_arcsec", "y_arcsec", "roll_arcsec"]
+    result = fmpy.simulate_fmu(
+        str(path), stop_time=2.0, output_interval=0.1, start_values={"seed": 5, "rate_deg_s": 1.5}, output=outputs
+    )
+    rng = np.random.default_rng(5)
+    state, expected = model.start(rng), []
+    for _ in range(len(result) - 1):
+        state, errors = model.step(state, 1.5, 0.1, rng)
+        expected.append(errors)
+    assert len(result) == 21
+    found = np.array([[row[name] for name in outputs] for row in result[1:]])
+    assert found == pytest.approx(np.array(expected), rel=1e-6)
+
+
+def test_the_scatter_of_the_fields_comes_from_two_estimates_of_each():
+    """Noise whose variance is lognormal over the fields, seen by eight frames in each estimate."""
+    rng = np.random.default_rng(9)
+    variance = np.exp(0.7 * rng.standard_normal(60_000))
+    first, second = (variance * rng.chisquare(7, 60_000) / 7 for _ in range(2))
+    assert fit.log_scale(first, second) == pytest.approx(0.7, rel=0.05)
+    assert fit.log_scale(first, first) > 0.8
+    assert fit.log_scale(np.ones(9), np.ones(9)) == 0

@@ -1,0 +1,65 @@
+"""Probabilities with exact bounds, runs that a claim needs, and limits."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import scipy
+
+from skysim.experiments.datasheet import performance
+from skysim.experiments.datasheet.performance import Counts, bracket, claims, noise_equivalent_angle, runs_needed
+
+
+def test_runs_without_a_failure_are_those_of_the_formula():
+    """ln 0.05 / ln 0.997 = 997.1: 997 runs show 99.7 % at 94.999 %, and 998 at 95 %."""
+    assert math.log(0.05) / math.log(0.997) == pytest.approx(997.07, abs=0.01)
+    assert runs_needed(0.997) == 998
+    assert 1 - 0.997**998 >= 0.95 > 1 - 0.997**997
+    assert abs(0.95 - (1 - 0.997**997)) < 2e-5
+    assert runs_needed(0.95) == 59
+
+
+@pytest.mark.parametrize("failures", [1, 2, 7])
+def test_runs_with_failures_are_the_fewest_whose_bound_holds(failures):
+    """P(at most so many failures) is the binomial's, below 5 % at the number and not at one fewer."""
+    runs = runs_needed(0.99, failures)
+    below = [scipy.stats.binom.cdf(failures, n, 0.01) for n in (runs, runs - 1)]
+    assert below[0] <= 0.05 < below[1]
+
+
+def test_a_claim_says_how_many_more_runs_it_needs():
+    found = {one["share"]: one for one in claims(Counts(400, 399, 1, 0))}
+    assert found[0.95]["shown"]
+    assert found[0.95]["more"] == 0
+    assert not found[0.997]["shown"]
+    assert scipy.stats.binom.cdf(1, 400 + found[0.997]["more"], 0.003) <= 0.05
+    assert scipy.stats.binom.cdf(1, 399 + found[0.997]["more"], 0.003) > 0.05
+
+
+def test_bounds_hold_the_truth_as_often_as_they_say():
+    """Each one-sided bound at 95 %, of a share of 0.9 in 40 frames."""
+    hits = np.random.default_rng(1).binomial(40, 0.9, 4000)
+    shares = [Counts(40, int(n), 40 - int(n), 0).share("right") for n in hits]
+    assert np.mean([one.low <= 0.9 for one in shares]) >= 0.945
+    assert np.mean([one.high >= 0.9 for one in shares]) >= 0.945
+
+
+def test_noise_is_told_from_all_that_two_frames_share():
+    rng = np.random.default_rng(2)
+    shared = 30 * rng.standard_normal(4000)
+    first, second = (shared + 2.5 * rng.standard_normal(4000) for _ in range(2))
+    first[:3] = np.nan
+    assert noise_equivalent_angle(first, second) == pytest.approx(2.5, rel=0.04)
+    assert math.isnan(noise_equivalent_angle(first[:3], second[:3]))
+
+
+def test_a_limit_lies_between_what_is_shown_above_and_below():
+    rows = [
+        {"rate": n, "counts": Counts(200, right, 200 - right, 0)} for n, right in enumerate([200, 199, 190, 150, 3])
+    ]
+    assert bracket(rows, "rate") == (1, 3)
+    assert bracket(rows[:1], "rate") == (0, math.inf)
+    assert math.isnan(bracket(rows[3:], "rate")[0])
+    assert performance.LIMIT == 0.95

@@ -1,0 +1,103 @@
+"""A whole datasheet from rendered frames: it goes on where it was stopped, and finds what was put in."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skysim.core.errors import InputError
+from skysim.experiments.datasheet import cells, page, run
+from skysim.experiments.datasheet.cells import Designer, Size
+from skysim.experiments.datasheet.components import components
+from skysim.experiments.datasheet.statement import numbers, sections, state
+from skysim.experiments.study.execution import trials
+from skysim.experiments.study.plan import TrialSpec
+from skysim.scene.loader import load
+
+SMALL = Size(fields=12, units=1, states=2, attitudes=2, frames=2, draws=2, sky=2, pairs=1)
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few levels of every experiment."""
+    monkeypatch.setattr(run, "QUICK", SMALL)
+    monkeypatch.setattr(cells, "STREAKS_PX", (1.0,))
+    monkeypatch.setattr(cells, "SEQUENCE", (0, 1))
+    monkeypatch.setattr(cells, "BENDS_PX", (4.0,))
+    monkeypatch.setattr(cells, "FAINTER", (-1.0,))
+
+
+def measured(folder: Path, watch: Callable[[int], Any] | None = None, fields: int | None = None) -> run.Sheet:
+    scene = load("shefex2", {})
+    return run.measure("shefex2", scene, {}, folder, quick=True, fields=fields, workers=1, watch=watch)
+
+
+def stop_after(batches: int) -> Callable[[int], Any]:
+    """A watch that stops the run as Ctrl-C does."""
+    seen: list[int] = []
+
+    def watch(progress: object) -> None:
+        seen.append(1)
+        if len(seen) == batches:
+            raise KeyboardInterrupt
+
+    return lambda trials: watch
+
+
+def test_a_stopped_datasheet_goes_on_and_is_the_same(small: None, tmp_path: Path) -> None:
+    whole = state(measured(tmp_path / "whole"))
+    with pytest.raises(KeyboardInterrupt):
+        measured(tmp_path / "stopped", stop_after(4))
+    again = state(measured(tmp_path / "stopped"))
+    assert json.dumps(numbers(again)) == json.dumps(numbers(whole))
+    paths = page.write_all(tmp_path / "whole", whole, True)
+    assert json.loads(paths["json"].read_text())["fields"] == 12
+    text = paths["report"].read_text(encoding="utf-8")
+    assert all(section.title in text for section in sections(whole))
+    assert text.count("<img") == 5
+    page.write_markdown(tmp_path / "sheet.md", whole, True)
+    assert (tmp_path / "sheet.md").read_text(encoding="utf-8").count("\n## ") == len(sections(whole))
+    with pytest.raises(InputError, match="contains another study"):
+        run.measure("shefex2", load("shefex2", {}), {"camera.f_number": "2"}, tmp_path / "whole", quick=True, workers=1)
+
+
+def test_too_few_fields_are_refused_with_their_number(small: None, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"--fields 4: . fields are solved .* allowed: 10 of them or more"):
+        state(measured(tmp_path, fields=4))
+
+
+def test_a_bias_and_a_thermal_drift_that_were_put_in_come_back() -> None:
+    """The mount turns by 10" per kelvin about x and 4" about roll: at 20, 22 and 27 C with the reference at 20.
+
+    The states' effects are 0, 20 and 70" about x; about y there is nothing but what the tracker has.
+    """
+    per_k, temperatures_c = np.array([10.0, 0.0, 40.0]), np.array([20.0, 22.0, 27.0])
+    thermal = {
+        "thermal.temperature": "{kind: table, hours: [0, 1, 2], temperature_c: [20, 22, 27]}",
+        "thermal.mount_arcsec_k": f"{per_k.tolist()}",
+    }
+    designer = Designer(load("shefex2", thermal), Size(12, 1, 3, 2, 2, 1, 1, 1))
+    assert designer.temperatures_c == temperatures_c.tolist()
+    base = {"thermal.mount_arcsec_k": per_k.tolist()}
+    spec = TrialSpec("shefex2", ".", 3, base, {"kind": "frames"}, True)
+    errors = []
+    for cell in designer.terms():
+        rows = trials.run_segments(spec, (trials.Segment(0, cell.settings, 0, range(12)),))
+        assert all(row.outcome.solved and not row.error for row in rows)
+        errors.append([[row.outcome.x_arcsec, row.outcome.y_arcsec, row.outcome.roll_arcsec] for row in rows])
+    shape = (1, designer.states, 2, 2, 12, 3)
+    by_axis = np.moveaxis(np.array(errors).reshape(shape), (4, 5), (1, 0))
+    for axis, slope in enumerate(per_k):
+        effects = slope * (temperatures_c - 20)
+        found = components(by_axis[axis])
+        expected = float(np.var(effects, ddof=1))
+        assert found.thermal == pytest.approx(expected, rel=0.05, abs=1.0 if axis < 2 else 20.0)
+        # The mean's square, less what the three states' scatter gives to it.
+        unbiased = float(np.mean(effects) ** 2 - expected / 3)
+        assert found.bias == pytest.approx(unbiased, rel=0.05, abs=2.0 if axis < 2 else 20.0)
