@@ -45,6 +45,24 @@ def solution_near(rng: np.random.Generator, state: states.State, off_rad: float)
     return correct.Solution(near, covariance(rng, 3), covariance(rng, 3))
 
 
+# States of several heads
+
+
+@law(states.of_head, states.build_layout)
+@given(heads=some.integers(1, 8), considered=CHOICES)
+def test_every_head_has_a_mounting_and_a_slow_error_of_its_own(heads: int, considered: tuple[str, ...]) -> None:
+    """They share no row; only the first mounting can be considered, the slow errors all together."""
+    layout = states.build_layout(GYRO, TRACKER, considered, heads)
+    names = [states.of_head(name, head) for head in range(heads) for name in ("mounting", "systematic")]
+    rows = np.concatenate([np.arange(layout.size)[layout.slices[name]] for name in names])
+    assert len(set(names)) == len(names)
+    assert len(set(rows.tolist())) == 6 * heads == len(layout.mountings) + layout.slow.stop - layout.slow.start
+    for name in ("mounting", "systematic"):
+        fixed = [not layout.estimated[layout.slices[states.of_head(name, head)]].any() for head in range(heads)]
+        others = name in considered and name == "systematic"
+        assert fixed == [name in considered, *[others] * (heads - 1)]
+
+
 # What is accepted
 
 
