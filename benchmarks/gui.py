@@ -42,10 +42,10 @@ def served(name: str) -> Iterator[str]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
         free.close()
-        command = [sys.executable, "-m", "skysim", "gui", name, "--no-open", "--port", str(port)]
+        command = [sys.executable, "-m", "skysim", "gui", name, "--no-open", "--port", str(port), "--token", "bench"]
         server = subprocess.Popen([*command, "--out", folder], start_new_session=True)
         try:
-            yield reached(f"http://127.0.0.1:{port}/")
+            yield reached(f"http://127.0.0.1:{port}/?token=bench")
         finally:
             os.killpg(server.pid, signal.SIGTERM)
             server.wait(10)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import hmac
 import secrets
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from nicegui import app, ui
+from starlette.datastructures import MutableHeaders
 from starlette.requests import HTTPConnection
 from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
 
@@ -18,7 +21,16 @@ from skysim.apps.gui.worker.session import SpareWorker
 from skysim.scene.loader import find
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
-COOKIE = "skysim_gui"
+# Only this server's own code runs in the page, and no other site may frame it. NiceGUI needs inline code and `eval`.
+PAGE_POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline';"
+    " img-src 'self' data: blob:; font-src 'self' data:; worker-src 'self' blob:; object-src 'none'; base-uri 'none';"
+    " form-action 'self'; frame-ancestors 'none'"
+)
+REPORT_POLICY = (
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; frame-ancestors 'none'"
+)
+SECURITY_HEADERS = {"x-frame-options": "DENY", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
 CONNECT_TIMEOUT_S = 50.0  # for a browser to load the page
 RECONNECT_S = 6.0  # for a lost browser to reconnect, before its work ends
 
@@ -28,11 +40,12 @@ class Guard:
 
     hosts : allowed Host headers ("*": any). This stops DNS rebinding: another site's name that resolves to this
         server comes with its own Host header.
-    token : required if not empty; `/?token=...` stores it in a cookie
+    token : required; `/?token=...` stores it in a cookie
+    port : of the server. Browsers send a host's cookies to all its ports, so the cookie's name has the port
     """
 
-    def __init__(self, app: Any, hosts: tuple[str, ...], token: str) -> None:
-        self.app, self.hosts, self.token = app, hosts, token
+    def __init__(self, app: Any, hosts: tuple[str, ...], token: str, port: int) -> None:
+        self.app, self.hosts, self.token, self.cookie = app, hosts, token, f"skysim_gui_{port}"
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -40,7 +53,7 @@ class Guard:
             return
         response = self.refusal(HTTPConnection(scope))
         if response is None:
-            await self.app(scope, limited(receive), send)
+            await self.app(scope, limited(receive), with_policy(send))
         elif scope["type"] == "http":
             await response(scope, receive, send)
         else:
@@ -56,11 +69,11 @@ class Guard:
             return PlainTextResponse("request of another site refused", 403)
         if int(headers.get("content-length") or 0) > LIMIT_BYTES + 2**16:
             return PlainTextResponse("request too large; allowed: 64 MB", 413)
-        if not self.token or token_matches(request.cookies.get(COOKIE, ""), self.token):
+        if token_matches(request.cookies.get(self.cookie, ""), self.token):
             return None
         if token_matches(request.query_params.get("token", ""), self.token):
             response = RedirectResponse("/", 303)
-            response.set_cookie(COOKIE, self.token, httponly=True, samesite="strict")
+            response.set_cookie(self.cookie, self.token, path="/", httponly=True, samesite="strict")
             return response
         return PlainTextResponse("token missing or wrong; open the address that the server printed: /?token=...", 401)
 
@@ -73,6 +86,19 @@ def token_matches(candidate: str, token: str) -> bool:
 def host_of(header: str) -> str:
     """The host of a Host header, without the port."""
     return header.rpartition(":")[0] if header.rpartition(":")[2].isdigit() else header
+
+
+def with_policy(send: Any) -> Any:
+    """Wrap `send` so that every response has the security headers, and a policy unless it has its own."""
+
+    async def send_with_headers(message: Any) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            headers.setdefault("content-security-policy", PAGE_POLICY)
+            headers.update(SECURITY_HEADERS)
+        await send(message)
+
+    return send_with_headers
 
 
 def limited(receive: Any) -> Any:
@@ -91,7 +117,16 @@ def limited(receive: Any) -> Any:
     return receive_limited
 
 
-def routes(scene: str, folder: Path, out: Path) -> None:
+def report_path(out: Path, name: str) -> Path | None:
+    """The report of a study in the folder; None if there is none of that name."""
+    try:
+        path = (out / name / "report.html").resolve()
+        return path if path.is_relative_to(out.resolve()) and path.is_file() else None
+    except (ValueError, OSError):  # a name with a null byte, or too long
+        return None
+
+
+def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str]) -> None:
     """Register all routes, with a spare worker ready for the next tab."""
     spare = SpareWorker(str(find(scene).resolve()))
     app.on_startup(spare.start)
@@ -108,14 +143,14 @@ def routes(scene: str, folder: Path, out: Path) -> None:
     @app.get("/report/{name}")
     def report(name: str) -> Response:
         """A finished study's report."""
-        path = (out / name / "report.html").resolve()
-        if not path.is_relative_to(out.resolve()) or not path.is_file():
+        path = report_path(out, name)
+        if path is None:
             return Response(status_code=404)
-        return FileResponse(path, media_type="text/html")
+        return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_POLICY})
 
     @ui.page("/", title="skysim gui", dark=True)
     async def index() -> None:
-        tab = Tab(scene, folder, out)
+        tab = Tab(scene, folder, out, cameras)
         tab.build()
         client = ui.context.client
         try:
@@ -129,18 +164,26 @@ def routes(scene: str, folder: Path, out: Path) -> None:
         spare.start()
 
 
-def serve(scene: str, host: str, port: int, token: str, folder: Path, out: Path, show: bool) -> None:
-    """Serve until Ctrl-C. token : required of browsers; if empty, a random one unless the host is a loopback address"""
+def serve(
+    scene: str, host: str, port: int, token: str, folder: Path, out: Path, cameras: Sequence[str], show: bool
+) -> None:
+    """Serve until Ctrl-C.
+
+    token : required of browsers, also of this machine, where other users and other sites' pages are; a random one if
+        empty
+    cameras : live cameras that the page may watch, see `skysim.core.io.images`
+    """
     hosts = LOOPBACK if host in LOOPBACK else ("*",)
-    token = token or ("" if host in LOOPBACK else secrets.token_urlsafe(16))
-    app.add_middleware(Guard, hosts=hosts, token=token)
-    routes(scene, folder, out)
-    address = f"http://{host}:{port}/" + (f"?token={token}" if token else "")
+    token = token or secrets.token_urlsafe(16)
+    app.add_middleware(Guard, hosts=hosts, token=token, port=port)
+    routes(scene, folder, out, cameras)
+    login = f"/?token={quote(token)}"
+    address = f"http://{host}:{port}{login}"
     print(f"skysim gui: {address}   (Ctrl-C ends it)", flush=True)
     ui.run(
         host=host,
         port=port,
-        show=show and not token,
+        show=login if show else False,
         reload=False,
         show_welcome_message=False,
         reconnect_timeout=RECONNECT_S,

@@ -29,6 +29,7 @@ CHROMIUM = next(
 PICTURES = ROOT / "out" / "screenshots"
 SLOW_MS = 600_000  # a first compilation on a busy machine
 QUICK_MS = 90_000
+TOKEN = "right"
 WIDE, NARROW = {"width": 1920, "height": 1080}, {"width": 1280, "height": 800}
 
 
@@ -41,11 +42,12 @@ class Server:
             self.port = free.getsockname()[1]
         self.folder, self.out = folder, folder / "out"
         command = [sys.executable, "-m", "skysim", "gui", "shefex2", "--no-open", "--port", str(self.port)]
-        place = ["--host", host, "--folder", str(folder), "--out", str(self.out)]
+        place = ["--host", host, "--folder", str(folder), "--out", str(self.out), "--token", TOKEN]
         # With pytest's own variable NiceGUI takes the server for a test of itself.
         environment = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
         self.process = subprocess.Popen([*command, *place, *told], cwd=ROOT, env=environment, start_new_session=True)
         self.url = f"http://127.0.0.1:{self.port}/"
+        self.login = f"{self.url}?token={TOKEN}"
 
     def __enter__(self) -> Server:
         for _ in range(1200):
@@ -61,7 +63,7 @@ class Server:
         self.process.wait(60)
 
     def status(self, path: str = "", **headers: str) -> int:
-        """What a request without a browser gets."""
+        """What a request without a browser and without the token's cookie gets."""
         asked = urllib.request.Request(self.url + path, headers=headers)
         try:
             return int(urllib.request.urlopen(asked, timeout=5).status)
@@ -104,7 +106,7 @@ def browser() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def tab(browser: Any, server: Server) -> Iterator[Any]:
     """A tab for most tests, one after the other, as a person has it open."""
-    with opened(browser, server.url, NARROW) as found:
+    with opened(browser, server.login, NARROW) as found:
         yield found
 
 
@@ -119,7 +121,7 @@ def page(tab: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def second(browser: Any, server: Server) -> Iterator[Any]:
     """Another tab."""
-    with opened(browser, server.url, NARROW) as found:
+    with opened(browser, server.login, NARROW) as found:
         yield found
 
 

@@ -27,6 +27,7 @@ from labpage import (
     differs,
     exported,
     onto_the_page,
+    opened,
     panel,
     picture,
     pictured,
@@ -307,24 +308,58 @@ def rolled(page: Any, name: str) -> float:
     return float(re.search(r"roll ([\d.]+)", facts)[1])
 
 
-def test_a_live_camera_is_followed_to_its_end(page: Any, tmp_path: Path) -> None:
+def test_a_live_camera_is_followed_to_its_end(browser: Any, tmp_path: Path) -> None:
     photo = cv2.imread(str(ROOT / "docs" / "images" / "sky.jpg"))
     high, wide = photo.shape[:2]
-    video = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 5, (wide, high))
+    clip = str(tmp_path / "clip.avi")
+    video = cv2.VideoWriter(clip, cv2.VideoWriter.fourcc(*"MJPG"), 5, (wide, high))
     for turn_deg in (0, 10):
         turn = cv2.getRotationMatrix2D((wide / 2, high / 2), turn_deg, 1)
         video.write(cv2.warpAffine(photo, turn, (wide, high)))
     video.release()
+    with Server(tmp_path, "--camera", clip) as watching, opened(browser, watching.login, NARROW) as page:
+        panel(page, "Image")
+        page.set_input_files("input[type=file]", ROOT / "docs" / "images" / "sky.jpg")
+        still = rolled(page, "sky.jpg")
+        page.get_by_role("button", name="Watch").click()
+        page.get_by_role("status").filter(has_text="ends after 2 frames").wait_for()
+        turned = rolled(page, "camera")
+        np.testing.assert_allclose(still - turned, 10, rtol=0, atol=0.05)  # the last frame's; the sky turns back
+        page.get_by_role("button", name="Watch").wait_for()
+        identified(page)
+
+
+def test_without_a_list_of_cameras_the_page_opens_none(page: Any) -> None:
+    panel(page, "Image")
+    page.get_by_text("start the page with skysim gui --camera 0").wait_for()
+    assert page.get_by_role("button", name="Watch").count() == 0
+
+
+def test_an_export_is_of_the_image_on_the_page(page: Any, tmp_path: Path) -> None:
+    """A photograph's pixels and solution, no truth; then the scene's again."""
     panel(page, "Image")
     page.set_input_files("input[type=file]", ROOT / "docs" / "images" / "sky.jpg")
-    still = rolled(page, "sky.jpg")
-    page.get_by_label("live camera").fill(str(tmp_path / "clip.avi"))
-    page.get_by_role("button", name="Watch").click()
-    page.get_by_role("status").filter(has_text="ends after 2 frames").wait_for()
-    turned = rolled(page, "camera")
-    np.testing.assert_allclose(still - turned, 10, rtol=0, atol=0.05)  # the last frame's; the sky turns the other way
-    page.get_by_role("button", name="Watch").wait_for()
+    solved = rolled(page, "sky.jpg")
+    saved = exported(page, "frame, PNG", tmp_path)
+    photo = cv2.imread(str(ROOT / "docs" / "images" / "sky.jpg"), cv2.IMREAD_GRAYSCALE)
+    assert cv2.imread(str(saved), cv2.IMREAD_UNCHANGED).shape == photo.shape
+    assert json.loads(exported(page, "solution", tmp_path).read_text())["solution"]["roll_deg"] == pytest.approx(
+        solved, abs=1e-3
+    )
+    page.get_by_role("button", name="Export").click()
+    page.locator(".q-menu .q-item", has_text=re.compile("^truth$")).click()
+    page.get_by_role("status").filter(has_text="truth: not known of an image from elsewhere").wait_for()
     identified(page)
+
+
+def test_starting_twice_starts_one_study(page: Any, server: Server) -> None:
+    panel(page, "Monte Carlo")
+    page.get_by_label("runs").fill("20000")
+    page.get_by_role("button", name="Start").dblclick()
+    page.keyboard.press("2")
+    assert server.come_to("study", 1) == 1
+    page.get_by_role("button", name="Stop").click()
+    assert server.come_to("study", 0) == 0
 
 
 def test_bad_input_is_refused_where_it_stands(page: Any) -> None:

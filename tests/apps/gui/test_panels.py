@@ -18,7 +18,7 @@ from skysim.apps.gui.messages import Detection, Light, TrackerResult
 from skysim.apps.gui.page import forms, keys, overlay
 from skysim.apps.gui.page.panels.sensor import Sensor
 from skysim.apps.gui.page.star_names import NAMES
-from skysim.apps.gui.server import Guard, host_of
+from skysim.apps.gui.server import Guard, host_of, report_path
 from skysim.apps.gui.worker import export, pointing, study_process, workbench
 from skysim.apps.gui.worker.photo import SUFFIXES
 from skysim.apps.gui.worker.session import Session, WorkerLost
@@ -224,21 +224,23 @@ async def knock(guard: Guard, headers: dict[str, str], query: str = "") -> int:
 
 
 async def page(scope: dict, receive: object, send) -> None:
-    await send({"type": "http.response.start", "status": 200})
+    await send({"type": "http.response.start", "status": 200, "headers": []})
 
 
 @pytest.mark.parametrize(
     ("headers", "query", "status"),
     [
-        ({"host": "127.0.0.1:8080"}, "", 200),
-        ({"host": "evil.example"}, "", 403),
-        ({"host": "localhost:8080", "origin": "http://evil.example"}, "", 403),
-        ({"host": "localhost:8080", "origin": "http://localhost:8080"}, "", 200),
-        ({"host": "localhost", "content-length": str(10**9)}, "", 413),
+        ({"host": "127.0.0.1:8080", "cookie": "skysim_gui_8080=right"}, "", 200),
+        ({"host": "127.0.0.1:8080"}, "", 401),
+        ({"host": "127.0.0.1:8080", "cookie": "skysim_gui_8081=right"}, "", 401),
+        ({"host": "evil.example"}, "token=right", 403),
+        ({"host": "localhost:8080", "origin": "http://evil.example"}, "token=right", 403),
+        ({"host": "localhost:8080", "origin": "http://localhost:8080"}, "token=right", 303),
+        ({"host": "localhost", "content-length": str(10**9)}, "token=right", 413),
     ],
 )
 def test_the_guard_of_a_page_of_this_machine(headers: dict[str, str], query: str, status: int) -> None:
-    guard = Guard(page, ("127.0.0.1", "localhost"), "")
+    guard = Guard(page, ("127.0.0.1", "localhost"), "right", 8080)
     assert asyncio.run(knock(guard, headers, query)) == status
 
 
@@ -248,13 +250,42 @@ def test_the_guard_of_a_page_of_this_machine(headers: dict[str, str], query: str
         ({"host": "lab"}, "", 401),
         ({"host": "lab"}, "token=wrong", 401),
         ({"host": "lab"}, "token=right", 303),
-        ({"host": "lab", "cookie": "skysim_gui=right"}, "", 200),
-        ({"host": "lab", "cookie": "skysim_gui=wrong"}, "", 401),
+        ({"host": "lab", "cookie": "skysim_gui_8080=right"}, "", 200),
+        ({"host": "lab", "cookie": "skysim_gui_8080=wrong"}, "", 401),
     ],
 )
 def test_the_guard_of_a_page_for_others_wants_the_token(headers: dict[str, str], query: str, status: int) -> None:
-    guard = Guard(page, ("*",), "right")
+    guard = Guard(page, ("*",), "right", 8080)
     assert asyncio.run(knock(guard, headers, query)) == status
+
+
+def test_every_response_has_a_policy_that_no_other_site_frames() -> None:
+    """A report keeps its own, stricter one."""
+    sent: list[dict] = []
+
+    async def send(message: dict) -> None:
+        sent.append(message)
+
+    async def report(_scope: dict, _receive: object, send) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"content-security-policy", b"none")]})
+
+    for served in (page, report):
+        headers = [(b"host", b"a"), (b"cookie", b"skysim_gui_1=right")]
+        scope = {"type": "http", "method": "GET", "path": "/", "headers": headers, "query_string": b""}
+        asyncio.run(Guard(served, ("*",), "right", 1)(scope, None, send))
+    policies = [dict(message["headers"]) for message in sent]
+    assert b"frame-ancestors 'none'" in policies[0][b"content-security-policy"]
+    assert policies[1][b"content-security-policy"] == b"none"
+    assert [one[b"x-frame-options"] for one in policies] == [b"DENY"] * 2
+
+
+@pytest.mark.parametrize("name", ["..", "../out", "\0", "x" * 5000, "none", ""])
+def test_a_report_that_is_none_of_the_folder_is_not_found(name: str, tmp_path: Path) -> None:
+    (tmp_path / "out" / "study").mkdir(parents=True)
+    for folder in (tmp_path, tmp_path / "out" / "study"):
+        (folder / "report.html").write_text("report")
+    assert report_path(tmp_path / "out", name) is None
+    assert report_path(tmp_path / "out", "study") is not None
 
 
 def test_a_host_is_told_with_or_without_its_port() -> None:

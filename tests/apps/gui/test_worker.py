@@ -12,6 +12,7 @@ import pytest
 from labpage import (
     CHROMIUM,
     NARROW,
+    TOKEN,
     Server,
     angles,
     changed,
@@ -124,8 +125,10 @@ def test_a_page_for_others_takes_its_token_and_no_other_site_s_word(
 ) -> None:
     assert server.status(Host="evil.example") == 403
     assert server.status("_nicegui_ws/socket.io/?EIO=4&transport=polling", Origin="http://evil.example") == 403
-    with Server(tmp_path, "--token", "right", host="0.0.0.0") as others:
-        assert [others.status(path) for path in ("", "?token=wrong", "?token=%C3%A9", "frame/x/1")] == [401] * 4
-        with opened(browser, others.url + "?token=right", NARROW) as page:
+    with Server(tmp_path, host="0.0.0.0") as others:
+        for one in (server, others):
+            assert [one.status(path) for path in ("", "?token=wrong", "?token=%C3%A9", "frame/x/1")] == [401] * 4
+            assert one.status("report/%00", Cookie=f"skysim_gui_{one.port}={TOKEN}") == 404
+        with opened(browser, others.login, NARROW) as page:
             assert "token" not in page.url
             status(page, "solved")

@@ -13,15 +13,17 @@ from skysim.core.errors import InputError
 
 def gui(
     scene: SceneArg = "shefex2",
-    host: Annotated[
-        str, typer.Option(help="Address to serve on; other than a loopback address requires a token.")
-    ] = "127.0.0.1",
+    host: Annotated[str, typer.Option(help="Address to serve on; 0.0.0.0 serves other machines too.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve on.")] = 8080,
     token: Annotated[
-        str, typer.Option(help="Access token that browsers must send; default: a random one if --host requires it.")
+        str, typer.Option(help="Access token that browsers must send; default: a random one, in the printed link.")
     ] = "",
     folder: Annotated[Path, typer.Option(help="Folder in which new scenes are saved.")] = Path("."),
     out: Annotated[Path, typer.Option(help="Folder of studies and their reports.")] = Path("out"),
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(metavar="SOURCE", help="Live camera that the page may watch: index, file or address; repeatable."),
+    ] = None,
     show: Annotated[bool, typer.Option("--open/--no-open", help="Open a browser.")] = True,
 ) -> None:
     """Open the interactive simulator in the browser (extra `gui`)."""
@@ -34,4 +36,4 @@ def gui(
         from skysim.apps.gui import server
     except ModuleNotFoundError as error:
         raise InputError(f"skysim gui needs {error.name}: pip install 'skysim[gui]'") from None
-    server.serve(scene, host, port, token, folder.resolve(), out.resolve(), show)
+    server.serve(scene, host, port, token, folder.resolve(), out.resolve(), camera or [], show)

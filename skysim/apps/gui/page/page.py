@@ -6,7 +6,7 @@ import math
 import secrets
 import signal
 import time
-from collections.abc import Awaitable, Mapping
+from collections.abc import Awaitable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ class Tab:
     """One tab: its worker, its scene, and its page elements.
 
     session : its worker; set when a browser has connected
-    folder : where scenes are saved;  out : where studies are
+    folder : where scenes are saved;  out : where studies are;  cameras : live ones that it may watch
     overrides : keys of the scene that differ from its file
     feedback : of the scene's controller; None without a controller
     solving : whether every frame is solved
@@ -46,9 +46,9 @@ class Tab:
 
     session: Session
 
-    def __init__(self, scene: str, folder: Path, out: Path) -> None:
+    def __init__(self, scene: str, folder: Path, out: Path, cameras: Sequence[str] = ()) -> None:
         self.id = secrets.token_hex(8)
-        self.scene, self.folder, self.out = scene, folder, out
+        self.scene, self.folder, self.out, self.cameras = scene, folder, out, cameras
         self.overrides: dict[str, str] = {}
         self.scene_info: SceneInfo | None = None
         self.view: FrameView | None = None
@@ -274,7 +274,8 @@ class Tab:
         elif name in files:
             ui.download(files[name], name)
         else:
-            self.show_message("no solution yet: press 1")
+            reason = "no solution yet: press 1" if name == "solution.json" else "not known of an image from elsewhere"
+            self.show_message(f"{kind}: {reason}")
 
     # Keys.
 
@@ -329,6 +330,6 @@ class Tab:
         elif action == "log":
             self.tabs.set_value("Log")
         elif action == "help":
-            self.help.open()
+            self.help.set_value(not self.help.value)
         elif action == "close":
             self.help.close()

@@ -1,4 +1,4 @@
-"""Export of the newest frame as files: frame, truth, solution, scene."""
+"""Export of the image on the page as files: frame, truth, solution, scene."""
 
 from __future__ import annotations
 
@@ -7,10 +7,16 @@ import zipfile
 from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import cv2
+import numpy as np
 import yaml
+from astropy.io import fits
+from numpy.typing import NDArray
 
+from skysim.apps.gui.messages import TrackerResult
+from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core.errors import InputError
 from skysim.core.io import files as file_io
@@ -18,6 +24,7 @@ from skysim.core.io.yaml_reader import VERSION, set_key
 from skysim.core.paths import SCENES
 from skysim.results import scoring
 from skysim.results.files import frames
+from skysim.results.report import annotate
 from skysim.scene.loader import find
 
 FILE_BY_ITEM = {  # file by menu entry
@@ -43,12 +50,32 @@ def frame_files(workbench: Workbench, base: str, overrides: dict[str, str]) -> d
     annotated = scoring.annotated(workbench.frame, workbench.truth, workbench.report)
     contents["figure.png"] = bytes(cv2.imencode(".png", annotated)[1])
     if result := workbench.result:
-        record = asdict(result)
-        record["spots"] = record.pop("detections")
-        del record["windows_px"]
-        contents["solution.json"] = file_io.to_json(record).encode()
+        contents["solution.json"] = file_io.to_json(solution_record(result)).encode()
     contents["scene.yaml"] = scene_yaml(base_reference(base), overrides).encode()
     return contents
+
+
+def photo_files(photo: Photo, image: NDArray) -> dict[str, bytes]:
+    """The files of an image that is not of the scene, by name: it has no truth, and the scene says nothing about it."""
+    detected = np.array([(spot.x, spot.y) for spot in photo.result.detections]).reshape(-1, 2)
+    identified = np.array([spot.id >= 0 for spot in photo.result.detections], bool)
+    record = solution_record(photo.result) | {"solution": photo.solution, "hint": photo.hint}
+    buffer = BytesIO()
+    fits.PrimaryHDU(image).writeto(buffer)
+    return {
+        "frame.fits": buffer.getvalue(),
+        "frame.png": bytes(cv2.imencode(".png", image)[1]),
+        "figure.png": bytes(cv2.imencode(".png", annotate(image, detected, detected[identified]))[1]),
+        "solution.json": file_io.to_json(record).encode(),
+    }
+
+
+def solution_record(result: TrackerResult) -> dict[str, Any]:
+    """The tracker's result for JSON."""
+    record = asdict(result)
+    record["spots"] = record.pop("detections")
+    del record["windows_px"]
+    return record
 
 
 def base_reference(scene: str, folder: Path | None = None) -> str:

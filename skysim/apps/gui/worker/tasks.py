@@ -27,12 +27,13 @@ class Worker:
 
     report_progress : reports progress (done, total) of a long task; raises Stopped if the task shall end
     moved : the testbed after the simulation of its motion
-    image : (H, W) pixels of an image that is not of the scene;  camera : an open live camera
+    other, image : an image that is not of the scene, and its (H, W) pixels;  camera : an open live camera
     """
 
     report_progress: Callable[[float, float], None]
     current: Workbench | None = None
     moved: Testbed | None = None
+    other: photo.Photo | None = None
     image: NDArray | None = None
     scene: str = ""
     overrides: Mapping[str, str] | None = None
@@ -47,13 +48,13 @@ class Worker:
 
     def show_frame(self, view: FrameView) -> FrameView:
         """Return the view, and forget the other image, because the page now shows the scene."""
-        self.image = None
+        self.other = self.image = None
         return view
 
     def show_photo(self, photo_pixels: photo.PhotoPixels) -> photo.Photo:
         """Keep an image that is not of the scene, and return it with its JPEG."""
-        shown, self.image = photo_pixels
-        return replace(shown, jpeg=self.jpeg())
+        self.other, self.image = photo_pixels
+        return replace(self.other, jpeg=self.jpeg())
 
     def shown_image(self) -> NDArray:
         """(H, W) pixels of the image on the page."""
@@ -119,6 +120,9 @@ class Worker:
         return self.show_photo(photo.photo_from_trial(study, Path(folder), trial))
 
     def export(self) -> dict[str, bytes]:
+        """The files of the image on the page."""
+        if self.other is not None and self.image is not None:
+            return export.photo_files(self.other, self.image)
         return export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
 
     def solve_file(self, name: str, data: bytes, fov_deg: float | None) -> photo.Photo:

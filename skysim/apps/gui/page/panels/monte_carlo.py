@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +32,7 @@ class MonteCarloPanel:
     def __init__(self, tab: Tab) -> None:
         self.tab, self.process, self.run_number = tab, StudyProcess(Path()), 0
         self.failed: tuple[tuple[int, str], ...] = ()
-        self.stopped = False
+        self.stopped = self.starting = False
         with ui.row().classes("w-full no-wrap items-center gap-2"):
             self.study_select = ui.select({}, value=None).props('dense outlined options-dense aria-label="Study"')
             self.study_select.classes("flex-grow").mark("study").on_value_change(self.study_chosen)
@@ -76,17 +77,29 @@ class MonteCarloPanel:
             await self.tab.set_field_of_view(float(self.field.value))
 
     async def start_or_stop(self) -> None:
-        if self.process.running:
-            self.process.stop()
-            self.stopped = True
-            self.note.set_text("stopping …")
+        if not self.process.running:
+            await self.start()
             return
-        await self.start()
+        self.process.stop()
+        self.stopped = True
+        self.note.set_text("stopping …")
 
     async def start(self) -> None:
-        """Start the chosen study and wait for its end; resume it if its store exists."""
-        if self.process.running:
+        """Start the chosen study and wait for its end; resume it if its store exists. Only one runs at a time."""
+        if self.starting or self.process.running:
             return
+        self.starting = True
+        try:
+            started = await self.start_process()
+        finally:
+            self.starting = False
+        if started:
+            fault = await self.process.wait()
+            if self.tab.is_open:
+                self.show_end("" if self.stopped else fault)
+
+    async def start_process(self) -> bool:
+        """Start the process of the chosen study; return whether it could be."""
         self.tab.show_message("")
         try:
             path = await run.io_bound(self.study_file)
@@ -95,7 +108,7 @@ class MonteCarloPanel:
                 raise InputError(f"{path.stem}: has the key optimize; allowed: studies with a design")
         except InputError as error:
             self.tab.show_message(str(error))
-            return
+            return False
         self.process = StudyProcess(path.parent if not self.study_select.value else self.tab.out / path.stem)
         self.process.total = study.trials
         self.bar.set_value(0)
@@ -105,9 +118,9 @@ class MonteCarloPanel:
         self.tab.log(f"study {path.stem}: {study.trials} trials")
         resumable = (self.process.folder / "study.sqlite").is_file()
         await self.process.start(path, "resume" if resumable else "run")
-        fault = await self.process.wait()
-        if self.tab.is_open:
-            self.show_end("" if self.stopped else fault)
+        if not self.tab.is_open:  # closed meanwhile, when there was no process to end
+            self.process.stop(signal.SIGTERM)
+        return True
 
     def study_file(self) -> Path:
         """Path of the study file: the chosen one, or a new Monte Carlo study; a stopped one if it is unchanged.

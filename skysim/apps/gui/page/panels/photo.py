@@ -32,8 +32,13 @@ class PhotoPanel:
         self.upload.props(f'flat bordered accept="{",".join(SUFFIXES)}"').classes("w-full").style("margin: 10px 0")
         self.upload.mark("upload")
         with ui.row().classes("w-full no-wrap items-center gap-2"):
-            self.source = ui.input("live camera: index, file or address").props("dense outlined").classes("flex-grow")
+            self.source = ui.select(list(tab.cameras), label="live camera", value=next(iter(tab.cameras), None))
+            self.source.props("dense outlined options-dense").classes("flex-grow")
             self.button = ui.button("Watch", on_click=self.watch).props("dense outline size=sm").mark("camera")
+            if not tab.cameras:
+                self.source.set_visibility(False)
+                self.button.set_visibility(False)
+                ui.label("To watch a live camera, start the page with skysim gui --camera 0.").classes("quiet")
         self.result_text = ui.label("No image yet. Images are solved lost in space; uncertain matches are rejected.")
         self.result_text.classes("mono quiet").style("margin-top: 10px; white-space: pre-wrap").mark("facts")
 
@@ -59,8 +64,12 @@ class PhotoPanel:
         if self.live:
             self.stop()
             return
+        # The value comes from the browser, which may send any: only what the command line named is opened.
+        if self.source.value not in self.tab.cameras:
+            self.tab.show_message("live camera: allowed: one of those given by --camera")
+            return
         self.tab.stop_playback()
-        self.live, solved_count, source = True, 0, (self.source.value or "0").strip()
+        self.live, solved_count, source = True, 0, str(self.source.value)
         self.button.set_text("Stop")
         while self.live:
             photo = await self.tab.run_task("solve_camera", source, self.fov.value)
