@@ -112,3 +112,31 @@ def is_time(text: str, kind: str, scale: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def read_named_rows(
+    path: Path, name: str, needed: Sequence[str], refusal: str, also: Sequence[str] = ()
+) -> tuple[list[str], Floats]:
+    """Names and numbers of a CSV file whose first line names its columns; # begins a comment.
+
+    name, needed : columns that it must have, of the rows' names, each once, and of numbers
+    also    : columns of numbers that it may have, after `needed` in the result;  others are not used
+    refusal : of a file without these columns or rows, after its path
+    Raises InputError with one line.
+    """
+    lines = [(n, line) for n, line in read_lines(path) if not line.startswith("#")]
+    columns = [cell.strip() for cell in lines[0][1].split(",")] if lines else []
+    if len(lines) < 2 or len({*columns}) < len(columns) or not {name, *needed} <= {*columns}:
+        raise InputError(f"{path}: {refusal}")
+    rows = [[cell.strip() for cell in line.split(",")] for _, line in lines[1:]]
+    places = [n for n, _ in lines[1:]]
+    for place, row in zip(places, rows, strict=True):
+        if len(row) != len(columns):
+            raise InputError(f"{path}, line {place}: {len(row)} values; allowed: {len(columns)}, as the first line has")
+    used = [columns.index(one) for one in (*needed, *also) if one in columns]
+    numbers = to_numbers(str(path), places, [[row[k] for k in used] for row in rows], len(used))
+    names = [row[columns.index(name)] for row in rows]
+    repeated = next((one for n, one in enumerate(names) if one in names[:n]), None)
+    if repeated is not None:
+        raise InputError(f"{path}: {excerpt(repeated)} occurs twice; allowed: once")
+    return names, numbers

@@ -10,10 +10,12 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+
+from skysim.core.errors import InputError
 
 MAX_CHARACTERS = 80  # of a quantity
 QUANTITY_PATTERN = r"^\s*[-+.]?\d.*[a-zA-Z]"  # pattern of a quantity in the JSON schema, for editors
@@ -122,6 +124,28 @@ Fraction = Annotated[Number, Field(ge=0, le=1)]
 Positive = Annotated[Number, Field(gt=0)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Ascending = Annotated[tuple[Number, ...], Field(min_length=2)]
+
+
+# SI unit, what it is, example, least and greatest value of a quantity on the command line.
+OptionRange = tuple[str, str, str, float, float]
+
+
+def option_quantities(ranges: Mapping[str, OptionRange], texts: Sequence[str]) -> list[float]:
+    """Quantities of the command line in SI units. Raises InputError for an invalid or out-of-range value.
+
+    ranges : by the option's name with _ for -;  texts : one each, in that order
+    """
+    values = []
+    for text, (name, (unit, what, example, low, high)) in zip(texts, ranges.items(), strict=True):
+        option = f"--{name.replace('_', '-')}"
+        try:
+            value = quantity(unit, what, example)(text)
+        except ValueError as error:
+            raise InputError(f"{option}: {error}") from None
+        if not low <= value <= high:
+            raise InputError(f"{option} {text}: allowed: {low:g} to {high:g}{unit and f' {unit}'}")
+        values.append(value)
+    return values
 
 
 class ConfigModel(BaseModel):

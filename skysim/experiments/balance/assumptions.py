@@ -8,7 +8,7 @@ import numpy as np
 
 from estimator.calibration.mass_properties.record import Lab, Prior, inertia_six
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import RPM_RAD_S, quantity
+from skysim.core.quantities.units import RPM_RAD_S, option_quantities
 from skysim.core.random_streams import BALANCE, random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import imu
@@ -53,19 +53,10 @@ def parse_uncertainty(
     inertia_sigma: str, offset_sigma: str, wheel_sigma: str, mount_sigma: str, tacho_sigma_rpm: float
 ) -> Uncertainty:
     """Parse the command line's quantities. Raises InputError for an invalid or out-of-range value."""
-    texts, values = (inertia_sigma, offset_sigma, wheel_sigma, mount_sigma), []
-    for text, (name, (unit, what, example, low, high)) in zip(texts, OPTIONS.items(), strict=True):
-        option = f"--{name.replace('_', '-')}"
-        try:
-            value = quantity(unit, what, example)(text)
-        except ValueError as error:
-            raise InputError(f"{option}: {error}") from None
-        if not low <= value <= high:
-            raise InputError(f"{option} {text}: allowed: {low:g} to {high:g}{unit and f' {unit}'}")
-        values.append(value)
+    texts = inertia_sigma, offset_sigma, wheel_sigma, mount_sigma
+    inertia, offset_m, wheel, mount_rad = option_quantities(OPTIONS, texts)
     if not 0 <= tacho_sigma_rpm <= MAX_TACHO_RPM:
         raise InputError(f"--tacho-sigma {tacho_sigma_rpm:g}: allowed: 0 to {MAX_TACHO_RPM:g} rpm")
-    inertia, offset_m, wheel, mount_rad = values
     return Uncertainty(inertia, offset_m, wheel, mount_rad, tacho_sigma_rpm * RPM_RAD_S)
 
 

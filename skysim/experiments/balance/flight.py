@@ -57,9 +57,7 @@ def check_scene(scene: Scene) -> None:
     if isinstance(scene.light, StarsConfig):
         raise InputError("light.kind: stars: balancing needs attitudes relative to the lab; allowed: dome")
     if vehicle.disturbances.cable:
-        raise InputError(
-            "vehicle.disturbances.cable: its spring is not told from a low center of mass; allowed: no cable"
-        )
+        raise InputError("vehicle.disturbances.cable: its spring acts like a low center of mass; allowed: no cable")
     if vehicle.cmgs:
         raise InputError("vehicle.cmgs: the stored momentum must be that of wheels; allowed: no cmgs")
 
@@ -67,8 +65,8 @@ def check_scene(scene: Scene) -> None:
 def excited_by_wheels(scene: Scene, vehicle: VehicleModel, tilt_deg: float) -> Scene:
     """The scene with its wheels at rest at first and a maneuver that tilts the vehicle at three yaw angles.
 
-    A horizontal torque that is constant in the lab is told from an offset of the center of mass by the yaw, its height
-    by the tilt, and the moments of inertia by the wheels' momentum, in which all three axes take part.
+    The yaw separates an offset of the center of mass from a horizontal torque that is constant in the lab, the tilt
+    shows the offset's height, and the wheels' momentum, about all three axes, the moments of inertia.
     """
     wheels = scene.vehicle.wheels
     if wheels is None:
@@ -127,7 +125,7 @@ def maneuver_s(scene: Scene) -> float:
 def fly(scene: Scene, assumptions: Assumptions, uncertainty: Uncertainty, watch: ProgressCallback | None) -> Flight:
     """Simulate a flight, render and solve its frames, and return what was measured.
 
-    Frames from the first on whose attitude is near the tilt stop are left out: a contact is a torque that nobody knows.
+    The frames from the first one near the tilt stop on are left out, because the torque of a contact is unknown.
     """
     testbed = run.simulate_motion(build_testbed(scene), watch)
     rows = measured_attitudes(testbed, watch)

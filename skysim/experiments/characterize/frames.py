@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.io import images
-from skysim.core.io.text import excerpt, read_lines, to_numbers
+from skysim.core.io.text import read_named_rows
 from skysim.experiments.characterize.sensor.levels import Level, LevelBuilder
 
 TABLE = "frames.csv"
@@ -106,26 +106,12 @@ def setting_of(path: Path, root: Path, picture: images.Picture, table: dict[str,
 
 def read_settings(path: Path) -> dict[str, Setting]:
     """Exposure and temperature by the file's name, from a CSV file. Raises InputError with one line."""
-    lines = [(n, line) for n, line in read_lines(path) if not line.startswith("#")]
-    names = [cell.strip() for cell in lines[0][1].split(",")] if lines else []
-    wanted = [name for name in ("exposure_s", "temperature_c") if name in names]
-    if len(lines) < 2 or len({*names}) < len(names) or "file" not in names or "exposure_s" not in wanted:
-        raise InputError(f"{path}: no exposures; allowed: columns file, exposure_s and, if known, temperature_c")
-    rows = [[cell.strip() for cell in line.split(",")] for _, line in lines[1:]]
-    places = [n for n, _ in lines[1:]]
-    for place, row in zip(places, rows, strict=True):
-        if len(row) != len(names):
-            raise InputError(f"{path}, line {place}: {len(row)} values; allowed: {len(names)}, as the first line has")
-    cells = [[row[names.index(name)] for name in wanted] for row in rows]
-    numbers = to_numbers(str(path), places, cells, len(wanted))
-    files = [row[names.index("file")] for row in rows]
-    repeated = next((name for n, name in enumerate(files) if name in files[:n]), None)
-    if repeated is not None:
-        raise InputError(f"{path}: {excerpt(repeated)} occurs twice; allowed: once")
+    refusal = "no exposures; allowed: columns file, exposure_s and, if known, temperature_c"
+    files, numbers = read_named_rows(path, "file", ["exposure_s"], refusal, ["temperature_c"])
     if (numbers[:, 0] < 0).any():
         raise InputError(f"{path}: an exposure below 0; allowed: seconds, 0 or more")
     return {
-        name: Setting(float(row[0]), float(row[1]) if len(wanted) == 2 else None)
+        name: Setting(float(row[0]), float(row[1]) if len(row) == 2 else None)
         for name, row in zip(files, numbers, strict=True)
     }
 

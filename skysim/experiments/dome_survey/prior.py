@@ -13,7 +13,7 @@ from estimator.calibration.survey_plan import SurveyModel
 from estimator.core.camera import Camera
 from estimator.identification.leds.codes import LedCode
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import quantity
+from skysim.core.quantities.units import option_quantities
 from skysim.core.types import Floats, Sources
 from skysim.experiments.configs import with_config
 from skysim.scene.scene import Scene
@@ -88,17 +88,8 @@ class CalibrationPrior:
 
 def survey_uncertainty(imu_sigma: str, led_sigma: str, lever_sigma: str, focal_error: str) -> SurveyUncertainty:
     """Parse the quantities of the command line. Raises InputError for an invalid or out-of-range value."""
-    texts, values = (imu_sigma, led_sigma, lever_sigma, focal_error), []
-    for text, (name, (unit, description, example, low, high)) in zip(texts, UNCERTAINTY_OPTIONS.items(), strict=True):
-        option = f"--{name.replace('_', '-')}"
-        try:
-            value = quantity(unit, description, example)(text)
-        except ValueError as error:
-            raise InputError(f"{option}: {error}") from None
-        values.append(value)
-        if not low <= value <= high:
-            raise InputError(f"{option} {text}: allowed: {low:g} to {high:g}{unit and f' {unit}'}")
-    return SurveyUncertainty(*values)
+    texts = imu_sigma, led_sigma, lever_sigma, focal_error
+    return SurveyUncertainty(*option_quantities(UNCERTAINTY_OPTIONS, texts))
 
 
 def calibration_prior(testbed: Testbed) -> CalibrationPrior:

@@ -25,7 +25,7 @@ from estimator.trackers.pipeline import Settings
 from skysim.core.errors import InputError
 from skysim.core.io import images
 from skysim.core.io.files import atomic_file
-from skysim.core.io.text import excerpt, read_lines, to_numbers
+from skysim.core.io.text import excerpt, read_named_rows
 from skysim.experiments.dome_survey import stops
 from skysim.experiments.dome_survey.frames import SurveyFrame, detect_lights
 from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty
@@ -102,21 +102,8 @@ def pixels_of(path: Path, camera: Camera) -> NDArray:
 
 def read_attitudes(path: Path) -> dict[str, Rotation]:
     """lab_from_body of each image by its name, from a CSV file. Raises InputError with one line."""
-    lines = [(n, line) for n, line in read_lines(path) if not line.startswith("#")]
-    names = [cell.strip() for cell in lines[0][1].split(",")] if lines else []
-    if len(lines) < 2 or len({*names}) < len(names) or not {*COLUMNS} <= {*names}:
-        raise InputError(f"{path}: no attitudes; allowed: columns {', '.join(COLUMNS)}, and others, which are not used")
-    rows = [[cell.strip() for cell in line.split(",")] for _, line in lines[1:]]
-    places = [n for n, _ in lines[1:]]
-    for place, row in zip(places, rows, strict=True):
-        if len(row) != len(names):
-            raise InputError(f"{path}, line {place}: {len(row)} values; allowed: {len(names)}, as the first line has")
-    columns = [names.index(name) for name in COLUMNS]
-    numbers = to_numbers(str(path), places, [[row[k] for k in columns[1:]] for row in rows], 3)
-    files = [row[columns[0]] for row in rows]
-    repeated = next((name for n, name in enumerate(files) if name in files[:n]), None)
-    if repeated is not None:
-        raise InputError(f"{path}: {excerpt(repeated)} occurs twice; allowed: once")
+    refusal = f"no attitudes; allowed: columns {', '.join(COLUMNS)}, and others, which are not used"
+    files, numbers = read_named_rows(path, COLUMNS[0], COLUMNS[1:], refusal)
     return dict(zip(files, stops.from_angles(numbers), strict=True))
 
 
