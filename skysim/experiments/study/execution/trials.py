@@ -9,7 +9,7 @@ import math
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from estimator.core.types import RateEstimate
 from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.pipeline import Report
 from skysim.camera import render
+from skysim.camera.detector.added_charge import AddedCharge
 from skysim.core import quaternion
 from skysim.core.paths import ROOT
 from skysim.core.random_streams import random_stream
@@ -84,6 +85,23 @@ class Segment(NamedTuple):
 
 
 # Running trials.
+
+
+@dataclass(frozen=True)
+class TrialJob:
+    """The trials of a study as a job of the engines."""
+
+    spec: TrialSpec
+
+    def run(self, chunk: tuple[Segment, ...]) -> list[Row]:
+        """Run all trials of a chunk, in order."""
+        return run_segments(self.spec, chunk)
+
+    def failed(self, segment: Segment, error: str) -> Row:
+        """The row of a trial that repeatedly killed its worker."""
+        replicate = segment.replicates[0]
+        seed = seed_of(self.spec, segment.point, replicate)
+        return Row(segment.first, segment.point, replicate, seed, "", code_version(), FAILED, error, 0.0)
 
 
 def run_segments(spec: TrialSpec, segments: tuple[Segment, ...]) -> list[Row]:
@@ -244,8 +262,13 @@ def zyz(first_rad: float, second_rad: float, third_rad: float) -> Floats:
     return np.array([cosine * math.cos(sum_), x, y, cosine * math.sin(sum_)])
 
 
-def render_trial_frame(setup: Setup, seed: int) -> tuple[Frame, Truth, tuple[float, float] | None]:
-    """Frame of a frame trial, its truth and, with a gyro, the streak vector (dx, dy) in pixels at the image center."""
+def render_trial_frame(
+    setup: Setup, seed: int, added: AddedCharge | None = None
+) -> tuple[Frame, Truth, tuple[float, float] | None]:
+    """Frame of a frame trial, its truth and, with a gyro, the streak vector (dx, dy) in pixels at the image center.
+
+    added : gets the masks of smear and particles
+    """
     trial, (attitude_rng, noise) = setup.trial, streams(setup, seed)
     assert isinstance(trial, FrameTrial)
     testbed = setup.testbed.in_run(int(noise.integers(2**62)))
@@ -259,7 +282,7 @@ def render_trial_frame(setup: Setup, seed: int) -> tuple[Frame, Truth, tuple[flo
     )
     middle = middle * Rotation.from_rotvec(turn_body)
     trajectory = constant_acceleration(testbed.scene, middle, rate_body, acceleration_body)
-    frame, truth = exposure.render_frame(replace(testbed, trajectory=trajectory), 0)
+    frame, truth = exposure.render_frame(replace(testbed, trajectory=trajectory), 0, added=added)
     streak_px = exposure_window(testbed.scene, 0).exposure_s * testbed.scene.camera.focal_px
     # For a star on the boresight: d(x / z)/dt = -w_y, d(y / z)/dt = w_x.
     return frame, truth, (-rate_cam[1] * streak_px, rate_cam[0] * streak_px) if trial.gyro else None
