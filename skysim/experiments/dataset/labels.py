@@ -1,0 +1,117 @@
+"""Render one frame of a dataset with its labels: sources, detections, masks of saturation, particles and smear."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.core.errors import ImageError
+from estimator.core.types import Centroids
+from estimator.trackers.pipeline import Clock, detect_and_centroid
+from skysim.camera.detector.added_charge import PARTICLES, SMEAR, AddedCharge
+from skysim.core.types import Floats, Frame, SourceTruth, Truth
+from skysim.experiments.study.execution import trials
+from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX
+from skysim.experiments.study.execution.setups import Setup
+from skysim.tracking.onboard_model import assumed_camera
+from skysim.tracking.settings import assumed_settings
+
+SATURATED = "saturated"
+MASKS = (SATURATED, PARTICLES, SMEAR)
+REACH_SIGMA = 3.0  # half-width of a source's box, in standard deviations of its image across the streak
+SOURCE = np.dtype(
+    [
+        ("id", "<i8"),
+        *((name, "<f8") for name in ("x_px", "y_px", "flux_x_px", "flux_y_px")),
+        *((name, "<f4") for name in ("streak_x_px", "streak_y_px", "streak_px", "electrons", "peak_e", "snr")),
+        ("sigma_px", "<f4"),
+        ("saturated", "?"),
+        ("detected", "?"),
+        *((name, "<f4") for name in ("detected_x_px", "detected_y_px")),
+    ]
+)
+
+
+class LabelledFrame(NamedTuple):
+    """A frame with its labels.
+
+    sources    : (N,) of dtype SOURCE, brightest first
+    unmatched_px : (M, 2) detections that are no source of the frame: noise, particles, hot pixels
+    masks      : by name of MASKS, run lengths of `run_lengths`; a mask that the scene cannot have is left out
+    """
+
+    frame: Frame
+    truth: Truth
+    sources: NDArray[Any]
+    unmatched_px: Floats
+    masks: dict[str, list[int]]
+
+
+def label_frame(setup: Setup, seed: int) -> LabelledFrame:
+    """Render a frame trial's frame and its labels. They depend on the setup and the seed alone."""
+    scene = setup.testbed.scene
+    config = scene.camera.detector
+    added = AddedCharge(max(math.hypot(config.read_noise_e, config.reset_noise_e), 1.0))
+    frame, truth, streak_px = trials.render_trial_frame(setup, seed, added)
+    masks = {SATURATED: frame.image_dn >= frame.saturation_dn, **added.masks}
+    try:
+        found = detect_and_centroid(frame.image_dn, assumed_camera(scene), assumed_settings(scene), Clock(), streak_px)
+    except ImageError:  # a saturated frame
+        found = Centroids.empty()
+    sources, unmatched = source_rows(truth.sources, found.xy_px)
+    runs = {name: run_lengths(masks[name]) for name in MASKS if name in masks}
+    return LabelledFrame(frame, truth, sources, unmatched, runs)
+
+
+def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Floats]:
+    """(N,) labels of the sources, brightest first, and the (M, 2) detections that are none of them.
+
+    A detection is that of the brightest source within SAME_LIGHT_PX of it, and half of the streak.
+    """
+    order = np.argsort(-truth.electrons, kind="stable")
+    rows = np.zeros(len(order), SOURCE)
+    rows["x_px"], rows["y_px"] = truth.xy_px[order].T
+    rows["flux_x_px"], rows["flux_y_px"] = truth.flux_xy_px[order].T
+    rows["streak_x_px"], rows["streak_y_px"] = truth.streak_xy_px[order].T
+    for name in ("id", "streak_px", "electrons", "peak_e", "snr", "saturated"):
+        rows[name] = getattr(truth, name)[order]
+    rows["sigma_px"] = across_sigma_px(truth.area_px, truth.streak_px)[order]
+    rows["detected_x_px"] = rows["detected_y_px"] = np.nan
+    unmatched = []
+    reach_px = SAME_LIGHT_PX + rows["streak_px"] / 2
+    for x, y in found_px.tolist():
+        near = np.hypot(rows["flux_x_px"] - x, rows["flux_y_px"] - y) <= reach_px
+        near &= ~rows["detected"]
+        n = int(np.argmax(near)) if near.any() else -1
+        if n < 0:
+            unmatched.append((x, y))
+        else:
+            rows["detected"][n], rows["detected_x_px"][n], rows["detected_y_px"][n] = True, x, y
+    return rows, np.array(unmatched, float).reshape(-1, 2)
+
+
+def across_sigma_px(area_px: Floats, streak_px: Floats) -> Floats:
+    """(N,) standard deviation across the streak of a Gaussian image with this noise-equivalent area.
+
+    A Gaussian of sigma s at rest has 4 pi s^2; one along a path L much longer than s has 2 sqrt(pi) s L. The root of
+    (4 pi s^2)^2 + (2 sqrt(pi) s L)^2 = area^2 has both limits, and an error of 6 % at most between them.
+    """
+    square = streak_px**2
+    return np.asarray(np.sqrt((np.sqrt(square**2 + 4 * area_px**2) - square) / (8 * math.pi)))
+
+
+def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
+    """Lengths of the runs of a (H, W) mask, column by column, the first of pixels that are not set: COCO's code."""
+    flat = np.flatnonzero(np.ascontiguousarray(mask.T))
+    if not len(flat):
+        return [mask.size]
+    breaks = np.flatnonzero(np.diff(flat) != 1)
+    first = np.concatenate([flat[:1], flat[breaks + 1]])
+    after = np.concatenate([flat[breaks], flat[-1:]]) + 1
+    ends = np.column_stack([first, after]).ravel()
+    lengths = np.diff(ends, prepend=0)
+    rest = mask.size - int(ends[-1])
+    return [*lengths.tolist(), *([rest] if rest else [])]
