@@ -64,7 +64,7 @@ def test_streak_vectors_are_those_of_the_turning_camera() -> None:
     camera: Camera = assumed_camera(setup.testbed.scene)
     rows, rate, half_s = one.sources, one.truth.rate_cam_rad_s, one.frame.exposure_s / 2
     assert len(rows) > 5
-    middle = camera.vectors(np.column_stack([rows["x_px"], rows["y_px"]]))
+    middle = camera.rays(np.column_stack([rows["x_px"], rows["y_px"]]))
     # Directions at rest turn against the camera: v(t) = exp(-w t) v.
     begin, end = (camera.pixels(Rotation.from_rotvec(-rate * t).apply(middle)) for t in (-half_s, half_s))
     found = np.column_stack([rows["streak_x_px"], rows["streak_y_px"]])
