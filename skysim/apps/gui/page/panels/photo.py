@@ -105,8 +105,7 @@ class PhotoPanel:
             message = self.tab.message_text
             self.show_text(message if message.startswith(name) else f"{name}: {message}", "warn")
             return
-        self.tab.sensor.show_photo(photo)
-        self.tab.attitude.show_photo(photo)
+        self.tab.display_photo(photo, kind="photo", photo=name)
         status_text = f"{name}: {photo.result.status}"
         if status_text != self.logged:  # log the repeated status of a live camera once
             self.logged = status_text
