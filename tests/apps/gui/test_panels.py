@@ -372,7 +372,8 @@ def test_a_flight_is_that_of_the_command_line_and_its_frames_are_kept() -> None:
 
 @pytest.mark.long
 def test_monte_carlo_is_a_study_that_runs_and_its_results_is_the_store_s(tmp_path: Path) -> None:
-    text = study_process.monte_carlo("shefex2", {"camera.f_number": "2"}, {"kind": "centroids", "noise_px": 0.2}, 40, 7)
+    trial = {"kind": "centroids", "noise_px": 0.2}
+    text = study_process.monte_carlo("shefex2", {"camera.focal_length": "24 mm"}, trial, 40, 7)
     path = tmp_path / "monte_carlo.yaml"
     path.write_text(text)
     values = study_loader.load(path)
