@@ -171,11 +171,11 @@ def test_undo_and_redo_go_through_moves_and_scenes(browser: Any, server: Server)
 @in_browser
 def test_the_printed_link_returns_to_the_last_view_and_a_bad_one_is_refused(browser: Any, server: Server) -> None:
     with opened(browser, server.login, NARROW) as page:
-        frame = source(page)
+        before = angles(page)
         page.keyboard.press("Shift+ArrowLeft")
-        changed(page, frame)
+        assert come(lambda: abs(angles(page)[0] - before[0]) > 1)
         moved = angles(page)
-        assert written(page, f"at={moved[0]:.4f}"[:-1])
+        assert written(page, f"at={moved[0]:.2f}"[:-1])
         page.goto(server.login)
         status(page, "solved")
         np.testing.assert_allclose(angles(page), moved, rtol=0, atol=1e-4)
@@ -200,7 +200,7 @@ def test_a_stopped_study_is_still_shown_after_a_reload_and_goes_on(browser: Any,
         status(page, "")
         panel(page, "Monte Carlo")
         assert page.get_by_text("trials; stopped, Start continues").inner_text() == stopped
-        assert page.get_by_label("noise, px").input_value() == "7"
+        assert page.get_by_label("noise, px").input_value() in ("7", "7.0")
         folders = sorted(server.out.iterdir())
         page.get_by_role("button", name="Start").click()
         grows = page.get_by_text(re.compile(r"^[1-9]\d* of 4000 trials$"))

@@ -306,7 +306,7 @@ class Tab:
         self.attitude.show(view)
         self.scene_3d.show(view)
 
-    def display_photo(self, photo: Photo, **state: Any) -> None:
+    def display_photo(self, photo: Photo, /, **state: Any) -> None:
         """Show an image that is not of the scene as it is now: a photograph, or a trial again.
 
         state : what the page shows thereby

@@ -53,7 +53,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-under {{ display: grid; grid-template-columns: 252px minmax(0, 1fr); gap: 14px; padding: 8px 14px; min-height: 0 }}
 .lab-zoom {{ width: 252px; height: 160px; border: 1px dashed {COLORS["line"]}; display: flex; align-items: center;
   justify-content: center }}
-.lab-run {{ display: flex; flex-direction: column; gap: 2px }}
+.lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-run > * {{ flex: none }}
 .mono.lab-log {{ white-space: pre-wrap; overflow-wrap: anywhere }}
 .q-uploader__subtitle {{ display: none }} .q-uploader__title {{ font-size: 13px; font-weight: 500 }}
 .lab-turn {{ position: absolute; left: 24px; bottom: 16px; font-size: 11px; pointer-events: none }}

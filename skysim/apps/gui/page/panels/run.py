@@ -55,17 +55,17 @@ class RunPanel:
             self.play = self.player_button("play_arrow", "Play", self.toggle)
             self.forward = self.player_button("skip_next", "Next frame", partial(self.step, 1))
             self.speed = ui.select(list(SPEEDS), value="real time").props('dense borderless aria-label="Speed"')
-            self.speed.classes("w-20").on("popup-hide", js_handler=keys.BLUR_JS).on_value_change(self.resync)
+            self.speed.classes("w-24").on("popup-hide", js_handler=keys.BLUR_JS).on_value_change(self.resync)
             self.loop = ui.select({}, on_change=self.close_loop).props("dense borderless options-dense")
             self.loop.props('aria-label="Feedback"').mark("feedback").on("popup-hide", js_handler=keys.BLUR_JS)
-            ui.space()
-            self.csv_button = ui.button("CSV", on_click=self.download).props("dense flat size=sm").mark("csv")
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
         with ui.row().classes("w-full no-wrap items-center gap-3"):
             self.seek = ui.slider(min=0, max=1, step=1, value=0).props('dense aria-label="Frame of the flight"')
             self.seek.on("change", self.slid).on("pan", self.slider_dragged)
             self.clock = ui.label().classes("mono flex-none").mark("clock")
-        self.summary = ui.label().classes("quiet").mark("flight")
+        with ui.row().classes("w-full no-wrap items-center gap-3"):
+            self.summary = ui.label().classes("quiet flex-grow").mark("flight")
+            self.csv_button = ui.button("CSV", on_click=self.download).props("dense flat size=sm").mark("csv")
         self.strips = StripChart()
         self.enable()
 

@@ -169,10 +169,10 @@ def y_axis(strip: Strip, n: int) -> dict[str, Any]:
 
 
 def decades(values: list[float]) -> dict[str, float]:
-    """Axis limits: whole decades that contain the values."""
+    """Axis limits: whole decades that contain the values, the uppermost four at most."""
     positive = [value for value in values if value > 0] or [1.0]
     low, high = math.floor(math.log10(min(positive))), math.ceil(math.log10(max(positive)))
-    return {"min": 10.0**low, "max": 10.0 ** max(high, low + 1)}
+    return {"min": 10.0 ** max(low, high - 4), "max": 10.0 ** max(high, low + 1)}
 
 
 def series(curve: Curve, n: int, k: int) -> dict[str, Any]:
