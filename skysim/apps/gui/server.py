@@ -70,12 +70,12 @@ class Guard:
             return PlainTextResponse("request of another site refused", 403)
         if int(headers.get("content-length") or 0) > LIMIT_BYTES + 2**16:
             return PlainTextResponse("request too large; allowed: 64 MB", 413)
-        if token_matches(request.cookies.get(self.cookie, ""), self.token):
-            return None
-        if token_matches(request.query_params.get("token", ""), self.token):
+        if token_matches(request.query_params.get("token", ""), self.token):  # the address does not keep it
             response = RedirectResponse("/", 303)
             response.set_cookie(self.cookie, self.token, path="/", httponly=True, samesite="strict")
             return response
+        if token_matches(request.cookies.get(self.cookie, ""), self.token):
+            return None
         return PlainTextResponse("token missing or wrong; open the address that the server printed: /?token=...", 401)
 
 

@@ -233,6 +233,7 @@ async def page(scope: dict, receive: object, send) -> None:
     ("headers", "query", "status"),
     [
         ({"host": "127.0.0.1:8080", "cookie": "skysim_gui_8080=right"}, "", 200),
+        ({"host": "127.0.0.1:8080", "cookie": "skysim_gui_8080=right"}, "token=right", 303),
         ({"host": "127.0.0.1:8080"}, "", 401),
         ({"host": "127.0.0.1:8080", "cookie": "skysim_gui_8081=right"}, "", 401),
         ({"host": "evil.example"}, "token=right", 403),

@@ -25,7 +25,7 @@ window.skysimHistory = {
     try { localStorage.setItem("skysim.view", JSON.stringify({ home, query })); } catch { /* storage is off */ }
   },
   read(home) {
-    if (location.search) return location.search;
+    if (/[?&]scene=/.test(location.search)) return location.search;
     try {
       const kept = JSON.parse(localStorage.getItem("skysim.view") || "{}");
       return kept.home === home ? kept.query : "";
