@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from nicegui import app, ui
+from nicegui import app, core, ui
 from starlette.datastructures import MutableHeaders
 from starlette.requests import HTTPConnection
 from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
@@ -17,7 +17,7 @@ from starlette.responses import FileResponse, PlainTextResponse, RedirectRespons
 from skysim.apps.gui.page.page import Tab
 from skysim.apps.gui.page.panels.photo import LIMIT_BYTES
 from skysim.apps.gui.page.panels.sensor import FRAMES
-from skysim.apps.gui.worker.session import SpareWorker
+from skysim.apps.gui.worker.session import MAX_WORKERS, SpareWorker
 from skysim.scene.loader import find
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
@@ -33,6 +33,7 @@ REPORT_POLICY = (
 SECURITY_HEADERS = {"x-frame-options": "DENY", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
 CONNECT_TIMEOUT_S = 50.0  # for a browser to load the page
 RECONNECT_S = 6.0  # for a lost browser to reconnect, before its work ends
+PING_INTERVAL_S, PING_TIMEOUT_S = 5.0, 30.0  # of the connection; a busy machine answers late
 
 
 class Guard:
@@ -69,12 +70,12 @@ class Guard:
             return PlainTextResponse("request of another site refused", 403)
         if int(headers.get("content-length") or 0) > LIMIT_BYTES + 2**16:
             return PlainTextResponse("request too large; allowed: 64 MB", 413)
-        if token_matches(request.cookies.get(self.cookie, ""), self.token):
-            return None
-        if token_matches(request.query_params.get("token", ""), self.token):
+        if token_matches(request.query_params.get("token", ""), self.token):  # the address does not keep it
             response = RedirectResponse("/", 303)
             response.set_cookie(self.cookie, self.token, path="/", httponly=True, samesite="strict")
             return response
+        if token_matches(request.cookies.get(self.cookie, ""), self.token):
+            return None
         return PlainTextResponse("token missing or wrong; open the address that the server printed: /?token=...", 401)
 
 
@@ -126,9 +127,15 @@ def report_path(out: Path, name: str) -> Path | None:
         return None
 
 
+def be_patient() -> None:
+    """Let a connection live although its browser answers late; NiceGUI takes both times from the reconnect time."""
+    core.sio.eio.ping_interval, core.sio.eio.ping_timeout = PING_INTERVAL_S, PING_TIMEOUT_S
+
+
 def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str]) -> None:
     """Register all routes, with a spare worker ready for the next tab."""
     spare = SpareWorker(str(find(scene).resolve()))
+    app.on_startup(be_patient)
     app.on_startup(spare.start)
     app.on_shutdown(spare.close)
 
@@ -157,9 +164,15 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str]) -> None:
             await client.connected(timeout=CONNECT_TIMEOUT_S)
         except TimeoutError:  # no browser has connected: start no worker
             return
-        tab.session = spare.take()
+        session = spare.take()
+        if session is None:
+            tab.sensor.show_waiting(
+                f"{MAX_WORKERS} of {MAX_WORKERS} workers in use.", "Close another page, then reload this one."
+            )
+            return
+        tab.session, tab.new_session = session, spare.take
         client.on_delete(tab.close)
-        await tab.open(scene)
+        await tab.start()
         await tab.scene_3d.adapt_frame_rate()
         spare.start()
 

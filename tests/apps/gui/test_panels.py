@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import re
-import time
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
@@ -28,9 +29,10 @@ from skysim.core.paths import SCENES
 from skysim.core.types import Mount
 from skysim.dynamics import multibody
 from skysim.experiments.study import loader as study_loader
-from skysim.results import stretch
+from skysim.results import scoring, stretch
 from skysim.scene import loader
 from skysim.simulation import exposure, run
+from skysim.simulation.testbed import build_tracker
 from skysim.sources import catalog, stars
 
 
@@ -231,6 +233,7 @@ async def page(scope: dict, receive: object, send) -> None:
     ("headers", "query", "status"),
     [
         ({"host": "127.0.0.1:8080", "cookie": "skysim_gui_8080=right"}, "", 200),
+        ({"host": "127.0.0.1:8080", "cookie": "skysim_gui_8080=right"}, "token=right", 303),
         ({"host": "127.0.0.1:8080"}, "", 401),
         ({"host": "127.0.0.1:8080", "cookie": "skysim_gui_8081=right"}, "", 401),
         ({"host": "evil.example"}, "token=right", 403),
@@ -324,25 +327,41 @@ def test_a_session_answers_refuses_and_ends_with_its_tab() -> None:
 
 
 @pytest.mark.long
-def test_a_flight_is_flown_played_and_stopped() -> None:
+def test_a_flight_is_that_of_the_command_line_and_its_frames_are_kept() -> None:
     async def story() -> None:
         session = Session()
         try:
             await session.run("open", "simsat_slew", {"exposure.frames": "4"}, False)
-            log = await session.run("simulate")
+            with pytest.raises(InputError, match="no flight has begun"):
+                await session.run("advance_flight", 0.01)
+            steps = [await session.run("begin_flight")]
+            await session.run("move", 0.0, 0.0, 1.0, False)  # other tasks have their turn
+            while steps[-1].phase != "done":
+                steps.append(await session.run("advance_flight", 0.5))
+                if len(steps) == 3:
+                    await session.run("move", 0.0, 0.0, 1.0, False)
+            rows = [row for step in steps for row in step.rows]
+            log = next(step.log for step in steps if step.log)
             assert log.t_s[-1] > 1.0
             assert set(log.curves) >= {"momentum", "pointing"}
-            view = await session.run("play", 0.5, True)
-            assert abs(view.t_s - 0.5) < 1e-9
+            # They are the frames of the command line: the same truth, errors and lights.
+            scene = loader.load("simsat_slew", {"exposure.frames": "4"})
+            testbed = run.prepare(scene)
+            expected = [scoring.row(one, scene, testbed.mount) for one in run.run(testbed, build_tracker(testbed))]
+            np.testing.assert_array_equal([row.cross_arcsec for row in rows], [one.cross_arcsec for one in expected])
+            np.testing.assert_array_equal([row.roll_arcsec for row in rows], [one.roll_arcsec for one in expected])
+            assert len(rows) == 4
+            view = await session.run("flight_frame", 2)
+            assert view.t_s == rows[2].t_s
             assert view.result.solved
-            await session.run("open", "simsat_slew", {}, False)
-            begun = time.monotonic()
-            flying = asyncio.create_task(session.run("simulate"))
-            while session.progress_fraction == 0.0 and time.monotonic() - begun < 20:
-                await asyncio.sleep(0.01)
-            session.halt()
-            with pytest.raises(InputError, match="stopped"):
-                await flying
+            files = await session.run("export")
+            frame, _ = exposure.render_frame(testbed, 2)
+            np.testing.assert_array_equal(fits.getdata(BytesIO(files["frame.fits"])), frame.image_dn)
+            before = view.jpeg
+            await session.run("show", "linear", 4.0)
+            assert (await session.run("flight_frame", 2)).jpeg != before
+            with pytest.raises(InputError, match="the flight has no frame 4"):
+                await session.run("flight_frame", 4)
         finally:
             session.close()
 
@@ -354,7 +373,8 @@ def test_a_flight_is_flown_played_and_stopped() -> None:
 
 @pytest.mark.long
 def test_monte_carlo_is_a_study_that_runs_and_its_results_is_the_store_s(tmp_path: Path) -> None:
-    text = study_process.monte_carlo("shefex2", {"camera.f_number": "2"}, {"kind": "centroids", "noise_px": 0.2}, 40, 7)
+    trial = {"kind": "centroids", "noise_px": 0.2}
+    text = study_process.monte_carlo("shefex2", {"camera.focal_length": "24 mm"}, trial, 40, 7)
     path = tmp_path / "monte_carlo.yaml"
     path.write_text(text)
     values = study_loader.load(path)

@@ -31,6 +31,9 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-head, .lab-keys {{ display: flex; align-items: center; gap: 14px; padding: 0 14px; background: {COLORS["panel"]};
   border: 0 solid {COLORS["line"]} }}
 .lab-name {{ font-weight: 600; letter-spacing: .02em; white-space: nowrap }}
+.lab-banner {{ flex: none; padding: 1px 8px; border-radius: 9px; font-size: 12px; max-width: 30ch; overflow: hidden;
+  text-overflow: ellipsis; white-space: nowrap; border: 1px solid {COLORS["line"]}; color: {COLORS["quiet"]} }}
+.lab-banner.flight, .lab-banner.replay, .lab-banner.photo {{ border-color: {COLORS["warn"]}; color: {COLORS["warn"]} }}
 .lab-title {{ flex: 0 1 auto; min-width: 0; max-width: 32% }} .lab-rate {{ width: 56px; text-align: right }}
 .lab-said {{ flex: 1 1 0; min-width: 0; text-align: right; line-height: 1.3; max-height: 2.6em; overflow: hidden;
   display: -webkit-box; -webkit-box-orient: vertical; -webkit-line-clamp: 2; overflow-wrap: anywhere }}
@@ -50,8 +53,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-under {{ display: grid; grid-template-columns: 252px minmax(0, 1fr); gap: 14px; padding: 8px 14px; min-height: 0 }}
 .lab-zoom {{ width: 252px; height: 160px; border: 1px dashed {COLORS["line"]}; display: flex; align-items: center;
   justify-content: center }}
-.lab-run {{ display: flex; flex-direction: column; gap: 2px }}
-.lab-run .lab-strips {{ flex: 1 1 0; margin-top: 8px; min-height: 380px }}
+.lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-run > * {{ flex: none }}
 .mono.lab-log {{ white-space: pre-wrap; overflow-wrap: anywhere }}
 .q-uploader__subtitle {{ display: none }} .q-uploader__title {{ font-size: 13px; font-weight: 500 }}
 .lab-turn {{ position: absolute; left: 24px; bottom: 16px; font-size: 11px; pointer-events: none }}

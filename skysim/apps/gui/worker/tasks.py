@@ -2,37 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import FrameView, MotionLog, PixelWindow, SceneInfo, Triple
+from skysim.apps.gui.messages import FlightStep, FrameView, PixelWindow, SceneInfo, Triple
 from skysim.apps.gui.worker import export, photo, playback, pointing
 from skysim.apps.gui.worker.workbench import Workbench, pixel_window
 from skysim.core.errors import InputError
 from skysim.core.io import images
-from skysim.simulation import run
-from skysim.simulation.testbed import Testbed
-
-
-class Stopped(Exception):
-    """Raised in a task that the user has stopped."""
 
 
 @dataclass
 class Worker:
-    """State between tasks: the workbench, its simulated motion, and the other image if the page shows one.
+    """State between tasks: the workbench, its flight, and the other image if the page shows one.
 
-    report_progress : reports progress (done, total) of a long task; raises Stopped if the task shall end
-    moved : the testbed after the simulation of its motion
+    unloaded : the flight's frame on the page, while its pixels are not rendered again
     other, image : an image that is not of the scene, and its (H, W) pixels;  camera : an open live camera
     """
 
-    report_progress: Callable[[float, float], None]
     current: Workbench | None = None
-    moved: Testbed | None = None
+    flight: playback.Flight | None = None
+    unloaded: int | None = None
     other: photo.Photo | None = None
     image: NDArray | None = None
     scene: str = ""
@@ -48,7 +41,7 @@ class Worker:
 
     def show_frame(self, view: FrameView) -> FrameView:
         """Return the view, and forget the other image, because the page now shows the scene."""
-        self.other = self.image = None
+        self.other = self.image = self.unloaded = None
         return view
 
     def show_photo(self, photo_pixels: photo.PhotoPixels) -> photo.Photo:
@@ -60,8 +53,15 @@ class Worker:
         """(H, W) pixels of the image on the page."""
         if self.image is not None:
             return self.image
+        self.load_pixels()
         assert self.workbench.frame is not None
         return self.workbench.frame.image_dn
+
+    def load_pixels(self) -> None:
+        """Render the pixels of the flight's frame on the page."""
+        if self.flight and self.unloaded is not None:
+            self.flight.load(self.unloaded)
+            self.unloaded = None
 
     def jpeg(self) -> bytes:
         return self.workbench.to_jpeg(self.shown_image())
@@ -72,11 +72,17 @@ class Worker:
         """Set up a scene and solve one frame, so that code is imported and compiled."""
         Workbench.open(scene, {}).render_at_rest(solve=True)
 
-    def open(self, scene: str, overrides: Mapping[str, str], solve: bool) -> tuple[SceneInfo, FrameView]:
-        """Set up a scene and render a first frame."""
-        self.current = Workbench.open(scene, overrides, self.current)
-        self.scene, self.overrides, self.moved = scene, dict(overrides), None
-        return self.current.scene_info, self.render(solve)
+    def open(
+        self, scene: str, overrides: Mapping[str, str], solve: bool, angles_deg: Triple | None = None
+    ) -> tuple[SceneInfo, FrameView]:
+        """Set up a scene and render a first frame; angles_deg : of another attitude than the kept one or the start."""
+        bench = Workbench.open(scene, overrides, self.current)
+        if angles_deg is not None:
+            bench.lab_from_body = pointing.from_angles(bench.scene, bench.testbed.mount, angles_deg)
+        self.current = bench
+        self.scene, self.overrides, self.flight = scene, dict(overrides), None
+        self.unloaded = None
+        return bench.scene_info, self.render(solve)
 
     def render(self, solve: bool) -> FrameView:
         return self.show_frame(self.workbench.render_at_rest(solve))
@@ -104,16 +110,25 @@ class Worker:
     def zoom(self, x: float, y: float) -> PixelWindow:
         return pixel_window(self.shown_image(), x, y)
 
-    def simulate(self) -> MotionLog:
-        """Simulate the whole motion, for playback."""
-        self.moved = run.simulate_motion(self.workbench.testbed, self.report_progress)
-        return playback.curves(self.moved.log)
+    def begin_flight(self) -> FlightStep:
+        """Begin to compute the scene's flight; `advance_flight` does the work."""
+        self.load_pixels()
+        self.flight = playback.Flight(self.workbench)
+        return self.flight.advance(0.0)
 
-    def play(self, t_s: float, solve: bool) -> FrameView:
-        """Render the frame at time t_s of the motion. Raises InputError if none was simulated."""
-        if self.moved is None:
-            raise InputError("no motion has been simulated yet")
-        return self.show_frame(playback.render_at(self.workbench, self.moved, t_s, solve))
+    def advance_flight(self, budget_s: float) -> FlightStep:
+        """Compute the flight for about a time. Raises InputError if none has begun."""
+        if self.flight is None:
+            raise InputError("no flight has begun")
+        return self.flight.advance(budget_s)
+
+    def flight_frame(self, index: int) -> FrameView:
+        """A kept frame of the flight. Raises InputError if it has not been computed."""
+        if self.flight is None or not 0 <= index < len(self.flight.frames):
+            raise InputError(f"the flight has no frame {index}")
+        view = self.show_frame(self.flight.show(index))
+        self.unloaded = index
+        return view
 
     def replay(self, study: str, folder: str, trial: int) -> photo.Photo:
         """Repeat a study's trial; the page shows its frame."""
@@ -123,6 +138,7 @@ class Worker:
         """The files of the image on the page."""
         if self.other is not None and self.image is not None:
             return export.photo_files(self.other, self.image)
+        self.load_pixels()
         return export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
 
     def solve_file(self, name: str, data: bytes, fov_deg: float | None) -> photo.Photo:

@@ -115,19 +115,28 @@ class Workbench:
         clock = Clock()
         self.frame, self.truth = exposure.render_frame(testbed, 0)
         self.report = factory.solve_frame(self.estimator, self.frame) if solve else None
-        jpeg, (height, width) = self.to_jpeg(self.frame.image_dn), self.frame.image_dn.shape
         clock.lap("all")
+        return self.frame_view(self.frame, self.truth, self.result, clock.seconds["all"])
+
+    def frame_view(self, frame: Frame, truth: Truth, result: TrackerResult | None, seconds: float) -> FrameView:
+        """The view of a frame of this scene for the page."""
+        height, width = frame.image_dn.shape
         return FrameView(
-            jpeg,
+            self.to_jpeg(frame.image_dn),
             (width, height),
-            scoring.angles_deg(self.truth.cam_from_lab, self.scene, self.testbed.mount),
-            tuple(quaternion.from_rotation(self.truth.lab_from_body).tolist()),
-            self.frame.exposure_s,
-            contrast.frame_statistics(self.frame.image_dn, self.frame.saturation_dn),
-            true_lights(self.truth, self.magnitude),
-            self.result,
-            1e3 * clock.seconds["all"],
+            scoring.angles_deg(truth.cam_from_lab, self.scene, self.testbed.mount),
+            tuple(quaternion.from_rotation(truth.lab_from_body).tolist()),
+            frame.exposure_s,
+            contrast.frame_statistics(frame.image_dn, frame.saturation_dn),
+            true_lights(truth, self.magnitude),
+            result,
+            1e3 * seconds,
         )
+
+    @property
+    def style(self) -> tuple[str, float, int]:
+        """What a frame's JPEG depends on besides its pixels."""
+        return self.stretch, self.brightness, self.widest_px
 
 
 def id_prefix(testbed: Testbed) -> str:

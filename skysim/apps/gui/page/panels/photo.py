@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
@@ -15,6 +17,17 @@ if TYPE_CHECKING:
 LIMIT_BYTES = 64 * 2**20
 
 
+def weak_handler(method: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """A handler that does not keep its panel alive: FastAPI keeps the route of an upload area in a cache for ever."""
+    reference = weakref.WeakMethod(method)
+
+    def handler(event: Any) -> Any:
+        alive = reference()
+        return alive(event) if alive else None
+
+    return handler
+
+
 class PhotoPanel:
     """Panel with upload area, live camera and result text."""
 
@@ -26,8 +39,8 @@ class PhotoPanel:
             label="Drop a FITS, PNG, JPEG, TIFF or BMP here",
             auto_upload=True,
             max_file_size=LIMIT_BYTES,
-            on_upload=self.uploaded,
-            on_rejected=lambda: tab.show_message(f"refused; allowed: {', '.join(SUFFIXES)}, at most 64 MB"),
+            on_upload=weak_handler(self.uploaded),
+            on_rejected=weak_handler(self.rejected),
         )
         self.upload.props(f'flat bordered accept="{",".join(SUFFIXES)}"').classes("w-full").style("margin: 10px 0")
         self.upload.mark("upload")
@@ -41,6 +54,9 @@ class PhotoPanel:
                 ui.label("To watch a live camera, start the page with skysim gui --camera 0.").classes("quiet")
         self.result_text = ui.label("No image yet. Images are solved lost in space; uncertain matches are rejected.")
         self.result_text.classes("mono quiet").style("margin-top: 10px; white-space: pre-wrap").mark("facts")
+
+    def rejected(self, _: Any) -> None:
+        self.tab.show_message(f"refused; allowed: {', '.join(SUFFIXES)}, at most 64 MB")
 
     async def uploaded(self, event: Any) -> None:
         data = await event.file.read()
@@ -89,8 +105,7 @@ class PhotoPanel:
             message = self.tab.message_text
             self.show_text(message if message.startswith(name) else f"{name}: {message}", "warn")
             return
-        self.tab.sensor.show_photo(photo)
-        self.tab.attitude.show_photo(photo)
+        self.tab.display_photo(photo, kind="photo", photo=name)
         status_text = f"{name}: {photo.result.status}"
         if status_text != self.logged:  # log the repeated status of a live camera once
             self.logged = status_text
