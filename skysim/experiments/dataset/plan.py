@@ -22,7 +22,7 @@ from skysim.experiments.study.factors import Factor, Settings, Value
 from skysim.experiments.study.plan import TRIAL, Plan, TrialSpec, digest, resolve_point
 
 KEYS = ("schema", "set", "trial", "factors", "hardware")  # of a file of variations
-AS_IT_IS = {"variation": {"levels": {"none": {}}}}  # factors of a scene without variations
+AS_IT_IS: dict[str, Any] = {"variation": {"levels": {"none": {}}}}  # factors of a scene without variations
 DRAW = 2  # first of the four numbers of a draw's key; seeds of trials and of hardware have up to three
 FORMATS = ("webdataset", "zarr", "coco")
 
@@ -127,14 +127,15 @@ def study_plan(scene: str, vary: Path | None, seed: int | None, overrides: Mappi
     trial = tree.get("trial") or {"kind": "frames"}
     if not isinstance(trial, dict) or trial.get("kind", "frames") != "frames":
         raise InputError(f"{vary}: trial.kind: a dataset has frames; allowed: frames")
-    if overrides and not isinstance(tree.get("set", {}), dict):
-        raise InputError(f"{vary}: set: {tree['set']!r}; allowed: keys of the scene with their values")
-    given = {key: parse_yaml(value)[1] for key, value in overrides.items()}
+    settings = tree.get("set") or {}
+    if not isinstance(settings, dict):
+        raise InputError(f"{vary}: set: {settings!r}; allowed: keys of the scene with their values")
+    settings = settings | {key: parse_yaml(value)[1] for key, value in overrides.items()}
     tree = {
         **{"title": "dataset", "factors": AS_IT_IS, "design": {"kind": "lhs", "points": 2}},
         **{"responses": ["identified"], **tree},
         **{"scene": scene, "seed": 0 if seed is None else seed},
-        **{"trial": {**trial, "kind": "frames"}, "set": {**tree.get("set", {}), **given}},
+        **{"trial": {**trial, "kind": "frames"}, "set": settings},
     }
     # Scenes are found from the folder of the command, not from that of the variations.
     return loader.plan_of(tree, text, vary or Path("--set"), Path.cwd() / "dataset")

@@ -71,7 +71,7 @@ def shard_name(folder: str, shard: int, suffix: str) -> str:
 def add_frame(tar: TarWriter, number: int, one: LabelledFrame, labels: dict[str, Any]) -> int:
     """Append a frame with its labels; return the position of its first pixel."""
     key, image = key_of(number), np.ascontiguousarray(one.frame.image_dn)
-    position = tar.add(f"{key}.image.npy", to_npy(image), memoryview(image).cast("B"))
+    position = tar.add(f"{key}.image.npy", to_npy(image), image.data.cast("B"))
     tar.add(f"{key}.sources.npy", to_npy(one.sources), one.sources.tobytes())
     masks = {name: {"size": list(image.shape), "counts": counts} for name, counts in one.masks.items()}
     more = {"masks": masks, "unmatched_px": one.unmatched_px.tolist(), "hidden": one.truth.hidden.tolist()}
