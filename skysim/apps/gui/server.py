@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hmac
 import secrets
+import signal
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from skysim.apps.gui.page.page import Tab
 from skysim.apps.gui.page.panels.photo import LIMIT_BYTES
 from skysim.apps.gui.page.panels.sensor import FRAMES
 from skysim.apps.gui.worker.session import MAX_WORKERS, SpareWorker
+from skysim.apps.gui.worker.study_process import StudyProcess
 from skysim.scene.loader import find
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
@@ -132,12 +134,19 @@ def be_patient() -> None:
     core.sio.eio.ping_interval, core.sio.eio.ping_timeout = PING_INTERVAL_S, PING_TIMEOUT_S
 
 
+def stop_studies() -> None:
+    """End the studies of all pages with the server; their trials so far are kept."""
+    for process in StudyProcess.begun:
+        process.stop(signal.SIGTERM)
+
+
 def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str]) -> None:
     """Register all routes, with a spare worker ready for the next tab."""
     spare = SpareWorker(str(find(scene).resolve()))
     app.on_startup(be_patient)
     app.on_startup(spare.start)
     app.on_shutdown(spare.close)
+    app.on_shutdown(stop_studies)
 
     @app.get("/frame/{tab}/{number}")
     def frame(tab: str, number: int) -> Response:

@@ -331,7 +331,7 @@ def test_a_live_camera_is_followed_to_its_end(browser: Any, tmp_path: Path) -> N
 
 def test_without_a_list_of_cameras_the_page_opens_none(page: Any) -> None:
     panel(page, "Image")
-    page.get_by_text("start the page with skysim gui --camera 0").wait_for()
+    page.get_by_text("No live camera is offered here").wait_for()
     assert page.get_by_role("button", name="Watch").count() == 0
 
 

@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import yaml
@@ -28,6 +28,7 @@ RESPONSES = {  # label on the page by response
     "time_ms_median": "ms per trial",
 }
 BINS = 28
+MAX_STUDIES = 4  # at once, of all pages
 MAX_FAILED = 20  # maximum number of failed trials in the results
 
 
@@ -63,7 +64,12 @@ def monte_carlo(scene: str, overrides: Mapping[str, str], trial: Mapping[str, An
 
 
 class StudyProcess:
-    """One study's process, which ends with its tab."""
+    """One study's process, which ends with its tab.
+
+    begun : processes of all tabs; those that have ended are taken out before another begins
+    """
+
+    begun: ClassVar[set[StudyProcess]] = set()
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -84,6 +90,14 @@ class StudyProcess:
             stderr=asyncio.subprocess.PIPE,
             start_new_session=True,
         )
+        StudyProcess.begun.add(self)
+
+    @classmethod
+    def check_count(cls) -> None:
+        """Raise InputError if MAX_STUDIES run already."""
+        cls.begun = {process for process in cls.begun if process.running}
+        if len(cls.begun) >= MAX_STUDIES:
+            raise InputError(f"{MAX_STUDIES} of {MAX_STUDIES} studies are running; start again after one has ended")
 
     async def wait(self) -> str:
         """Wait for the process; return the last line of its standard error if it failed, else ""."""

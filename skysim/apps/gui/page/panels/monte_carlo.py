@@ -12,7 +12,7 @@ from urllib.parse import quote
 from nicegui import run, ui
 
 from skysim.apps.gui.page import keys
-from skysim.apps.gui.page.style import COLORS, TOOLTIP, format_number
+from skysim.apps.gui.page.style import CURVE_COLORS, TOOLTIP, chart_color, format_number
 from skysim.apps.gui.worker.study_process import RESPONSES, StudyProcess, StudyResults, finished, monte_carlo
 from skysim.core.errors import InputError
 from skysim.core.io import files
@@ -104,6 +104,7 @@ class MonteCarloPanel:
         """Start the process of the chosen study; return whether it could be."""
         self.tab.show_message("")
         try:
+            StudyProcess.check_count()
             path = await run.io_bound(self.study_file)
             study = await run.io_bound(loader.load, path)
             if study.study.optimize is not None:
@@ -274,7 +275,8 @@ def format_interval(value: float, low: float, high: float) -> str:
 
 def options() -> dict[str, Any]:
     """ECharts options of the histogram of the error angle."""
-    text = {"color": COLORS["quiet"], "fontSize": 10}
+    text = {":color": chart_color("quiet"), "fontSize": 10}
+    rule = {"lineStyle": {":color": chart_color("line")}}
     title = {"text": "no trials yet", "left": "center", "top": "middle"}
     axis = {"axisLabel": text, "nameTextStyle": text}
     x_name = {"name": "error angle, ″", "nameLocation": "middle", "nameGap": 24}
@@ -283,7 +285,7 @@ def options() -> dict[str, Any]:
         "title": title | {"textStyle": text | {"fontWeight": "normal", "fontSize": 11}},
         "grid": {"left": 42, "right": 10, "top": 22, "bottom": 36},
         "xAxis": axis | x_name | {"type": "category", "data": []},
-        "yAxis": axis | {"name": "trials", "type": "value", "splitLine": {"lineStyle": {"color": COLORS["line"]}}},
+        "yAxis": axis | {"name": "trials", "type": "value", "splitLine": rule},
         "tooltip": TOOLTIP,
-        "series": [{"type": "bar", "data": [], "barCategoryGap": "8%", "itemStyle": {"color": COLORS["accent"]}}],
+        "series": [{"type": "bar", "data": [], "barCategoryGap": "8%", "itemStyle": {"color": CURVE_COLORS[0]}}],
     }

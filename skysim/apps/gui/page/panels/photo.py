@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
+from skysim.apps.gui.page.shell.wording import for_page
 from skysim.apps.gui.worker.photo import SUFFIXES
 
 if TYPE_CHECKING:
@@ -51,7 +52,9 @@ class PhotoPanel:
             if not tab.cameras:
                 self.source.set_visibility(False)
                 self.button.set_visibility(False)
-                ui.label("To watch a live camera, start the page with skysim gui --camera 0.").classes("quiet")
+                ui.label(
+                    "No live camera is offered here. Whoever starts the page names those that it may watch."
+                ).classes("quiet")
         self.result_text = ui.label("No image yet. Images are solved lost in space; uncertain matches are rejected.")
         self.result_text.classes("mono quiet").style("margin-top: 10px; white-space: pre-wrap").mark("facts")
 
@@ -82,7 +85,7 @@ class PhotoPanel:
             return
         # The value comes from the browser, which may send any: only what the command line named is opened.
         if self.source.value not in self.tab.cameras:
-            self.tab.show_message("live camera: allowed: one of those given by --camera")
+            self.tab.show_message("live camera: allowed: one of those in the list")
             return
         self.tab.stop_playback()
         self.live, solved_count, source = True, 0, str(self.source.value)
@@ -120,5 +123,5 @@ class PhotoPanel:
         self.show_text(f"{status_text}\n{pointing}\n{quality}", "good")
 
     def show_text(self, text: str, color: str) -> None:
-        self.result_text.set_text(text)
+        self.result_text.set_text(for_page(text))
         self.result_text.classes(remove="quiet good warn", add=color)

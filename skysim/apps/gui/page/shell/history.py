@@ -80,6 +80,12 @@ class History:
         arguments = ", ".join(json.dumps(value) for value in (view.query(), push, self.home))
         ui.run_javascript(f"skysimHistory.write({arguments})")
 
+    def undo(self) -> None:
+        ui.run_javascript("skysimHistory.undo()")
+
+    def redo(self) -> None:
+        ui.run_javascript("skysimHistory.redo()")
+
     def adopt(self) -> None:
         """The address names the page's view already."""
         self.written = self.tab.state
