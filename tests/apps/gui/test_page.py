@@ -17,6 +17,7 @@ from astropy.table import Table
 from labpage import (
     CHROMIUM,
     NARROW,
+    TOKEN,
     WIDE,
     Server,
     angles,
@@ -253,13 +254,16 @@ def test_f8_sets_the_field_and_an_arrow_goes_a_fiftieth_of_it(page: Any) -> None
     set_to(page, "field, °", "14.868")
 
 
-def test_monte_carlo_of_200_by_2(page: Any) -> None:
+def test_monte_carlo_of_200_by_2_whose_report_is_its_user_s(page: Any, server: Server) -> None:
     page.keyboard.press("2")
     page.get_by_text("200 of 200 trials").wait_for()
     told = page.get_by_text("identified", exact=False).last.inner_text()
     assert float(re.search(r"identified\s+([\d.]+)", told)[1]) > 0.9
+    report = page.locator("a[href^='/report/']").first
+    path = str(report.get_attribute("href")).removeprefix("/")
+    assert server.status(path, Cookie=f"skysim_gui_{server.port}={TOKEN}") == 404  # another browser that has the token
     with page.expect_popup() as opens:
-        page.locator("a[href^='/report/']").first.click()
+        report.click()
     opens.value.wait_for_function("() => document.title.startsWith('Monte Carlo of')")
     opens.value.close()
 

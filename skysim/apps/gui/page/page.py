@@ -47,6 +47,7 @@ class Tab:
 
     session : its worker; set when a browser has connected;  new_session : gives another, None if there are too many
     folder : where scenes are saved;  out : where studies are;  cameras : live ones that it may watch
+    user : its browser, see `server.user_of`
     state : what the page shows;  view : the newest frame of the scene
     feedback : of the scene's controller; None without a controller
     solving : whether every frame is solved
@@ -56,8 +57,8 @@ class Tab:
     session: Session
     new_session: Callable[[], Session | None]
 
-    def __init__(self, scene: str, folder: Path, out: Path, cameras: Sequence[str] = ()) -> None:
-        self.id = secrets.token_hex(8)
+    def __init__(self, scene: str, folder: Path, out: Path, cameras: Sequence[str] = (), user: str = "") -> None:
+        self.id, self.user = secrets.token_hex(8), user
         self.folder, self.out, self.cameras = folder, out, cameras
         self.state = View(scene)
         self.scene_info: SceneInfo | None = None

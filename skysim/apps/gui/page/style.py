@@ -60,8 +60,8 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-busy.hidden {{ display: inline-flex; visibility: hidden }}
 .lab-head {{ border-bottom-width: 1px }} .lab-keys {{ border-top-width: 1px; gap: 18px; overflow: hidden;
   white-space: nowrap; color: {COLORS["quiet"]}; font-size: 12px }}
-.lab-keys kbd, .lab-command kbd {{ background: {COLORS["line"]}; color: {COLORS["text"]}; border-radius: 3px; padding: 1px 5px;
-  font: 11px ui-monospace, monospace; margin-right: 5px }}
+.lab-keys kbd, .lab-command kbd {{ background: {COLORS["line"]}; color: {COLORS["text"]}; border-radius: 3px;
+  padding: 1px 5px; font: 11px ui-monospace, monospace; margin-right: 5px }}
 .lab-sensor {{ display: grid; grid-template-rows: 40px minmax(0, 1fr) 176px; min-width: 0; min-height: 0 }}
 .lab-bar {{ display: flex; align-items: center; gap: 14px; padding: 0 14px; min-width: 0; overflow: hidden }}
 .lab-frame {{ display: flex; align-items: center; justify-content: center; min-height: 0; min-width: 0; padding: 0 14px;

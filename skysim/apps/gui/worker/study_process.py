@@ -28,6 +28,7 @@ RESPONSES = {  # label on the page by response
     "time_ms_median": "ms per trial",
 }
 BINS = 28
+PAGE_STUDY = "monte_carlo_"  # of the folders of Monte Carlo studies, followed by their user
 MAX_STUDIES = 4  # at once, of all pages
 MAX_FAILED = 20  # maximum number of failed trials in the results
 
@@ -150,7 +151,13 @@ def histogram(error_arcsec: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
     return tuple(np.sqrt(edges[1:] * edges[:-1]).tolist()), tuple(counts.tolist())
 
 
-def finished(folder: Path) -> list[Path]:
-    """Folders of the studies that have a report, the newest first."""
+def is_shown(name: str, user: str) -> bool:
+    """Whether a user may see a study: all but the Monte Carlo studies that another user has started in the page."""
+    return not name.startswith(PAGE_STUDY) or name.startswith(f"{PAGE_STUDY}{user}_")
+
+
+def finished(folder: Path, user: str) -> list[Path]:
+    """Folders of the studies that have a report and are shown to a user, the newest first."""
     folders = [path.parent for path in folder.glob("*/report.html") if (path.parent / STORE).is_file()]
+    folders = [path for path in folders if is_shown(path.name, user)]
     return sorted(folders, key=lambda path: -(path / "report.html").stat().st_mtime)
