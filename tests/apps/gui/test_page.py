@@ -274,6 +274,9 @@ def test_a_dropped_picture_is_solved_shown_or_refused(page: Any, tmp_path: Path)
     photo = cv2.imread(str(ROOT / "docs" / "images" / "sky.jpg"), cv2.IMREAD_GRAYSCALE)
     page.set_input_files("input[type=file]", ROOT / "docs" / "images" / "sky.jpg")
     page.get_by_text("sky.jpg: solved").wait_for()
+    identifier = page.get_by_role("combobox", name="identifier F7").input_value()
+    stage = "" if identifier == "default" else f"; identifier {identifier}"
+    assert page.get_by_text(f"sky.jpg: solved{stage}\n").count() == 1
     assert page.get_by_label("angle 1").input_value() == ""  # nobody knows where it was taken
     page.mouse.click(*screen(page, photo.shape[::-1], 600, 400))
     for x, y, dn in pixels(page):  # the picture's, not the scene's

@@ -15,17 +15,19 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
+from estimator.trackers.pipeline import Report
+from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui.messages import Detection, Light, TrackerResult
 from skysim.apps.gui.page import forms, keys, overlay
 from skysim.apps.gui.page.panels.sensor import Sensor
 from skysim.apps.gui.page.star_names import NAMES
 from skysim.apps.gui.server import Guard, host_of, report_path, user_of
-from skysim.apps.gui.worker import export, pointing, study_process, workbench
+from skysim.apps.gui.worker import export, photo, pointing, study_process, workbench
 from skysim.apps.gui.worker.photo import SUFFIXES
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.io.images import IMAGE_SUFFIXES
-from skysim.core.paths import SCENES
+from skysim.core.paths import ROOT, SCENES
 from skysim.core.types import Mount
 from skysim.dynamics import multibody
 from skysim.experiments.study import loader as study_loader
@@ -379,6 +381,25 @@ def test_a_flight_is_that_of_the_command_line_and_its_frames_are_kept() -> None:
             session.close()
 
     asyncio.run(story())
+
+
+@pytest.mark.long
+def test_a_photograph_is_solved_by_the_chosen_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tracker's own settings say so; a stage that does not exist is refused."""
+    used: list[str] = []
+    solved = photo.solved_photo
+
+    def watched(image: np.ndarray, report: Report, tracker: StarTracker) -> photo.PhotoPixels:
+        used.append(tracker.settings.identifier)
+        return solved(image, report, tracker)
+
+    monkeypatch.setattr(photo, "solved_photo", watched)
+    data = (ROOT / "docs" / "images" / "sky.jpg").read_bytes()
+    for stages in ((), (("identifier", "pyramid"),)):
+        photo.photo_from_file("sky.jpg", data, 40.0, stages)
+    assert used == ["default", "pyramid"]
+    with pytest.raises(InputError, match="identifier"):
+        photo.photo_from_file("sky.jpg", data, 40.0, (("identifier", "none"),))
 
 
 # Monte Carlo.

@@ -143,11 +143,15 @@ def test_a_narrow_window_cuts_no_control(tab_of_own: Any, width: int) -> None:
       .filter(one => one.checkVisibility() && one.getBoundingClientRect().width > 2)
       .map(one => [one.ariaLabel || one.innerText || one.className, one.getBoundingClientRect()])
       .filter(([_, box]) => box.left < 0 || box.right > innerWidth + 1).map(([name]) => name)"""
+    panel(page, "Log")
     page.set_viewport_size({"width": width, "height": 800})
     for name in ("Lab", "Run", "Monte Carlo"):
         panel(page, name)
         page.wait_for_timeout(500)
         assert page.evaluate(cut) == []
+        if name == "Lab":  # hidden while the window changed
+            space = page.locator(".lab-space canvas").first
+            assert come(lambda: space.bounding_box()["width"] > 0.8 * width)  # noqa: B023
         assert page.locator(".lab-frame canvas").bounding_box()["width"] > 0.5 * width
         pictured(page, f"narrow_{width}_{name.replace(' ', '_')}")
     page.set_viewport_size(NARROW)

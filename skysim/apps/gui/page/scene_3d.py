@@ -30,7 +30,7 @@ class Scene3D:
         self.scene = ui.scene(
             width=400, height=300, grid=False, background_color=DARK["ground"], fps=FPS_SLOW, click_events=[]
         )
-        self.scene.classes("w-full h-full").mark("space")
+        self.scene.classes("w-full h-full lab-space").mark("space")
         self.fps = FPS_SLOW
         self.scene.on("pointerenter", lambda: self.scene.props(f"fps={FPS}"), args=[])
         self.scene.on("pointerleave", lambda: self.scene.props(f"fps={self.fps}"), args=[])

@@ -133,7 +133,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   .lab-sensor {{ grid-template-rows: auto min(60vh, 100vw) auto }} .lab-bar {{ flex-wrap: wrap; padding: 4px 14px }}
   .lab-under {{ grid-template-columns: repeat(auto-fit, minmax(252px, 1fr)); overflow: auto }}
   .lab-side {{ grid-template-rows: auto auto 620px; border-left: 0 }}
-  .lab-run > .row {{ flex-wrap: wrap }}
+  .lab-run > .row:first-child {{ flex-wrap: wrap }}
 }}
 @media (max-width: 600px) {{
   .lab-stages {{ grid-template-columns: repeat(2, minmax(0, 1fr)) }}

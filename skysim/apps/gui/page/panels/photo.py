@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from nicegui import ui
 
 from skysim.apps.gui.page.shell.wording import for_page
-from skysim.apps.gui.worker.photo import SUFFIXES
+from skysim.apps.gui.worker.photo import SUFFIXES, Stages
 
 if TYPE_CHECKING:
     from skysim.apps.gui.page.page import Tab
@@ -70,7 +70,15 @@ class PhotoPanel:
             return
         self.tab.stop_playback()
         self.show_text(f"solving {name} …", "quiet")
-        self.show(name, await self.tab.run_task("solve_file", name, data, self.fov.value, activity=f"solving {name} …"))
+        settings = self.fov.value, self.stages
+        self.show(name, await self.tab.run_task("solve_file", name, data, *settings, activity=f"solving {name} …"))
+
+    @property
+    def stages(self) -> Stages:
+        """The algorithms that the user has chosen for stars; a dome's do not solve photographs."""
+        info = self.tab.scene_info
+        chosen = info.stages if info and info.under_stars else {}
+        return tuple((stage, name) for stage, name in chosen.items() if name != "default")
 
     def stop(self) -> None:
         """Stop the live camera after the current frame."""
@@ -91,7 +99,7 @@ class PhotoPanel:
         self.live, solved_count, source = True, 0, str(self.source.value)
         self.button.set_text("Stop")
         while self.live:
-            photo = await self.tab.run_task("solve_camera", source, self.fov.value)
+            photo = await self.tab.run_task("solve_camera", source, self.fov.value, self.stages)
             if not self.tab.is_open:
                 return
             if photo or not solved_count:  # a camera that ends keeps its last result on the page
@@ -109,7 +117,8 @@ class PhotoPanel:
             self.show_text(message if message.startswith(name) else f"{name}: {message}", "warn")
             return
         self.tab.display_photo(photo, kind="photo", photo=name)
-        status_text = f"{name}: {photo.result.status}"
+        stages = "".join(f"; {stage} {algorithm}" for stage, algorithm in self.stages)
+        status_text = f"{name}: {photo.result.status}{stages}"
         if status_text != self.logged:  # log the repeated status of a live camera once
             self.logged = status_text
             self.tab.log(status_text)

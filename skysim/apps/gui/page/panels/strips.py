@@ -103,7 +103,7 @@ def strips(rows: Sequence[FrameRow], log: MotionLog) -> list[Strip]:
 class StripChart:
     """The chart; a click on a strip emits the page's event `moment` with the time there.
 
-    strips : that are drawn;  size : number of series, without the cursors
+    strips : that are drawn
     """
 
     def __init__(self) -> None:
@@ -125,6 +125,7 @@ class StripChart:
         """Move the line of the shown moment in all strips, without sending their curves again."""
         cursors = [cursor(n, t_s) for n in range(len(self.strips))]
         if cursors:
+            self.chart.options["series"][-len(cursors) :] = cursors  # for the next time that all is sent
             self.chart.run_chart_method("setOption", {"series": cursors})
 
 

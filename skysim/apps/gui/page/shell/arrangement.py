@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from nicegui import ui
 
-# The splitter works in the browser alone. An arrow key on it is not the camera's.
+# The splitter works in the browser alone. An arrow key on it is not the camera's. The 3-D view takes its size only when
+# the window changes, so it is told also after the splitter or its tab has changed it.
 SPLITTER_JS = """
 window.skysimSplitter = {
   set(px) {
@@ -18,6 +19,12 @@ try {
   const wide = Number(localStorage.getItem("skysim.side"));
   if (wide) document.documentElement.style.setProperty("--lab-side", wide + "px");
 } catch { /* storage is off */ }
+const waiting = setInterval(() => {
+  const space = document.querySelector(".lab-space");
+  if (!space) return;
+  clearInterval(waiting);
+  new ResizeObserver(() => window.dispatchEvent(new Event("resize"))).observe(space);
+}, 200);
 document.addEventListener("pointerdown", event => {
   if (!event.target.classList.contains("lab-split")) return;
   event.preventDefault();
