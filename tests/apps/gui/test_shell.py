@@ -108,6 +108,7 @@ def test_the_theme_and_the_splitter_are_remembered(tab_of_own: Any) -> None:
         page.keyboard.press("Control+k")
         page.get_by_label("Action").fill("theme")
         page.get_by_role("option").first.click()
+        page.get_by_role("dialog").wait_for(state="detached")
 
     dark, before = ground(), wide()
     toggle()
@@ -117,7 +118,7 @@ def test_the_theme_and_the_splitter_are_remembered(tab_of_own: Any) -> None:
     page.mouse.down()
     page.mouse.move(1280 - before - 80, 400, steps=4)
     page.mouse.up()
-    assert abs(wide() - before - 80) < 8
+    assert come(lambda: abs(wide() - before - 80) < 8)
     page.get_by_role("separator", name="Width of the panels").focus()
     frame, dragged = source(page), wide()
     page.keyboard.press("ArrowRight")
