@@ -52,9 +52,7 @@ class PhotoPanel:
             if not tab.cameras:
                 self.source.set_visibility(False)
                 self.button.set_visibility(False)
-                ui.label(
-                    "No live camera is offered here. Whoever starts the page names those that it may watch."
-                ).classes("quiet")
+                ui.label("No live camera is offered here. Cameras are named when the lab is started.").classes("quiet")
         self.result_text = ui.label("No image yet. Images are solved lost in space; uncertain matches are rejected.")
         self.result_text.classes("mono quiet").style("margin-top: 10px; white-space: pre-wrap").mark("facts")
 

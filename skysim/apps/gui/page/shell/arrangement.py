@@ -5,7 +5,7 @@ from __future__ import annotations
 from nicegui import ui
 
 # The splitter works in the browser alone. An arrow key on it is not the camera's. The 3-D view takes its size only when
-# the window changes, so it is told also after the splitter or its tab has changed it.
+# the window changes, so that a change by the splitter or by its tab sends a resize event.
 SPLITTER_JS = """
 window.skysimSplitter = {
   set(px) {
