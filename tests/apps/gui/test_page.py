@@ -17,6 +17,7 @@ from astropy.table import Table
 from labpage import (
     CHROMIUM,
     NARROW,
+    TOKEN,
     WIDE,
     Server,
     angles,
@@ -253,13 +254,16 @@ def test_f8_sets_the_field_and_an_arrow_goes_a_fiftieth_of_it(page: Any) -> None
     set_to(page, "field, °", "14.868")
 
 
-def test_monte_carlo_of_200_by_2(page: Any) -> None:
+def test_monte_carlo_of_200_by_2_whose_report_is_its_user_s(page: Any, server: Server) -> None:
     page.keyboard.press("2")
     page.get_by_text("200 of 200 trials").wait_for()
     told = page.get_by_text("identified", exact=False).last.inner_text()
     assert float(re.search(r"identified\s+([\d.]+)", told)[1]) > 0.9
+    report = page.locator("a[href^='/report/']").first
+    path = str(report.get_attribute("href")).removeprefix("/")
+    assert server.status(path, Cookie=f"skysim_gui_{server.port}={TOKEN}") == 404  # another browser that has the token
     with page.expect_popup() as opens:
-        page.locator("a[href^='/report/']").first.click()
+        report.click()
     opens.value.wait_for_function("() => document.title.startsWith('Monte Carlo of')")
     opens.value.close()
 
@@ -270,6 +274,9 @@ def test_a_dropped_picture_is_solved_shown_or_refused(page: Any, tmp_path: Path)
     photo = cv2.imread(str(ROOT / "docs" / "images" / "sky.jpg"), cv2.IMREAD_GRAYSCALE)
     page.set_input_files("input[type=file]", ROOT / "docs" / "images" / "sky.jpg")
     page.get_by_text("sky.jpg: solved").wait_for()
+    identifier = page.get_by_role("combobox", name="identifier F7").input_value()
+    stage = "" if identifier == "default" else f"; identifier {identifier}"
+    assert page.get_by_text(f"sky.jpg: solved{stage}\n").count() == 1
     assert page.get_by_label("angle 1").input_value() == ""  # nobody knows where it was taken
     page.mouse.click(*screen(page, photo.shape[::-1], 600, 400))
     for x, y, dn in pixels(page):  # the picture's, not the scene's
@@ -331,7 +338,7 @@ def test_a_live_camera_is_followed_to_its_end(browser: Any, tmp_path: Path) -> N
 
 def test_without_a_list_of_cameras_the_page_opens_none(page: Any) -> None:
     panel(page, "Image")
-    page.get_by_text("start the page with skysim gui --camera 0").wait_for()
+    page.get_by_text("No live camera is offered here").wait_for()
     assert page.get_by_role("button", name="Watch").count() == 0
 
 

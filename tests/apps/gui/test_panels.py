@@ -15,17 +15,19 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
+from estimator.trackers.pipeline import Report
+from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui.messages import Detection, Light, TrackerResult
 from skysim.apps.gui.page import forms, keys, overlay
 from skysim.apps.gui.page.panels.sensor import Sensor
 from skysim.apps.gui.page.star_names import NAMES
-from skysim.apps.gui.server import Guard, host_of, report_path
-from skysim.apps.gui.worker import export, pointing, study_process, workbench
+from skysim.apps.gui.server import Guard, host_of, report_path, user_of
+from skysim.apps.gui.worker import export, photo, pointing, study_process, workbench
 from skysim.apps.gui.worker.photo import SUFFIXES
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.io.images import IMAGE_SUFFIXES
-from skysim.core.paths import SCENES
+from skysim.core.paths import ROOT, SCENES
 from skysim.core.types import Mount
 from skysim.dynamics import multibody
 from skysim.experiments.study import loader as study_loader
@@ -291,6 +293,19 @@ def test_a_report_that_is_none_of_the_folder_is_not_found(name: str, tmp_path: P
     assert report_path(tmp_path / "out", "study") is not None
 
 
+def test_a_report_of_a_study_of_the_page_is_its_user_s_alone(tmp_path: Path) -> None:
+    mine, other = "0123456789abcdef", "fedcba9876543210"
+    names = f"monte_carlo_{mine}_tab_1", f"monte_carlo_{other}_tab_1", "afit_sensitivity"
+    for name in names:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "report.html").write_text("report")
+        (tmp_path / name / "study.sqlite").touch()
+    assert [report_path(tmp_path, name, mine) is not None for name in names] == [True, False, True]
+    assert [report_path(tmp_path, name) is not None for name in names] == [False, False, True]
+    assert user_of({"skysim_user": mine}) == mine
+    assert user_of({"skysim_user": "../x"}) == user_of({}) == ""
+
+
 def test_a_host_is_told_with_or_without_its_port() -> None:
     assert [host_of(one) for one in ("a:1", "a", "[::1]:8", "[::1]")] == ["a", "a", "[::1]", "[::1]"]
 
@@ -368,6 +383,25 @@ def test_a_flight_is_that_of_the_command_line_and_its_frames_are_kept() -> None:
     asyncio.run(story())
 
 
+@pytest.mark.long
+def test_a_photograph_is_solved_by_the_chosen_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tracker's own settings say so; a stage that does not exist is refused."""
+    used: list[str] = []
+    solved = photo.solved_photo
+
+    def watched(image: np.ndarray, report: Report, tracker: StarTracker) -> photo.PhotoPixels:
+        used.append(tracker.settings.identifier)
+        return solved(image, report, tracker)
+
+    monkeypatch.setattr(photo, "solved_photo", watched)
+    data = (ROOT / "docs" / "images" / "sky.jpg").read_bytes()
+    for stages in ((), (("identifier", "pyramid"),)):
+        photo.photo_from_file("sky.jpg", data, 40.0, stages)
+    assert used == ["default", "pyramid"]
+    with pytest.raises(InputError, match="identifier"):
+        photo.photo_from_file("sky.jpg", data, 40.0, (("identifier", "none"),))
+
+
 # Monte Carlo.
 
 
@@ -393,7 +427,7 @@ def test_monte_carlo_is_a_study_that_runs_and_its_results_is_the_store_s(tmp_pat
     assert results.done == 40
     assert sum(results.counts) == round(40 * (1 - results.statistics["refused"][0]))
     assert results.statistics["identified"][0] > 0.8
-    assert tmp_path in study_process.finished(tmp_path.parent)
+    assert tmp_path in study_process.finished(tmp_path.parent, "")
 
 
 def test_a_histogram_counts_every_trial_once() -> None:

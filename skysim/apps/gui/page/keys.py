@@ -40,10 +40,12 @@ KEYS = (
     Key((",", "."), ", .", "step", "", "show the previous or the next frame of the flight"),
     Key(("l",), "L", "live", "", "return to the live scene"),
     Key(("Ctrl+z",), "Ctrl Z", "undo", "", "undo the last change; Ctrl Shift Z: redo"),
+    Key(("Ctrl+k",), "Ctrl K", "palette", "actions", "list every action; type a part of its name"),
     Key(("F10",), "F10", "log", "log", "show the log of this session"),
     Key(("F1",), "F1", "help", "help", "show this help"),
     Key(("Escape",), "Esc", "close", "close", "close the help"),
 )
+PERFORMED = {"identify", "monte_carlo", "play", "live", "attitude", "sensor", "identifier", "runs", "log", "help"}
 ACTION_BY_KEY = {name: key.action for key in KEYS for name in key.keys}
 
 # A list or tab keeps the keyboard focus after a choice, so the focus is removed from it.

@@ -9,6 +9,7 @@ import signal
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ from nicegui.events import KeyEventArguments
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.page import forms, keys, style
-from skysim.apps.gui.page.history import History
 from skysim.apps.gui.page.panels.attitude import AttitudeCard
 from skysim.apps.gui.page.panels.monte_carlo import MonteCarloPanel
 from skysim.apps.gui.page.panels.photo import PhotoPanel
@@ -26,6 +26,10 @@ from skysim.apps.gui.page.panels.run import RunPanel
 from skysim.apps.gui.page.panels.scene import ScenePanel
 from skysim.apps.gui.page.panels.sensor import FRAMES, Sensor
 from skysim.apps.gui.page.scene_3d import Scene3D
+from skysim.apps.gui.page.shell.arrangement import Arrangement
+from skysim.apps.gui.page.shell.history import History
+from skysim.apps.gui.page.shell.palette import Command, Palette
+from skysim.apps.gui.page.shell.wording import for_page
 from skysim.apps.gui.state import View
 from skysim.apps.gui.worker import export, pointing
 from skysim.apps.gui.worker.photo import Photo
@@ -43,6 +47,7 @@ class Tab:
 
     session : its worker; set when a browser has connected;  new_session : gives another, None if there are too many
     folder : where scenes are saved;  out : where studies are;  cameras : live ones that it may watch
+    user : its browser, see `server.user_of`
     state : what the page shows;  view : the newest frame of the scene
     feedback : of the scene's controller; None without a controller
     solving : whether every frame is solved
@@ -52,8 +57,8 @@ class Tab:
     session: Session
     new_session: Callable[[], Session | None]
 
-    def __init__(self, scene: str, folder: Path, out: Path, cameras: Sequence[str] = ()) -> None:
-        self.id = secrets.token_hex(8)
+    def __init__(self, scene: str, folder: Path, out: Path, cameras: Sequence[str] = (), user: str = "") -> None:
+        self.id, self.user = secrets.token_hex(8), user
         self.folder, self.out, self.cameras = folder, out, cameras
         self.state = View(scene)
         self.scene_info: SceneInfo | None = None
@@ -98,15 +103,16 @@ class Tab:
         ui.add_css(style.CSS)
         ui.add_body_html(f"<script>{keys.SUPPRESS_DEFAULTS_JS}</script>")
         ui.colors(
-            primary=style.COLORS["accent"],
-            negative=style.COLORS["bad"],
-            dark=style.COLORS["panel"],
-            dark_page=style.COLORS["ground"],
+            primary=style.DARK["accent"],
+            negative=style.DARK["bad"],
+            dark=style.DARK["panel"],
+            dark_page=style.DARK["ground"],
         )
         with ui.element("div").classes("lab"):
             self.build_header()
             self.sensor = Sensor(self)
             with ui.element("div").classes("lab-side"):
+                Arrangement.splitter()
                 self.attitude = AttitudeCard(self)
                 self.build_panels()
             with ui.element("div").classes("lab-keys").mark("keys"):
@@ -116,6 +122,8 @@ class Tab:
         self.help = self.build_help()
         ui.keyboard(on_key=self.key, ignore=["input", "textarea"])
         self.history = History(self, self.scene)
+        self.palette = Palette(self.commands)
+        self.arrangement = Arrangement([self.run_panel.strips.chart, self.study_panel.chart])
 
     def build_header(self) -> None:
         with ui.element("div").classes("lab-head"):
@@ -183,6 +191,24 @@ class Tab:
                     ui.label(key.help)
         return dialog
 
+    def commands(self) -> list[Command]:
+        """Every action with its key: those of keys, the panels, the exports."""
+        found = [
+            Command(key.help, key.label, partial(self.perform, key.action))
+            for key in keys.KEYS
+            if key.action in keys.PERFORMED
+        ]
+        found += [
+            Command("show the next frame of the flight", ".", partial(self.run_panel.step, 1)),
+            Command("show the previous frame of the flight", ",", partial(self.run_panel.step, -1)),
+            Command("undo the last change", "Ctrl Z", self.history.undo),
+            Command("redo the change that was undone", "Ctrl Shift Z", self.history.redo),
+            Command("compute the flight of the scene, or stop that", "", self.run_panel.simulate),
+            Command("change between the dark and the light theme", "", self.arrangement.toggle),
+        ]
+        found += [Command(f"panel: {name}", "", partial(self.tabs.set_value, name)) for name in PANELS]
+        return found + [Command(f"export: {name}", "", partial(self.export, name)) for name in export.FILE_BY_ITEM]
+
     # Actions.
 
     async def scene_picked(self) -> None:
@@ -191,6 +217,7 @@ class Tab:
 
     async def start(self) -> None:
         """Show the first view: that of the page's address or of the browser's storage, else the server's scene."""
+        await self.arrangement.restore()
         await self.show_query(await self.history.read())
         refusal = self.message_text
         if self.is_open and self.view is None and await self.open(self.scene):
@@ -361,6 +388,7 @@ class Tab:
 
     def show_message(self, text: str, color: str = "warn") -> None:
         """Show a message in the head until the next action; warnings are also logged."""
+        text = for_page(text)
         if text == self.message_text:
             return
         self.message_text = text
@@ -395,7 +423,7 @@ class Tab:
         action = keys.ACTION_BY_KEY.get(name)
         if not event.action.keydown or action is None or event.modifiers.ctrl or event.modifiers.meta:
             return
-        if self.help.value and action not in ("help", "close"):
+        if self.palette.dialog.value or (self.help.value and action not in ("help", "close")):
             return
         if action == "move":
             right, up, roll_sign = keys.MOVES[name]

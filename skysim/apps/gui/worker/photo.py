@@ -61,12 +61,15 @@ PhotoPixels = tuple[Photo, NDArray]  # with the image's pixels
 SUFFIXES = tuple(dict.fromkeys("." + suffix.rpartition(".")[2] for suffix in images.IMAGE_SUFFIXES))
 
 
-def photo_from_file(name: str, data: bytes, fov_deg: float | None) -> PhotoPixels:
+Stages = tuple[tuple[str, str], ...]  # chosen algorithms: pairs of stage and name
+
+
+def photo_from_file(name: str, data: bytes, fov_deg: float | None, stages: Stages = ()) -> PhotoPixels:
     """Solve an uploaded file, as it is viewed. Raises InputError if it is no readable image."""
     suffix = images.image_suffix(name)
     if not suffix:
         raise InputError(f"{Path(name).name}: allowed: {', '.join(images.IMAGE_SUFFIXES)}")
-    solver = plate_solver.kept_solver(fov_deg)
+    solver = plate_solver.kept_solver(fov_deg, stages=stages)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"upload{suffix}"
         path.write_bytes(data)
@@ -106,10 +109,10 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     return photo, frame.image_dn
 
 
-def solve_frame(image: NDArray, fov_deg: float | None) -> PhotoPixels:
+def solve_frame(image: NDArray, fov_deg: float | None, stages: Stages = ()) -> PhotoPixels:
     """Solve a frame of a live camera; the result's status says why if there is no solution."""
     check_size(image)
-    return solved_photo(image, *plate_solver.solve_array(image, plate_solver.kept_solver(fov_deg), None))
+    return solved_photo(image, *plate_solver.solve_array(image, plate_solver.kept_solver(fov_deg, stages=stages), None))
 
 
 def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoPixels:

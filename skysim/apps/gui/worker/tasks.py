@@ -141,14 +141,14 @@ class Worker:
         self.load_pixels()
         return export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
 
-    def solve_file(self, name: str, data: bytes, fov_deg: float | None) -> photo.Photo:
-        return self.show_photo(photo.photo_from_file(name, data, fov_deg))
+    def solve_file(self, name: str, data: bytes, fov_deg: float | None, stages: photo.Stages = ()) -> photo.Photo:
+        return self.show_photo(photo.photo_from_file(name, data, fov_deg, stages))
 
-    def solve_camera(self, source: str, fov_deg: float | None) -> photo.Photo:
+    def solve_camera(self, source: str, fov_deg: float | None, stages: photo.Stages = ()) -> photo.Photo:
         """Solve the next frame of a live camera, which stays open."""
         if self.camera is None:
             self.camera = images.LiveCamera(source)
-        return self.show_photo(photo.solve_frame(images.monochrome(self.camera.frame()), fov_deg))
+        return self.show_photo(photo.solve_frame(images.monochrome(self.camera.frame()), fov_deg, stages))
 
     def release(self) -> None:
         """Close the live camera."""

@@ -25,7 +25,7 @@ from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation import exposure
-from skysim.simulation.run import FrameResult
+from skysim.simulation.run import FrameResult, warm_up_tracker
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking import factory
 from skysim.tracking import settings as tracker_settings
@@ -65,10 +65,10 @@ class Workbench:
         scene = load(name, overrides)
         if before and before.scene.model_copy(update={"tracker": scene.tracker}) == scene:
             testbed = replace(before.testbed, scene=scene)
-            return replace(before, scene=scene, testbed=testbed, estimator=build_tracker(testbed))
+            return replace(before, scene=scene, testbed=testbed, estimator=warm_tracker(testbed))
         testbed = build_testbed(scene)
         lab_from_body = testbed.trajectory.lab_from_body[0]
-        workbench = cls(scene, testbed, build_tracker(testbed), lab_from_body, magnitude=magnitude_by_id(testbed))
+        workbench = cls(scene, testbed, warm_tracker(testbed), lab_from_body, magnitude=magnitude_by_id(testbed))
         if before:
             return replace(workbench, stretch=before.stretch, brightness=before.brightness, widest_px=before.widest_px)
         return workbench
@@ -137,6 +137,13 @@ class Workbench:
     def style(self) -> tuple[str, float, int]:
         """What a frame's JPEG depends on besides its pixels."""
         return self.stretch, self.brightness, self.widest_px
+
+
+def warm_tracker(testbed: Testbed) -> factory.Estimator:
+    """The scene's tracker, compiled, so that its first frame's time is that of solving it."""
+    tracker = build_tracker(testbed)
+    warm_up_tracker(testbed, tracker)
+    return tracker
 
 
 def id_prefix(testbed: Testbed) -> str:

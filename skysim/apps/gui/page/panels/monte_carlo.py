@@ -12,8 +12,16 @@ from urllib.parse import quote
 from nicegui import run, ui
 
 from skysim.apps.gui.page import keys
-from skysim.apps.gui.page.style import COLORS, TOOLTIP, format_number
-from skysim.apps.gui.worker.study_process import RESPONSES, StudyProcess, StudyResults, finished, monte_carlo
+from skysim.apps.gui.page.style import CURVE_COLORS, TOOLTIP, chart_color, format_number
+from skysim.apps.gui.worker.study_process import (
+    PAGE_STUDY,
+    RESPONSES,
+    StudyProcess,
+    StudyResults,
+    finished,
+    is_shown,
+    monte_carlo,
+)
 from skysim.core.errors import InputError
 from skysim.core.io import files
 from skysim.core.paths import STUDIES, title_of
@@ -104,6 +112,7 @@ class MonteCarloPanel:
         """Start the process of the chosen study; return whether it could be."""
         self.tab.show_message("")
         try:
+            StudyProcess.check_count()
             path = await run.io_bound(self.study_file)
             study = await run.io_bound(loader.load, path)
             if study.study.optimize is not None:
@@ -144,7 +153,7 @@ class MonteCarloPanel:
             return before
         self.run_number += 1
         text = monte_carlo(*settings, self.run_number)
-        folder = files.make_folder(self.tab.out / f"monte_carlo_{self.tab.id}_{self.run_number}")
+        folder = files.make_folder(self.tab.out / f"{PAGE_STUDY}{self.tab.user}_{self.tab.id}_{self.run_number}")
         files.write_text(folder / "monte_carlo.yaml", text)
         return folder / "monte_carlo.yaml"
 
@@ -165,7 +174,8 @@ class MonteCarloPanel:
         if self.process.running or self.starting:
             return
         folder = self.tab.out / name
-        found = await run.io_bound(stored_study, folder) if name and folder.parent == self.tab.out else None
+        is_here = name and folder.parent == self.tab.out and is_shown(name, self.tab.user)
+        found = await run.io_bound(stored_study, folder) if is_here else None
         if found is None:
             self.tab.set_state(study="")
             return
@@ -239,7 +249,7 @@ class MonteCarloPanel:
     def list_reports(self) -> None:
         self.reports.clear()
         with self.reports:
-            folders = finished(self.tab.out)
+            folders = finished(self.tab.out, self.tab.user)
             for folder in folders[:12]:
                 done = time.strftime("%d %b %H:%M", time.localtime((folder / "report.html").stat().st_mtime))
                 with ui.row().classes("w-full no-wrap gap-3"):
@@ -274,7 +284,8 @@ def format_interval(value: float, low: float, high: float) -> str:
 
 def options() -> dict[str, Any]:
     """ECharts options of the histogram of the error angle."""
-    text = {"color": COLORS["quiet"], "fontSize": 10}
+    text = {":color": chart_color("quiet"), "fontSize": 10}
+    rule = {"lineStyle": {":color": chart_color("line")}}
     title = {"text": "no trials yet", "left": "center", "top": "middle"}
     axis = {"axisLabel": text, "nameTextStyle": text}
     x_name = {"name": "error angle, ″", "nameLocation": "middle", "nameGap": 24}
@@ -283,7 +294,7 @@ def options() -> dict[str, Any]:
         "title": title | {"textStyle": text | {"fontWeight": "normal", "fontSize": 11}},
         "grid": {"left": 42, "right": 10, "top": 22, "bottom": 36},
         "xAxis": axis | x_name | {"type": "category", "data": []},
-        "yAxis": axis | {"name": "trials", "type": "value", "splitLine": {"lineStyle": {"color": COLORS["line"]}}},
+        "yAxis": axis | {"name": "trials", "type": "value", "splitLine": rule},
         "tooltip": TOOLTIP,
-        "series": [{"type": "bar", "data": [], "barCategoryGap": "8%", "itemStyle": {"color": COLORS["accent"]}}],
+        "series": [{"type": "bar", "data": [], "barCategoryGap": "8%", "itemStyle": {"color": CURVE_COLORS[0]}}],
     }

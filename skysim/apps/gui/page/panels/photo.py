@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from skysim.apps.gui.worker.photo import SUFFIXES
+from skysim.apps.gui.page.shell.wording import for_page
+from skysim.apps.gui.worker.photo import SUFFIXES, Stages
 
 if TYPE_CHECKING:
     from skysim.apps.gui.page.page import Tab
@@ -51,7 +52,7 @@ class PhotoPanel:
             if not tab.cameras:
                 self.source.set_visibility(False)
                 self.button.set_visibility(False)
-                ui.label("To watch a live camera, start the page with skysim gui --camera 0.").classes("quiet")
+                ui.label("No live camera is offered here. Cameras are named when the lab is started.").classes("quiet")
         self.result_text = ui.label("No image yet. Images are solved lost in space; uncertain matches are rejected.")
         self.result_text.classes("mono quiet").style("margin-top: 10px; white-space: pre-wrap").mark("facts")
 
@@ -67,7 +68,15 @@ class PhotoPanel:
             return
         self.tab.stop_playback()
         self.show_text(f"solving {name} …", "quiet")
-        self.show(name, await self.tab.run_task("solve_file", name, data, self.fov.value, activity=f"solving {name} …"))
+        settings = self.fov.value, self.stages
+        self.show(name, await self.tab.run_task("solve_file", name, data, *settings, activity=f"solving {name} …"))
+
+    @property
+    def stages(self) -> Stages:
+        """The algorithms that the user has chosen for stars; a dome's do not solve photographs."""
+        info = self.tab.scene_info
+        chosen = info.stages if info and info.under_stars else {}
+        return tuple((stage, name) for stage, name in chosen.items() if name != "default")
 
     def stop(self) -> None:
         """Stop the live camera after the current frame."""
@@ -82,13 +91,13 @@ class PhotoPanel:
             return
         # The value comes from the browser, which may send any: only what the command line named is opened.
         if self.source.value not in self.tab.cameras:
-            self.tab.show_message("live camera: allowed: one of those given by --camera")
+            self.tab.show_message("live camera: allowed: one of those in the list")
             return
         self.tab.stop_playback()
         self.live, solved_count, source = True, 0, str(self.source.value)
         self.button.set_text("Stop")
         while self.live:
-            photo = await self.tab.run_task("solve_camera", source, self.fov.value)
+            photo = await self.tab.run_task("solve_camera", source, self.fov.value, self.stages)
             if not self.tab.is_open:
                 return
             if photo or not solved_count:  # a camera that ends keeps its last result on the page
@@ -106,7 +115,8 @@ class PhotoPanel:
             self.show_text(message if message.startswith(name) else f"{name}: {message}", "warn")
             return
         self.tab.display_photo(photo, kind="photo", photo=name)
-        status_text = f"{name}: {photo.result.status}"
+        stages = "".join(f"; {stage} {algorithm}" for stage, algorithm in self.stages)
+        status_text = f"{name}: {photo.result.status}{stages}"
         if status_text != self.logged:  # log the repeated status of a live camera once
             self.logged = status_text
             self.tab.log(status_text)
@@ -120,5 +130,5 @@ class PhotoPanel:
         self.show_text(f"{status_text}\n{pointing}\n{quality}", "good")
 
     def show_text(self, text: str, color: str) -> None:
-        self.result_text.set_text(text)
+        self.result_text.set_text(for_page(text))
         self.result_text.classes(remove="quiet good warn", add=color)

@@ -10,8 +10,9 @@ from typing import Any
 from nicegui import ui
 
 from skysim.apps.gui.messages import FrameRow, MotionLog
-from skysim.apps.gui.page.style import COLORS, CURVE_COLORS, TOOLTIP
+from skysim.apps.gui.page.style import CURVE_COLORS, TOOLTIP, chart_color
 
+BAND_COLOR = "#8b95a5"
 STRIP_PX, HEAD_PX, AXIS_PX = 118, 22, 24  # height of a strip, of its title and legend, of the time axis
 Points = list[list[float]]
 CLICK_JS = """() => {
@@ -102,7 +103,7 @@ def strips(rows: Sequence[FrameRow], log: MotionLog) -> list[Strip]:
 class StripChart:
     """The chart; a click on a strip emits the page's event `moment` with the time there.
 
-    strips : that are drawn;  size : number of series, without the cursors
+    strips : that are drawn
     """
 
     def __init__(self) -> None:
@@ -124,13 +125,15 @@ class StripChart:
         """Move the line of the shown moment in all strips, without sending their curves again."""
         cursors = [cursor(n, t_s) for n in range(len(self.strips))]
         if cursors:
+            self.chart.options["series"][-len(cursors) :] = cursors  # for the next time that all is sent
             self.chart.run_chart_method("setOption", {"series": cursors})
 
 
 def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
     """ECharts options of stacked strips; each has a title with its unit and a legend."""
-    text, rule = {"color": COLORS["quiet"], "fontSize": 11}, {"lineStyle": {"color": COLORS["line"]}}
-    title = {"padding": 0, "left": 0, "textStyle": {"color": COLORS["text"], "fontWeight": "normal", "fontSize": 12}}
+    text, rule = {":color": chart_color("quiet"), "fontSize": 11}, {"lineStyle": {":color": chart_color("line")}}
+    title_text = {":color": chart_color("text"), "fontWeight": "normal", "fontSize": 12}
+    title = {"padding": 0, "left": 0, "textStyle": title_text}
     legend = {"textStyle": text, "itemWidth": 14, "itemHeight": 7, "itemGap": 10, "right": 10, "padding": 0}
     tops = [n * STRIP_PX for n in range(len(drawn))]
     grid = {"left": 52, "right": 12, "height": STRIP_PX - HEAD_PX - 8}
@@ -144,7 +147,7 @@ def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
             for one, top in zip(drawn, tops, strict=True)
         ],
         "tooltip": TOOLTIP,
-        "axisPointer": {"link": [{"xAxisIndex": "all"}], "lineStyle": {"color": COLORS["text"]}},
+        "axisPointer": {"link": [{"xAxisIndex": "all"}], "lineStyle": {":color": chart_color("text")}},
         "dataZoom": [
             {"type": "inside", "xAxisIndex": "all", "zoomOnMouseWheel": "ctrl", "moveOnMouseMove": "shift"}
             | {"moveOnMouseWheel": False, "filterMode": "none"}
@@ -180,7 +183,7 @@ def series(curve: Curve, n: int, k: int) -> dict[str, Any]:
     color = CURVE_COLORS[k % len(CURVE_COLORS)]
     look: dict[str, Any] = {"itemStyle": {"color": color}, "symbolSize": 5, "showSymbol": curve.kind == "dots"}
     if curve.kind == "band":
-        color = COLORS["quiet"]
+        color = BAND_COLOR
         look = {"areaStyle": {"color": color, "opacity": 0.22}, "showSymbol": False, "itemStyle": {"color": color}}
     line = {"lineStyle": {"width": 0.8 if curve.kind == "band" else 1.5, "color": color}}
     kind = "scatter" if curve.kind == "dots" else "line"
@@ -189,7 +192,7 @@ def series(curve: Curve, n: int, k: int) -> dict[str, Any]:
 
 def cursor(n: int, t_s: float) -> dict[str, Any]:
     """ECharts series of a vertical line in a strip at a time."""
-    style = {"color": COLORS["accent"], "width": 1.5, "type": "solid"}
+    style = {"color": CURVE_COLORS[0], "width": 1.5, "type": "solid"}
     mark = {"silent": True, "symbol": "none", "animation": False, "label": {"show": False}, "lineStyle": style}
     line = {"id": f"cursor{n}", "type": "line", "data": [], "animation": False}
     return line | {"markLine": mark | {"data": [{"xAxis": t_s}]}} | in_strip(n)

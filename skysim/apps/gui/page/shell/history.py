@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from skysim.apps.gui.page.page import Tab
     from skysim.apps.gui.state import View
 
+SETTLED = 3  # times of the timer without a change after which the next one is a new step
 WRITE_S = 0.4  # browsers refuse more than about 200 entries in 30 s
 JS = """
 window.skysimHistory = {
@@ -51,13 +52,13 @@ class History:
 
     home : the server's scene; a stored view is that of a server for the same one
     written : the view in the address;  pending : the newest query that is asked for while another is being shown
-    settled : whether the view has not changed since the last write, so that the next change is a new step
+    unchanged : times of the timer since the last change
     """
 
     def __init__(self, tab: Tab, home: str) -> None:
         self.tab, self.home = tab, home
         self.written: View | None = None
-        self.settled = self.showing = False
+        self.showing, self.unchanged = False, 0
         self.pending: str | None = None
         ui.add_body_html(f"<script>{JS}</script>")
         ui.on("view", self.asked)
@@ -72,13 +73,19 @@ class History:
         view = self.tab.state
         waits = self.showing or self.tab.view is None or self.tab.run_panel.wanted_s is not None
         if view is self.written or waits:
-            self.settled = True
+            self.unchanged += 1
             return
         before, self.written = self.written, view
-        push = before is not None and before != view and (self.settled or not view.same_step(before))
-        self.settled = False
+        push = before is not None and before != view and (self.unchanged >= SETTLED or not view.same_step(before))
+        self.unchanged = 0
         arguments = ", ".join(json.dumps(value) for value in (view.query(), push, self.home))
         ui.run_javascript(f"skysimHistory.write({arguments})")
+
+    def undo(self) -> None:
+        ui.run_javascript("skysimHistory.undo()")
+
+    def redo(self) -> None:
+        ui.run_javascript("skysimHistory.redo()")
 
     def adopt(self) -> None:
         """The address names the page's view already."""
