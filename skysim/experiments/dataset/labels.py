@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,22 +13,27 @@ from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, detect_and_centroid
 from skysim.camera.detector.added_charge import PARTICLES, SMEAR, AddedCharge
-from skysim.core.types import Floats, Frame, SourceTruth, Truth
+from skysim.camera.render import Window
+from skysim.core.types import BodyTruth, Floats, Frame, SourceTruth, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX
 from skysim.experiments.study.execution.setups import Setup
+from skysim.simulation.testbed import exposure_window
 from skysim.tracking.onboard_model import assumed_camera
 from skysim.tracking.settings import assumed_settings
 
 SATURATED = "saturated"
 MASKS = (SATURATED, PARTICLES, SMEAR)
-REACH_SIGMA = 3.0  # half-width of a source's box, in standard deviations of its image across the streak
+REACH_SIGMA = 3.0  # half-width of a source's rectangle, in standard deviations of its image across the streak
+DISC_PX = 2.0  # sources of a larger radius are discs with edges
+EDGE_PX = 3.0  # reach of the blur about the edge of a disc
+STILL_PX = 1e-6  # a shorter streak has no direction
 SOURCE = np.dtype(
     [
         ("id", "<i8"),
         *((name, "<f8") for name in ("x_px", "y_px", "flux_x_px", "flux_y_px")),
         *((name, "<f4") for name in ("streak_x_px", "streak_y_px", "streak_px", "electrons", "peak_e", "snr")),
-        ("sigma_px", "<f4"),
+        *((name, "<f4") for name in ("sigma_px", "radius_px")),
         ("saturated", "?"),
         ("detected", "?"),
         *((name, "<f4") for name in ("detected_x_px", "detected_y_px")),
@@ -35,10 +41,26 @@ SOURCE = np.dtype(
 )
 
 
+class Extents(NamedTuple):
+    """The rectangle about each source's image, along its streak.
+
+    center_px : (N, 2);  along : (N, 2) unit vector of the streak;  half_px : (N, 2) half-length and half-width
+    """
+
+    center_px: Floats
+    along: Floats
+    half_px: Floats
+
+    def of(self, which: NDArray[np.bool_]) -> Extents:
+        """Those of some sources."""
+        return Extents(*(part[which] for part in self))
+
+
 class LabelledFrame(NamedTuple):
     """A frame with its labels.
 
     sources    : (N,) of dtype SOURCE, brightest first
+    extents    : the rectangle about each image
     unmatched_px : (M, 2) detections that are no source of the frame: noise, particles, hot pixels
     masks      : by name of MASKS, run lengths of `run_lengths`; a mask that the scene cannot have is left out
     """
@@ -46,6 +68,7 @@ class LabelledFrame(NamedTuple):
     frame: Frame
     truth: Truth
     sources: NDArray[Any]
+    extents: Extents
     unmatched_px: Floats
     masks: dict[str, list[int]]
 
@@ -62,8 +85,10 @@ def label_frame(setup: Setup, seed: int) -> LabelledFrame:
     except ImageError:  # a saturated frame
         found = Centroids.empty()
     sources, unmatched = source_rows(truth.sources, found.xy_px)
+    add_radii(sources, truth.bodies, scene.camera.focal_px)
+    extents = image_extents(sources, exposure_window(scene, frame.index), scene.camera.height_px)
     runs = {name: run_lengths(masks[name]) for name in MASKS if name in masks}
-    return LabelledFrame(frame, truth, sources, unmatched, runs)
+    return LabelledFrame(frame, truth, sources, extents, unmatched, runs)
 
 
 def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Floats]:
@@ -91,6 +116,34 @@ def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Flo
         else:
             rows["detected"][n], rows["detected_x_px"][n], rows["detected_y_px"][n] = True, x, y
     return rows, np.array(unmatched, float).reshape(-1, 2)
+
+
+def add_radii(rows: NDArray[Any], bodies: Sequence[BodyTruth], focal_px: float) -> None:
+    """Set the radius of Sun, Moon and planets among the sources, in place, without the lens's distortion."""
+    for body in bodies:
+        rows["radius_px"][rows["id"] == body.id] = math.radians(body.diameter_arcsec / 7200) * focal_px
+
+
+def image_extents(rows: NDArray[Any], window: Window, height_px: int) -> Extents:
+    """The rectangle about each source's streak.
+
+    It is wider on each side by REACH_SIGMA standard deviations of the blur, or by the radius of a disc and its blurred
+    edge. A rolling shutter exposes the row of a disc's center later than the middle one, and shears the disc.
+    """
+    streak = np.nan_to_num(np.column_stack([rows["streak_x_px"], rows["streak_y_px"]]).astype(float))
+    length = np.linalg.norm(streak, axis=1)
+    along = np.where(length[:, None] > STILL_PX, streak / np.maximum(length, STILL_PX)[:, None], [1.0, 0.0])
+    # Of a source at the row y at mid-exposure: delay = row_time (y + v_y delay - middle row), in exposures.
+    rolling = window.row_time_s / window.exposure_s
+    rolling = rolling / np.maximum(1 - rolling * streak[:, 1], 0.1)
+    radius = rows["radius_px"].astype(float)
+    disc = radius > DISC_PX
+    delay = rolling * (rows["y_px"] - (height_px - 1) / 2)
+    middle = np.column_stack([rows["x_px"], rows["y_px"]]) + delay[:, None] * streak
+    center = np.where(disc[:, None], middle, np.column_stack([rows["flux_x_px"], rows["flux_y_px"]]))
+    reach = np.where(disc, radius + EDGE_PX, REACH_SIGMA * rows["sigma_px"])
+    shear = np.where(disc, rolling * radius, 0.0) * length
+    return Extents(center, along, np.column_stack([length / 2 + reach + shear, reach]))
 
 
 def across_sigma_px(area_px: Floats, streak_px: Floats) -> Floats:

@@ -23,6 +23,7 @@ from skysim.experiments.study.plan import TRIAL, Plan, TrialSpec, digest, resolv
 
 KEYS = ("schema", "set", "trial", "factors", "hardware")  # of a file of variations
 AS_IT_IS: dict[str, Any] = {"variation": {"levels": {"none": {}}}}  # factors of a scene without variations
+TRACKED = f"{TRIAL}tracked"
 DRAW = 2  # first of the four numbers of a draw's key; seeds of trials and of hardware have up to three
 FORMATS = ("webdataset", "zarr", "coco")
 
@@ -86,10 +87,15 @@ class DatasetPlan:
         return digest(self.manifest())
 
 
+def keys_of(factor: Factor) -> set[str]:
+    """The keys that a factor sets."""
+    options = [settings for _, settings in factor.options()] or [factor.value_at(0.5)[1]]
+    return {key for settings in options for key in settings}
+
+
 def is_of_frame(factor: Factor) -> bool:
     """Whether a factor sets keys of the trial alone, and is drawn in every frame."""
-    options = [settings for _, settings in factor.options()] or [factor.value_at(0.5)[1]]
-    return all(key.startswith(TRIAL) for settings in options for key in settings)
+    return all(key.startswith(TRIAL) for key in keys_of(factor))
 
 
 def load(
@@ -113,7 +119,15 @@ def load(
         if name not in FORMATS:
             raise InputError(f"--to: {unknown_name('format', name, FORMATS)}")
     plan = study_plan(scene, vary, seed, overrides or {})
+    check_trial(plan, vary)
     return DatasetPlan(plan.spec, dict(plan.study.factors), frames, frames_per_shard, tuple(dict.fromkeys(formats)))
+
+
+def check_trial(plan: Plan, vary: Path | None) -> None:
+    """Refuse the key of the trial that is for solving alone. Raises InputError."""
+    keys = {*(TRIAL + key for key in plan.spec.trial)}.union(*map(keys_of, plan.study.factors.values()))
+    if TRACKED in keys:
+        raise InputError(f"{vary}: {TRACKED}: no effect on single frames; allowed: studies")
 
 
 def study_plan(scene: str, vary: Path | None, seed: int | None, overrides: Mapping[str, str]) -> Plan:

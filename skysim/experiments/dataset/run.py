@@ -129,11 +129,15 @@ def prepare(plan: DatasetPlan, storage: Storage) -> None:
         storage.prepare(())
         text = json.dumps(told | {"digest": plan.digest} | plan.manifest(), indent=1, default=str)
         storage.write(MANIFEST, text.encode())
-    used = {INDEX, SOURCES, *(folder for name, folder in FOLDERS.items() if name in plan.formats)}
-    storage.prepare(tuple(sorted(used)))
+    storage.prepare(folders_of(plan))
     if "zarr" in plan.formats and not shards.zarr_is_there(storage):
         image = next(labelled_frames(plan, 0))[3].frame.image_dn
         shards.create_zarr(storage, plan.frames, plan.frames_per_shard, image)
+
+
+def folders_of(plan: DatasetPlan) -> tuple[str, ...]:
+    """The folders of a dataset's files, without Zarr's."""
+    return (INDEX, SOURCES, *(folder for name, folder in FOLDERS.items() if name in plan.formats))
 
 
 def check_manifest(storage: Storage, own: dict[str, Any]) -> None:
@@ -175,4 +179,5 @@ def run(plan: DatasetPlan, url: str, engine: Engine, watch: Callable[[Progress],
             progress.failed += len(plan.frames_of(result.shard)) if result.error else 0
         if watch:
             watch(progress)
+    storage.prepare(folders_of(plan))  # workers of a killed run may have been writing when this one began
     return progress

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.types import ra_dec_roll_rad
 from skysim.core.errors import InputError
-from skysim.experiments.dataset.labels import MASKS, REACH_SIGMA, LabelledFrame
+from skysim.experiments.dataset.labels import MASKS, Extents, LabelledFrame
 from skysim.experiments.dataset.storage import EXTRA, Storage
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
@@ -107,8 +107,11 @@ def coco_image(labels: dict[str, Any]) -> dict[str, Any]:
 
 def coco_annotations(one: LabelledFrame, number: int) -> list[dict[str, Any]]:
     """Boxes and outlines of the sources, and masks of the rest as crowds, without their ids."""
-    rows = one.sources[one.sources["snr"] >= COCO_SNR]
-    found = [annotation(number, 1, box, False, [outline], iscrowd=0, **extra) for box, outline, extra in outlines(rows)]
+    seen = one.sources["snr"] >= COCO_SNR
+    found = [
+        annotation(number, 1, box, box[2] * box[3], [outline], iscrowd=0, **extra)
+        for box, outline, extra in outlines(one.sources[seen], one.extents.of(seen))
+    ]
     height, width = one.frame.image_dn.shape
     for name, counts in one.masks.items():
         if len(counts) > 1:
@@ -119,35 +122,25 @@ def coco_annotations(one: LabelledFrame, number: int) -> list[dict[str, Any]]:
     return found
 
 
-def annotation(image: int, category: int, box: list[float], area: Any, code: Any, **more: Any) -> dict[str, Any]:
-    """One annotation; the area is that of the box if it is not given."""
-    area = box[2] * box[3] if area is False else area
+def annotation(image: int, category: int, box: list[float], area: float, code: Any, **more: Any) -> dict[str, Any]:
+    """One annotation."""
     return {"image_id": image, "category_id": category, "bbox": box, "area": area, "segmentation": code, **more}
 
 
-def outlines(rows: NDArray[Any]) -> list[tuple[list[float], list[float], dict[str, Any]]]:
-    """Box (x, y, width, height), outline (x, y of four corners) and id of each source.
+def outlines(rows: NDArray[Any], extents: Extents) -> list[tuple[list[float], list[float], dict[str, Any]]]:
+    """Box (x, y, width, height), outline (x, y of four corners) and labels of each source.
 
-    The outline is the rectangle about the streak, REACH_SIGMA standard deviations wider on each side. COCO's origin
-    is the corner of the first pixel, half a pixel from its center.
+    COCO's origin is the corner of the first pixel, half a pixel from its center.
     """
-    streak = np.nan_to_num(np.column_stack([rows["streak_x_px"], rows["streak_y_px"]]).astype(float))
-    length = np.linalg.norm(streak, axis=1)
-    along = np.where(length[:, None] > 0, streak / np.maximum(length, 1e-12)[:, None], [1.0, 0.0])
-    across = along[:, ::-1] * [-1, 1]
-    reach = REACH_SIGMA * rows["sigma_px"].astype(float)
-    center = np.column_stack([rows["flux_x_px"], rows["flux_y_px"]]) + 0.5
-    a, b = along * (length / 2 + reach)[:, None], across * reach[:, None]
-    corners = np.round(center[:, None] + np.stack([-a - b, a - b, a + b, b - a], axis=1), 2)
+    across = extents.along[:, ::-1] * [-1, 1]
+    a, b = extents.along * extents.half_px[:, :1], across * extents.half_px[:, 1:]
+    corners = np.round(extents.center_px[:, None] + 0.5 + np.stack([-a - b, a - b, a + b, b - a], axis=1), 2)
     low, high = corners.min(axis=1), corners.max(axis=1)
     boxes = np.round(np.column_stack([low, high - low]), 2).tolist()
-    extra = [
-        {"source": source, "electrons": electrons, "detected": detected}
-        for source, electrons, detected in zip(
-            rows["id"].tolist(), rows["electrons"].tolist(), rows["detected"].tolist(), strict=True
-        )
-    ]
-    return list(zip(boxes, corners.reshape(-1, 8).tolist(), extra, strict=True))
+    names = {"source": "id", "electrons": "electrons", "detected": "detected"}
+    columns = zip(*(rows[name].tolist() for name in names.values()), strict=True)
+    labels = [dict(zip(names, values, strict=True)) for values in columns]
+    return list(zip(boxes, corners.reshape(-1, 8).tolist(), labels, strict=True))
 
 
 def mask_box(counts: list[int], height: int) -> list[float]:

@@ -93,7 +93,10 @@ def test_the_table_of_sources_has_those_of_the_frames(whole: Path) -> None:
 
 
 def test_boxes_hold_the_light_of_their_sources(whole: Path) -> None:
-    """COCO counts from the corner of the first pixel. Brightness above the background inside is that of the source."""
+    """COCO counts from the corner of the first pixel. Brightness above the background inside is that of the source.
+
+    A count is 10 electrons. The error has four standard deviations of the noise, and 2 % for light beside the box.
+    """
     made, checked = samples(whole), 0
     ids = []
     for path in sorted((whole / "coco").glob("*.json")):
@@ -113,11 +116,12 @@ def test_boxes_hold_the_light_of_their_sources(whole: Path) -> None:
             assert y < row["flux_y_px"] + 0.5 < y + height
             x0, y0, x1, y1 = int(x), int(y), int(np.ceil(x + width)), int(np.ceil(y + height))
             alone = np.hypot(rows["x_px"] - row["x_px"], rows["y_px"] - row["y_px"]) < 15
-            if row["snr"] > 50 and alone.sum() == 1 and x0 > 3 and y0 > 3 and x1 < WIDTH - 3 and y1 < HEIGHT - 3:
-                light = (image[y0:y1, x0:x1] - np.median(image)).sum() * 10
-                assert light == pytest.approx(row["electrons"], rel=0.1)
+            if row["snr"] > 15 and alone.sum() == 1 and x0 > 3 and y0 > 3 and x1 < WIDTH - 3 and y1 < HEIGHT - 3:
+                light_e = (image[y0:y1, x0:x1] - np.median(image)).sum() * 10
+                noise_e = np.sqrt((y1 - y0) * (x1 - x0) * np.var(image[:, :20]) * 100 + row["electrons"])
+                assert abs(light_e - row["electrons"]) < 4 * noise_e + 0.02 * row["electrons"]
                 checked += 1
-    assert checked >= 2
+    assert checked >= 4
     assert len(set(ids)) == len(ids)
 
 
