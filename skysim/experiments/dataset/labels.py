@@ -14,6 +14,7 @@ from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, detect_and_centroid
 from skysim.camera.detector.added_charge import PARTICLES, SMEAR, AddedCharge
 from skysim.camera.render import Window
+from skysim.core.jit import jit
 from skysim.core.types import BodyTruth, Floats, Frame, SourceTruth, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX
@@ -79,7 +80,7 @@ def label_frame(setup: Setup, seed: int) -> LabelledFrame:
     config = scene.camera.detector
     added = AddedCharge(max(math.hypot(config.read_noise_e, config.reset_noise_e), 1.0))
     frame, truth, streak_px = trials.render_trial_frame(setup, seed, added)
-    masks = {SATURATED: frame.image_dn >= frame.saturation_dn, **added.masks}
+    masks = {SATURATED: frame.image_dn >= least_value(frame), **added.masks}
     try:
         found = detect_and_centroid(frame.image_dn, assumed_camera(scene), assumed_settings(scene), Clock(), streak_px)
     except ImageError:  # a saturated frame
@@ -89,6 +90,11 @@ def label_frame(setup: Setup, seed: int) -> LabelledFrame:
     extents = image_extents(sources, exposure_window(scene, frame.index), scene.camera.height_px)
     runs = {name: run_lengths(masks[name]) for name in MASKS if name in masks}
     return LabelledFrame(frame, truth, sources, extents, unmatched, runs)
+
+
+def least_value(frame: Frame) -> float:
+    """The least value of a saturated pixel, an integer if pixels are, which compares faster."""
+    return math.ceil(frame.saturation_dn) if frame.image_dn.dtype.kind == "u" else frame.saturation_dn
 
 
 def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Floats]:
@@ -105,17 +111,25 @@ def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Flo
         rows[name] = getattr(truth, name)[order]
     rows["sigma_px"] = across_sigma_px(truth.area_px, truth.streak_px)[order]
     rows["detected_x_px"] = rows["detected_y_px"] = np.nan
-    unmatched = []
-    reach_px = SAME_LIGHT_PX + rows["streak_px"] / 2
-    for x, y in found_px.tolist():
-        near = np.hypot(rows["flux_x_px"] - x, rows["flux_y_px"] - y) <= reach_px
-        near &= ~rows["detected"]
-        n = int(np.argmax(near)) if near.any() else -1
-        if n < 0:
-            unmatched.append((x, y))
-        else:
-            rows["detected"][n], rows["detected_x_px"][n], rows["detected_y_px"][n] = True, x, y
-    return rows, np.array(unmatched, float).reshape(-1, 2)
+    chosen = brightest_near(found_px, truth.flux_xy_px[order], SAME_LIGHT_PX + truth.streak_px[order] / 2)
+    own = chosen[chosen >= 0]
+    rows["detected"][own] = True
+    rows["detected_x_px"][own], rows["detected_y_px"][own] = found_px[chosen >= 0].T
+    return rows, found_px[chosen < 0]
+
+
+@jit
+def brightest_near(found_px: Floats, source_px: Floats, reach_px: Floats) -> NDArray[np.int64]:
+    """(M,) number of the first source that is within its reach of each detection and has none yet; -1 without one."""
+    chosen = np.full(len(found_px), -1)
+    is_free = np.ones(len(source_px), np.bool_)
+    for m in range(len(found_px)):
+        for n in range(len(source_px)):
+            dx, dy = source_px[n, 0] - found_px[m, 0], source_px[n, 1] - found_px[m, 1]
+            if is_free[n] and dx * dx + dy * dy <= reach_px[n] * reach_px[n]:
+                chosen[m], is_free[n] = n, False
+                break
+    return chosen
 
 
 def add_radii(rows: NDArray[Any], bodies: Sequence[BodyTruth], focal_px: float) -> None:
@@ -158,7 +172,8 @@ def across_sigma_px(area_px: Floats, streak_px: Floats) -> Floats:
 
 def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
     """Lengths of the runs of a (H, W) mask, column by column, the first of pixels that are not set: COCO's code."""
-    flat = np.flatnonzero(np.ascontiguousarray(mask.T))
+    y, x = np.divmod(np.flatnonzero(mask), mask.shape[1])  # a copy of the transposed mask would take ten times longer
+    flat = np.sort(x * len(mask) + y)
     if not len(flat):
         return [mask.size]
     breaks = np.flatnonzero(np.diff(flat) != 1)

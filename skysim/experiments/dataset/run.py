@@ -95,14 +95,14 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
         for frame, levels, setup, one in labelled_frames(plan, shard):
             numbers = {"frame": frame, "shard": shard, "seed": plan.seed(frame)}
             row = shards.frame_labels(one, setup.testbed.scene, numbers)
-            row |= {"dtype": one.frame.image_dn.dtype.str, "file": name if tar else ""}
+            row |= {"pixel_type": one.frame.image_dn.dtype.str, "file": name if tar else ""}
             row["position"] = shards.add_frame(tar, frame, one, row | {"levels": levels}) if tar else -1
             rows.append(row | {"levels": json.dumps(levels, default=str)})
             sources.append(one.sources)
             if "zarr" in plan.formats:
                 images.append(one.frame.image_dn)
             if "coco" in plan.formats:
-                coco += shards.coco_annotations(one, frame)
+                coco.append(shards.coco_annotations(one, frame))
         if tar:
             tar.close()
     if images:

@@ -105,26 +105,24 @@ def coco_image(labels: dict[str, Any]) -> dict[str, Any]:
     return {"id": labels["frame"], "file_name": name, "height": labels["height"], "width": labels["width"]}
 
 
-def coco_annotations(one: LabelledFrame, number: int) -> list[dict[str, Any]]:
-    """Boxes and outlines of the sources, and masks of the rest as crowds, without their ids."""
+def coco_annotations(one: LabelledFrame, number: int) -> bytes:
+    """JSON objects, joined by commas: outlines of the sources, and masks of the rest as crowds.
+
+    Ids are unique in the dataset. Objects of a whole shard would take longer, for the sake of Python's garbage.
+    """
     seen = one.sources["snr"] >= COCO_SNR
-    found = [
-        annotation(number, 1, box, box[2] * box[3], [outline], iscrowd=0, **extra)
-        for box, outline, extra in outlines(one.sources[seen], one.extents.of(seen))
+    found: list[dict[str, Any]] = [
+        {"category_id": 1, "bbox": box, "area": box[2] * box[3], "segmentation": [outline], "iscrowd": 0, **labels}
+        for box, outline, labels in outlines(one.sources[seen], one.extents.of(seen))
     ]
     height, width = one.frame.image_dn.shape
     for name, counts in one.masks.items():
         if len(counts) > 1:
-            box = mask_box(counts, height)
             code = {"size": [height, width], "counts": counts}
-            area = sum(counts[1::2])
-            found.append(annotation(number, 1 + CATEGORIES.index(name), box, area, code, iscrowd=1))
-    return found
-
-
-def annotation(image: int, category: int, box: list[float], area: float, code: Any, **more: Any) -> dict[str, Any]:
-    """One annotation."""
-    return {"image_id": image, "category_id": category, "bbox": box, "area": area, "segmentation": code, **more}
+            mask = {"bbox": mask_box(counts, height), "area": sum(counts[1::2]), "segmentation": code, "iscrowd": 1}
+            found.append({"category_id": 1 + CATEGORIES.index(name), **mask})
+    numbered = [{"id": number * 100_000 + n, "image_id": number, **each} for n, each in enumerate(found, 1)]
+    return json.dumps(numbered)[1:-1].encode()
 
 
 def outlines(rows: NDArray[Any], extents: Extents) -> list[tuple[list[float], list[float], dict[str, Any]]]:
@@ -154,15 +152,11 @@ def mask_box(counts: list[int], height: int) -> list[float]:
     return [float(x0), float(y0), float(x1 - x0 + 1), float(y1 - y0 + 1)]
 
 
-def coco_file(images: list[dict[str, Any]], annotations: list[dict[str, Any]]) -> bytes:
-    """A COCO file of one shard; annotations get ids that are unique in the dataset."""
-    counts: dict[int, int] = {}
-    for one in annotations:
-        image = one["image_id"]
-        counts[image] = counts.get(image, -1) + 1
-        one["id"] = image * 100_000 + counts[image] + 1
-    categories = [{"id": n, "name": name} for n, name in enumerate(CATEGORIES, 1)]
-    return json.dumps({"images": images, "annotations": annotations, "categories": categories}).encode()
+def coco_file(images: list[dict[str, Any]], annotations: list[bytes]) -> bytes:
+    """A COCO file of one shard, from the annotations of each frame."""
+    categories = json.dumps([{"id": n, "name": name} for n, name in enumerate(CATEGORIES, 1)]).encode()
+    parts = (json.dumps(images).encode(), b", ".join(filter(None, annotations)), categories)
+    return b'{"images": %b, "annotations": [%b], "categories": %b}' % parts
 
 
 # Tables.

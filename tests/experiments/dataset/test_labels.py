@@ -15,6 +15,7 @@ from skysim.camera.render import Window
 from skysim.core.io.yaml_reader import parse_yaml
 from skysim.core.types import SourceTruth
 from skysim.experiments.dataset import labels, shards
+from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.setups import Setup, prepared_setup
 from skysim.experiments.study.plan import TrialSpec
 from skysim.scene.sections.camera import InterlineConfig
@@ -156,6 +157,15 @@ def test_particles_are_masked_where_a_frame_without_them_differs() -> None:
     loss_e = 2 + 0.02 * np.abs(added_e)  # transfer loss moves a little charge to the next pixels
     assert (added_e[mask & free] > config.read_noise_e - config.gain_e_dn - loss_e[mask & free]).all()
     assert (added_e[~mask & free] < config.read_noise_e + config.gain_e_dn + loss_e[~mask & free]).all()
+
+
+def test_a_frame_with_labels_is_that_of_the_trial() -> None:
+    setup = setup_with(PARTICLE)
+    frame, truth, _ = trials.render_trial_frame(setup, 4)
+    image = frame.image_dn.copy()
+    one = labels.label_frame(setup, 4)
+    np.testing.assert_array_equal(one.frame.image_dn, image)
+    np.testing.assert_array_equal(np.sort(one.sources["id"]), np.sort(truth.sources.id))
 
 
 def test_saturated_pixels_are_those_whose_charge_exceeds_the_well() -> None:

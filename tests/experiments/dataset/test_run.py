@@ -76,7 +76,7 @@ def test_every_format_has_the_same_frames(whole: Path) -> None:
         np.testing.assert_array_equal(images[row["frame"]], image)
         with (whole / row["file"]).open("rb") as file:  # one frame without its shard
             file.seek(row["position"])
-            pixels = np.frombuffer(file.read(image.nbytes), row["dtype"]).reshape(image.shape)
+            pixels = np.frombuffer(file.read(image.nbytes), row["pixel_type"]).reshape(image.shape)
         np.testing.assert_array_equal(pixels, image)
         assert one["frame.json"]["levels"] == json.loads(row["levels"])
         assert 0.1 <= one["frame.json"]["levels"]["rate"] <= 0.5
