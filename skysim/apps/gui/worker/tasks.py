@@ -8,8 +8,18 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import FlightStep, FrameView, PixelWindow, SceneInfo, Triple
-from skysim.apps.gui.worker import export, photo, playback, pointing
+from skysim.apps.gui.messages import (
+    AmbiguityMap,
+    FlightStep,
+    FrameView,
+    PixelWindow,
+    PlanCheck,
+    SceneInfo,
+    SurveyPlan,
+    Triple,
+)
+from skysim.apps.gui.worker import export, photo, playback
+from skysim.apps.gui.worker.scene import planning, pointing
 from skysim.apps.gui.worker.workbench import Workbench, pixel_window
 from skysim.core.errors import InputError
 from skysim.core.io import images
@@ -109,6 +119,15 @@ class Worker:
 
     def zoom(self, x: float, y: float) -> PixelWindow:
         return pixel_window(self.shown_image(), x, y)
+
+    def check(self) -> PlanCheck:
+        return planning.check(self.workbench.testbed)
+
+    def ambiguity(self) -> AmbiguityMap:
+        return planning.ambiguity(self.workbench.testbed)
+
+    def survey(self, frames: int) -> SurveyPlan:
+        return planning.survey(self.workbench.scene, frames)
 
     def begin_flight(self) -> FlightStep:
         """Begin to compute the scene's flight; `advance_flight` does the work."""
