@@ -52,10 +52,11 @@ def dataset(
         trial_progress(f"dataset of {scene}", frames, "frames") as update,
     ):
         progress = run.run(made, out, chosen, update)
-    if progress.failed:
-        print_error(f"{progress.failed} frames are missing: their workers died; the same command tries them again")
     result = {"out": out, "frames": progress.done, "shards": made.shards, "failed": progress.failed}
     if json:
         print_json(result | {"rate_hz": progress.rate})
     else:
         print(f"{progress.done} of {frames} frames in {made.shards} shards: {out}")
+    if progress.failed:
+        print_error(f"{progress.failed} frames are missing: their workers died; the same command tries them again")
+        raise typer.Exit(2)
