@@ -36,7 +36,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "datasheet": ("skysim datasheet shefex2 --quick", "skysim datasheet afit_simsat --fields 200 --out out/afit_sheet"),
     "dataset": (
         "skysim dataset shefex2 --frames 1000 --out out/frames",
-        "skysim dataset shefex2 --frames 1000000 --vary night.yaml --out s3://bucket/frames --to webdataset --to zarr",
+        "skysim dataset shefex2 --frames 64 --vary night.yaml --out s3://bucket/night",
     ),
     "characterize": (
         "skysim characterize --camera imx264 --darks lab/darks --flats lab/flats",
