@@ -12,7 +12,7 @@ import sqlite3
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import astuple
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,7 @@ CREATE TABLE IF NOT EXISTS runs (
   trials INTEGER NOT NULL, seconds REAL NOT NULL);
 """
 
+values_of = attrgetter(*FIELDS)  # of an outcome; `astuple` takes twenty times longer
 INSERT = f"INSERT OR REPLACE INTO trials VALUES ({', '.join('?' * (7 + len(FIELDS)))})"
 
 
@@ -124,7 +125,7 @@ class Store:
 
     def add(self, rows: list[Row]) -> None:
         """Store rows in one transaction."""
-        values = [(*row[:6], *map(to_sql, astuple(row.outcome)), row.error) for row in rows]
+        values = [(*row[:6], *map(to_sql, values_of(row.outcome)), row.error) for row in rows]
         with self.db:
             self.db.executemany(INSERT, values)
             times = [(row.trial, 1e3 * row.seconds) for row in rows]

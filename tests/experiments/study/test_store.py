@@ -306,3 +306,14 @@ def test_chunks_are_sized_by_time() -> None:
     wanted = int(runner.CHUNK_S / 0.01)
     assert sizes[:8] == [min(2**n, wanted) for n in range(8)]
     assert sizes[9] == int(runner.CHUNK_S / 0.1)
+
+
+@pytest.mark.parametrize(("workers", "rate_hz"), [(1, 4), (2, 8), (16, 64), (64, 64), (1000, 64)])
+def test_many_workers_complete_no_more_chunks_than_few(workers: int, rate_hz: float) -> None:
+    """Of trials of 10 ms: the chunks of a second, from their size."""
+    todo = runner.ChunkQueue([Point({}, {})], 100_000, np.arange(100_000), seconds=runner.chunk_seconds(workers))
+    size = 0
+    for _ in range(14):
+        size = sum(len(segment.replicates) for segment in todo.next())
+        todo.report_time((trials.Segment(0, {}, 0, range(size)),), size * 0.01)
+    assert workers / (size * 0.01) == pytest.approx(rate_hz, rel=0.05)

@@ -10,7 +10,7 @@ import json
 import logging
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from typing import Any
@@ -80,36 +80,50 @@ def thread_count(client: Client) -> int:
 def collect_rows(
     client: Client, name: str, job: Job, chunks: Chunks, in_flight: dict[Future, Submission]
 ) -> Iterator[list[Any]]:
-    """Yield rows as chunks complete. `in_flight` maps futures to their chunks.
+    """Yield rows as chunks complete, those of the same time together. `in_flight` maps futures to their chunks.
 
     Dask gives up a task (KilledWorker) after several of its workers died, whether the task was the cause or was only
     queued there. The trials of such a chunk are therefore retried one at a time with nothing else in flight, and a
     trial that is given up again is recorded as failed.
     """
     retries: deque[Chunk] = deque()
-    completed, capacity, polled_s = as_completed(loop=client.loop), 0, -POLL_S
+    completed = as_completed(loop=client.loop, with_results=True, raise_errors=False)
+    capacity, polled_s = 0, -POLL_S
     while True:
         if time.monotonic() - polled_s >= POLL_S:
             capacity, polled_s = max(thread_count(client), 1) * (1 + AHEAD), time.monotonic()
         alone = bool(retries)
-        while len(in_flight) < (1 if alone else capacity) and (chunk := retries.popleft() if alone else chunks.next()):
-            future = client.submit(run_encoded, name, encode_chunk(chunk), pure=False)
-            in_flight[future] = (chunk, alone)
-            completed.add(future)
+        new = take(retries.popleft if alone else chunks.next, (1 if alone else capacity) - len(in_flight))
+        # One message submits all, and results arrive in the background: a round trip for each would be the limit.
+        futures = client.map(run_encoded, [name] * len(new), list(map(encode_chunk, new)), pure=False) if new else []
+        in_flight |= {future: (chunk, alone) for future, chunk in zip(futures, new, strict=True)}
+        completed.update(futures)
         if not in_flight:
             return
-        future = next(completed)
-        chunk, was_alone = in_flight.pop(future)
-        try:
-            rows, seconds = future.result()
-        except KilledWorker:
-            if was_alone:
-                yield [job.failed(chunk[0], DIED)]
-            else:
-                retries.extend(split_chunk(chunk))
-        else:
-            chunks.report_time(chunk, seconds)
+        rows: list[Any] = []
+        for future, result in completed.next_batch():
+            chunk, was_alone = in_flight.pop(future)
+            if future.status == "finished":
+                chunks.report_time(chunk, result[1])
+                rows += result[0]
+                continue
+            try:
+                future.result()  # raises, without a message to the cluster
+            except KilledWorker:
+                if was_alone:
+                    rows.append(job.failed(chunk[0], DIED))
+                else:
+                    retries.extend(split_chunk(chunk))
+        if rows:
             yield rows
+
+
+def take(source: Callable[[], Chunk], count: int) -> list[Chunk]:
+    """Chunks of a source, as many or until it has no more."""
+    taken: list[Chunk] = []
+    while len(taken) < count and (chunk := source()):
+        taken.append(chunk)
+    return taken
 
 
 def encode_chunk(chunk: Chunk) -> str:

@@ -141,6 +141,9 @@ class Pool:
     ) -> Iterator[list[Any]]:
         """Yield rows as chunks complete; retries first, each alone in flight. `in_flight` maps futures to their chunks.
 
+        Rows of chunks that are complete at the same time come together, so that the store takes one transaction for
+        them: the more workers wait for it, the fewer transactions.
+
         Raises BrokenProcessPool if a worker dies; `in_flight` then holds the chunks that were lost.
         """
         while True:
@@ -154,10 +157,16 @@ class Pool:
                     raise
             if not in_flight:
                 return
-            for future in wait(in_flight, return_when=FIRST_COMPLETED).done:
-                rows, seconds = future.result()
+            finished, rows = wait(in_flight, return_when=FIRST_COMPLETED).done, list[Any]()
+            whole = [future for future in finished if future.exception() is None]
+            for future in whole:
+                more, seconds = future.result()
                 chunks.report_time(in_flight.pop(future), seconds)
+                rows += more
+            if rows:
                 yield rows
+            for future in finished:
+                future.result()  # raises if its worker died
 
 
 def run_timed(job: Job, chunk: Chunk) -> TimedRows:

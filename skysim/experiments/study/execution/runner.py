@@ -20,6 +20,7 @@ from skysim.experiments.study.plan import Plan, TrialSpec, resolve_point
 from skysim.experiments.study.store import Store
 
 CHUNK_S = 0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies
+MANY = 16  # workers; more have longer chunks, and complete MANY / CHUNK_S a second: a Dask scheduler handles hundreds
 MAX_CHUNK = 5000  # maximum number of trials in a chunk
 
 
@@ -54,7 +55,7 @@ Watch = Callable[[Progress], Any]
 
 
 class ChunkQueue:
-    """Divides the missing trials of some points into chunks of about CHUNK_S seconds.
+    """Divides the missing trials of some points into chunks of about so many seconds.
 
     Chunks larger than a point are extended to complete points, so that a point's setup is built on one worker only.
 
@@ -68,8 +69,10 @@ class ChunkQueue:
         missing: NDArray[np.int64],
         first: int = 0,
         spec: TrialSpec | None = None,
+        seconds: float = CHUNK_S,
     ) -> None:
         self.points, self.replicates, self.missing, self.first, self.spec = points, replicates, missing, first, spec
+        self.seconds = seconds
         self.position, self.size = 0, 1
 
     def next(self) -> Chunk:
@@ -94,8 +97,13 @@ class ChunkQueue:
     def report_time(self, chunk: Chunk, seconds: float) -> None:
         """Set the size of the next chunks from the run time of this one; the size at most doubles."""
         count = sum(len(segment.replicates) for segment in chunk)
-        size = int(CHUNK_S * count / max(seconds, 1e-6))
+        size = int(self.seconds * count / max(seconds, 1e-6))
         self.size = int(np.clip(size, 1, min(2 * max(count, self.size), MAX_CHUNK)))
+
+
+def chunk_seconds(workers: int) -> float:
+    """Run time of a chunk, in proportion to the workers if they are many, so that coordination is not the limit."""
+    return CHUNK_S * max(1.0, workers / MANY)
 
 
 def prepare_store(plan: Plan, store: Store, resume: bool, overrides: Mapping[str, str] | None = None) -> None:
@@ -181,7 +189,7 @@ def run_points(
     failed_before = store.counts()["failed"]
     progress = Progress(len(numbers), len(numbers) - len(missing), failed_before)
     budget = plan.study.budget
-    queue = ChunkQueue(points, replicates, missing, first, plan.spec)
+    queue = ChunkQueue(points, replicates, missing, first, plan.spec, chunk_seconds(engine.workers))
     rows = engine.run(TrialJob(plan.spec), queue) if len(missing) else iter(())
     try:
         for batch in rows:
