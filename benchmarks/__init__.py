@@ -24,6 +24,7 @@ AREAS = (
     "frames",
     "sky",
     "codes",
+    "scale",
 )
 
 

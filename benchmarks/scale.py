@@ -1,0 +1,180 @@
+"""Throughput from one frame to many: labelled frames in shards, centroid trials in the store, closed loops, clusters.
+
+`python -m benchmarks scale`, on a quiet machine with two cores. Rates are those of the clock; the costs of a frame's
+parts and of a trial are seconds of CPU, which other load lengthens less. docs/explanation/scale.md uses them.
+"""
+
+from __future__ import annotations
+
+import io
+import tarfile
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from benchmarks import coordination
+from benchmarks.studies import CENTROIDS, run_study
+from benchmarks.timing import verdict, versus
+from skysim.camera.detector.added_charge import AddedCharge
+from skysim.experiments.dataset import plan, run, shards
+from skysim.experiments.dataset.labels import LabelledFrame, label_frame
+from skysim.experiments.study.execution import engines, trials
+from skysim.scene import loader
+from skysim.simulation.run import prepare, simulate_motion
+
+SIZE = {"camera.width_px": "1024", "camera.height_px": "1024"}
+# 20 degrees and stars to V 7, as in benchmarks/instrument.py, with all noise of a CMOS chip: shot and read noise, dark
+# current, PRNU, DSNU, hot pixels. The CCD of shefex2 has readout smear, transfer loss and blooming besides.
+CMOS = SIZE | {
+    **{"camera.focal_length": "28.7 mm", "light.limit_mag": "7", "camera.shutter": "{kind: global}"},
+    **{"camera.detector.cti_parallel": "0", "camera.detector.cti_serial": "0", "camera.detector.blooming": "none"},
+}
+FRAMES, PER_SHARD = 640, 16
+PARTS = 64  # frames of which the parts are timed
+DASK_S, DASK_CHUNKS = 1.0, 12
+
+
+def measure() -> list[dict[str, Any]]:
+    """All results."""
+    return [*frames(), *parts(), writing(), *centroids(), *closed_loop(), dask_overhead(), *coordination.measure()]
+
+
+def figure(name: str, value: float, unit: str, what: str) -> dict[str, Any]:
+    """A result without a bar."""
+    return verdict(name, value, unit, what, 0.0) | {"bar": None, "met": None}
+
+
+# Labelled frames.
+
+
+def small_plan(count: int = FRAMES, per_shard: int = PER_SHARD, keys: dict[str, str] = CMOS) -> plan.DatasetPlan:
+    """Frames of 1024 x 1024 pixels."""
+    return plan.load("shefex2", None, count, overrides=keys, frames_per_shard=per_shard)
+
+
+def frames() -> list[dict[str, Any]]:
+    """Frames written to shards in a second, by two workers and by one."""
+    rates = {workers: frames_hz(workers) for workers in (2, 1)}
+    return [
+        verdict("labelled 1024 x 1024 frames to shards, two workers", rates[2], "/s", "CMOS", 400.0, True),
+        verdict("frames: two workers over one", rates[2] / rates[1], "x", f"{rates[1]:.0f}/s of one", 1.9, True),
+    ]
+
+
+def frames_hz(workers: int) -> float:
+    """Frames in a second, from the end of the second shard of each worker to that of the last one."""
+    arrived: list[tuple[float, int]] = []
+    with tempfile.TemporaryDirectory() as folder, closing(engines.Pool(workers)) as pool:
+        run.run(small_plan(), f"{folder}/frames", pool, lambda at: arrived.append((time.perf_counter(), at.now)))
+    first = next(n for n, (_, now) in enumerate(arrived) if now >= 2 * workers * PER_SHARD)
+    (begin_s, before), (end_s, after) = arrived[first], arrived[-1]
+    return (after - before) / (end_s - begin_s)
+
+
+def parts() -> list[dict[str, Any]]:
+    """CPU time of a frame's parts on one core, and which of them is the greatest."""
+    rows = []
+    for name, keys in (("CMOS", CMOS), ("CCD", SIZE)):
+        spent = parts_of(small_plan(PARTS, PARTS, keys))
+        total, most = sum(spent.values()), max(spent, key=lambda part: spent[part])
+        rows += [figure(f"CPU of a {name} frame", total, "ms", f"{most} is {spent[most] / total:.0%}")]
+        rows += [figure(f"- {part}", ms, "ms", f"{ms / total:.0%}") for part, ms in spent.items()]
+    return rows
+
+
+def parts_of(made: plan.DatasetPlan) -> dict[str, float]:
+    """Milliseconds of CPU of a frame: render; label (detection, masks); encode (COCO, numbers); write (the tar)."""
+    spent = dict.fromkeys(("render", "label", "encode", "write"), 0.0)
+    with tempfile.TemporaryFile() as file:
+        tar = shards.TarWriter(file)
+        for number, levels, setup, one in run.labelled_frames(made, 0):
+            seed, threshold_e = made.seed(number), setup.testbed.scene.camera.detector.read_noise_e
+            with timed(spent, "render"):
+                trials.render_trial_frame(setup, seed, AddedCharge(threshold_e))
+            with timed(spent, "label"):
+                label_frame(setup, seed)
+            with timed(spent, "encode"):
+                row = shards.frame_labels(one, setup.testbed.scene, {"frame": number, "shard": 0, "seed": seed})
+                shards.coco_annotations(one, number)
+            with timed(spent, "write"):
+                shards.add_frame(tar, number, one, row | {"levels": levels})
+    spent["label"] -= spent["render"]
+    return {name: 1e3 * seconds / PARTS for name, seconds in spent.items()}
+
+
+@contextmanager
+def timed(spent: dict[str, float], name: str) -> Iterator[None]:
+    """Add the CPU time of a block."""
+    begin = time.process_time()
+    yield
+    spent[name] += time.process_time() - begin
+
+
+def writing() -> dict[str, Any]:
+    """The tar of a shard, beside Python's tarfile and numpy.save with the same members."""
+    _, _, _, one = next(run.labelled_frames(small_plan(PER_SHARD), 0))
+    kept = [(number, one) for number in range(PER_SHARD)]
+    return versus("write 16 frames as a tar", lambda: ours(kept), "tarfile", lambda: by_tarfile(kept), repeats=10)
+
+
+def ours(kept: list[tuple[int, LabelledFrame]]) -> None:
+    """Write the frames as skysim does, to memory."""
+    tar = shards.TarWriter(io.BytesIO())
+    for number, one in kept:
+        shards.add_frame(tar, number, one, {})
+    tar.close()
+
+
+def by_tarfile(kept: list[tuple[int, LabelledFrame]]) -> None:
+    """Write the same with Python's library."""
+    with tarfile.open(fileobj=io.BytesIO(), mode="w") as tar:
+        for number, one in kept:
+            for name, array in (("image", one.frame.image_dn), ("sources", one.sources)):
+                file = io.BytesIO()
+                np.save(file, array)
+                member = tarfile.TarInfo(f"{number:09d}.{name}.npy")
+                member.size = file.tell()
+                file.seek(0)
+                tar.addfile(member, file)
+
+
+# Trials, motion, clusters.
+
+
+def centroids() -> list[dict[str, Any]]:
+    """Centroid trials in a second with the store, by two workers and by one."""
+    two, one = (run_study(CENTROIDS, workers) for workers in (2, 1))
+    return [
+        verdict("centroid trials with the store, two workers", two.rate, "/s", "", 5000.0, True),
+        verdict("centroids: two workers over one", two.rate / one.rate, "x", f"{one.rate:.0f}/s of one", 1.9, True),
+        figure("centroids: beside the trial itself", one.overhead_ms, "ms", "a trial of one worker"),
+    ]
+
+
+def closed_loop() -> list[dict[str, Any]]:
+    """SimSat on its wheels under control, against the clock, and against mj_step alone with the same model."""
+    testbed = prepare(loader.load("afit_simsat", {"exposure.frames": "3"}))
+    model, flown_s = testbed.vehicle.model, float(testbed.trajectory.t_s[-1])
+
+    def bare() -> None:
+        data = mujoco.MjData(model)
+        for _ in range(round(flown_s / model.opt.timestep)):
+            mujoco.mj_step(model, data)
+
+    row = versus("closed loop on wheels", lambda: simulate_motion(testbed), "bare mj_step", bare, repeats=20)
+    speed = flown_s / (row["value"] / 1e3)
+    limit = f"mj_step alone: {flown_s / (row['peer_value'] / 1e3):.0f}x"
+    return [row, verdict("closed loop on wheels", speed, "x real time", limit, 100.0, True)]
+
+
+def dask_overhead() -> dict[str, Any]:
+    """What Dask adds to chunks of one second on two workers that do nothing but wait."""
+    with coordination.dask(workers=2) as engine:
+        hertz = coordination.completions_hz(engine, 2, DASK_S, rounds=DASK_CHUNKS // 2)
+    percent = 100 * (2 / DASK_S / hertz - 1)
+    return verdict("overhead of Dask, chunks of 1 s", percent, "%", "two workers", 10.0)
