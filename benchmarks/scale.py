@@ -175,6 +175,6 @@ def closed_loop() -> list[dict[str, Any]]:
 def dask_overhead() -> dict[str, Any]:
     """What Dask adds to chunks of one second on two workers that do nothing but wait."""
     with coordination.dask(workers=2) as engine:
-        hertz = coordination.completions_hz(engine, 2, DASK_S, rounds=DASK_CHUNKS // 2)
+        hertz = coordination.pace(engine, 2, DASK_S, rounds=DASK_CHUNKS // 2).hertz
     percent = 100 * (2 / DASK_S / hertz - 1)
     return verdict("overhead of Dask, chunks of 1 s", percent, "%", "two workers", 10.0)
