@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import tempfile
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,8 @@ from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps import plate_solver
-from skysim.apps.gui.messages import Light, TrackerResult, Triple
+from skysim.apps.gui.messages import Lens, Light, Pose, TrackerResult, Triple
+from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.workbench import (
     detection_views,
     id_prefix,
@@ -33,27 +36,34 @@ from skysim.experiments.study.execution.trials import run_trial
 from skysim.experiments.study.store import STORE
 from skysim.results import scoring, stretch
 from skysim.simulation.run import FrameResult
+from skysim.tracking.settings import STAR_ALGORITHMS
 
 
 @dataclass(frozen=True, slots=True)
 class Photo:
-    """An image that is not of the current scene, and its solution; size_px is the image's, jpeg what the page shows.
+    """An image that is not of the current scene, and its solution.
 
+    pixels, saturation_dn, pose : see `FrameView`;  lens : of the pose; both are None if the image was not solved
     names, true_deg : of its three angles, and their true values if known
     lights, prefix : true lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
     hint : of a refused file the likely cause, of a solved one what was assumed
+    stages : the algorithms that solved it, by stage
     """
 
     size_px: tuple[int, int]
     result: TrackerResult
     solution: dict[str, Any]
     statistics: stretch.FrameStatistics
-    jpeg: bytes = b""
+    pixels: bytes = b""
+    saturation_dn: float = math.inf
+    lens: Lens | None = None
+    pose: Pose | None = None
     names: tuple[str, str, str] = ("RA", "Dec", "roll")
     true_deg: Triple | None = None
     lights: tuple[Light, ...] = ()
     prefix: str = "HIP"
     hint: str = ""
+    stages: Mapping[str, str] = field(default_factory=dict)
 
 
 PhotoPixels = tuple[Photo, NDArray]  # with the image's pixels
@@ -61,12 +71,31 @@ PhotoPixels = tuple[Photo, NDArray]  # with the image's pixels
 SUFFIXES = tuple(dict.fromkeys("." + suffix.rpartition(".")[2] for suffix in images.IMAGE_SUFFIXES))
 
 
-def photo_from_file(name: str, data: bytes, fov_deg: float | None) -> PhotoPixels:
-    """Solve an uploaded file, as it is viewed. Raises InputError if it is no readable image."""
+@functools.lru_cache(maxsize=1)
+def kept_solver(fov_deg: float | None, stages: tuple[tuple[str, str], ...]) -> plate_solver.Solver:
+    """A solver with chosen algorithms, (stage, name) each, kept with its trackers for the next picture."""
+    return plate_solver.make_solver(fov_deg, None, stages=dict(stages))
+
+
+def usable_stages(stages: Mapping[str, str]) -> dict[str, str]:
+    """The chosen algorithms as far as they solve stars: an identifier or solver of LEDs gives way to the default."""
+    return {stage: name if name in STAR_ALGORITHMS[stage] else "default" for stage, name in stages.items()}
+
+
+def used_stages(stages: Mapping[str, str], fov_deg: float | None) -> dict[str, str]:
+    """The algorithms that solve a picture: quads of stars identify it if its field of view is unknown."""
+    return dict(stages) if fov_deg else {**stages, "identifier": "quads"}
+
+
+def photo_from_file(name: str, data: bytes, fov_deg: float | None, stages: Mapping[str, str]) -> PhotoPixels:
+    """Solve an uploaded file, as it is viewed, by the chosen algorithms. Raises InputError if it is no readable image.
+
+    stages : names of algorithms by stage
+    """
     suffix = images.image_suffix(name)
     if not suffix:
         raise InputError(f"{Path(name).name}: allowed: {', '.join(images.IMAGE_SUFFIXES)}")
-    solver = plate_solver.kept_solver(fov_deg)
+    solver = kept_solver(fov_deg, tuple(usable_stages(stages).items()))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"upload{suffix}"
         path.write_bytes(data)
@@ -78,7 +107,7 @@ def photo_from_file(name: str, data: bytes, fov_deg: float | None) -> PhotoPixel
     outcome = plate_solver.solve_picture(picture, solver, date_utc)
     hint = plate_solver.outcome_fields(outcome, date_utc)["hint"]
     photo, image = solved_photo(outcome.hypothesis.pixels, outcome.report, outcome.tracker)
-    return replace(photo, hint=hint), image
+    return replace(photo, hint=hint, stages=used_stages(usable_stages(stages), fov_deg)), image
 
 
 def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
@@ -102,14 +131,20 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
         true_deg=scoring.angles_deg(truth.cam_from_lab, scene, setup.testbed.mount),
         lights=true_lights(truth, magnitude_by_id(setup.testbed)),
         prefix=id_prefix(setup.testbed),
+        pixels=pixels.encoded(frame.image_dn),
+        saturation_dn=frame.saturation_dn,
+        lens=(lens := pixels.scene_lens(setup.testbed)),
+        pose=pixels.scene_pose(setup.testbed, lens, truth),
     )
     return photo, frame.image_dn
 
 
-def solve_frame(image: NDArray, fov_deg: float | None) -> PhotoPixels:
+def solve_frame(image: NDArray, fov_deg: float | None, stages: Mapping[str, str]) -> PhotoPixels:
     """Solve a frame of a live camera; the result's status says why if there is no solution."""
     check_size(image)
-    return solved_photo(image, *plate_solver.solve_array(image, plate_solver.kept_solver(fov_deg), None))
+    solver = kept_solver(fov_deg, tuple(usable_stages(stages).items()))
+    photo, image = solved_photo(image, *plate_solver.solve_array(image, solver, None))
+    return replace(photo, stages=used_stages(usable_stages(stages), fov_deg)), image
 
 
 def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoPixels:
@@ -121,4 +156,9 @@ def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoP
     result = TrackerResult(attitude.status, detections, 1e3 * sum(report.seconds.values()), angles)
     height, width = image.shape
     saturation_dn = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
-    return Photo((width, height), result, solution, stretch.frame_statistics(image, saturation_dn)), image
+    statistics = stretch.frame_statistics(image, saturation_dn)
+    photo = Photo((width, height), result, solution, statistics, pixels=pixels.encoded(image))
+    if attitude.solved:
+        camera = attitude.camera or tracker.camera
+        photo = replace(photo, lens=pixels.lens_of(camera), pose=pixels.solved_pose(attitude))
+    return replace(photo, saturation_dn=saturation_dn), image

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import FrameView, MotionLog, PixelWindow, SceneInfo, Triple
+from skysim.apps.gui.messages import FrameView, MotionLog, SceneInfo, Triple
 from skysim.apps.gui.worker import export, photo, playback, pointing
-from skysim.apps.gui.worker.workbench import Workbench, pixel_window
+from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core.errors import InputError
 from skysim.core.io import images
 from skysim.simulation import run
@@ -52,19 +52,9 @@ class Worker:
         return view
 
     def show_photo(self, photo_pixels: photo.PhotoPixels) -> photo.Photo:
-        """Keep an image that is not of the scene, and return it with its JPEG."""
+        """Keep an image that is not of the scene, and return its view."""
         self.other, self.image = photo_pixels
-        return replace(self.other, jpeg=self.jpeg())
-
-    def shown_image(self) -> NDArray:
-        """(H, W) pixels of the image on the page."""
-        if self.image is not None:
-            return self.image
-        assert self.workbench.frame is not None
-        return self.workbench.frame.image_dn
-
-    def jpeg(self) -> bytes:
-        return self.workbench.to_jpeg(self.shown_image())
+        return self.other
 
     # Tasks.
 
@@ -91,19 +81,6 @@ class Worker:
         bench.lab_from_body = pointing.moved(bench.scene, bench.testbed.mount, bench.lab_from_body, right, up, roll_deg)
         return self.render(solve)
 
-    def show(self, stretch: str, brightness: float) -> bytes:
-        """Change stretch and brightness; return the shown image as JPEG."""
-        self.workbench.stretch, self.workbench.brightness = stretch, brightness
-        return self.jpeg()
-
-    def fit(self, widest_px: int) -> bytes:
-        """Limit the image's width to the pixels that the screen has for it; return the shown image as JPEG."""
-        self.workbench.widest_px = widest_px
-        return self.jpeg()
-
-    def zoom(self, x: float, y: float) -> PixelWindow:
-        return pixel_window(self.shown_image(), x, y)
-
     def simulate(self) -> MotionLog:
         """Simulate the whole motion, for playback."""
         self.moved = run.simulate_motion(self.workbench.testbed, self.report_progress)
@@ -126,13 +103,16 @@ class Worker:
         return export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
 
     def solve_file(self, name: str, data: bytes, fov_deg: float | None) -> photo.Photo:
-        return self.show_photo(photo.photo_from_file(name, data, fov_deg))
+        """Solve an uploaded file by the algorithms that the page shows."""
+        return self.show_photo(photo.photo_from_file(name, data, fov_deg, self.workbench.stages))
 
     def solve_camera(self, source: str, fov_deg: float | None) -> photo.Photo:
         """Solve the next frame of a live camera, which stays open."""
         if self.camera is None:
             self.camera = images.LiveCamera(source)
-        return self.show_photo(photo.solve_frame(images.monochrome(self.camera.frame()), fov_deg))
+        return self.show_photo(
+            photo.solve_frame(images.monochrome(self.camera.frame()), fov_deg, self.workbench.stages)
+        )
 
     def release(self) -> None:
         """Close the live camera."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
@@ -39,7 +40,10 @@ class PhotoPanel:
                 self.source.set_visibility(False)
                 self.button.set_visibility(False)
                 ui.label("To watch a live camera, start the page with skysim gui --camera 0.").classes("quiet")
-        self.result_text = ui.label("No image yet. Images are solved lost in space; uncertain matches are rejected.")
+        self.result_text = ui.label(
+            "No image yet. Images are solved lost in space, by the algorithms chosen above; an identifier needs the"
+            " field of view, else quads of stars identify the image."
+        )
         self.result_text.classes("mono quiet").style("margin-top: 10px; white-space: pre-wrap").mark("facts")
 
     async def uploaded(self, event: Any) -> None:
@@ -98,12 +102,17 @@ class PhotoPanel:
         solution = photo.solution
         if not solution:
             hint = photo.hint or "Rejected: the match is not significant."
-            self.show_text(f"{status_text}\n{hint}", "warn")
+            self.show_text(f"{status_text}\n{hint}\n{stages_text(photo.stages)}", "warn")
             return
         pointing = f"RA {solution['ra_deg']:.4f}°  Dec {solution['dec_deg']:+.4f}°  roll {solution['roll_deg']:.3f}°"
         quality = f"field {solution['fov_deg']:.3f}°  {solution['matches']} stars  rms {solution['rms_arcsec']:.1f}″"
-        self.show_text(f"{status_text}\n{pointing}\n{quality}", "good")
+        self.show_text(f"{status_text}\n{pointing}\n{quality}\n{stages_text(photo.stages)}", "good")
 
     def show_text(self, text: str, color: str) -> None:
         self.result_text.set_text(text)
         self.result_text.classes(remove="quiet good warn", add=color)
+
+
+def stages_text(stages: Mapping[str, str]) -> str:
+    """The algorithms that solved an image, in one line."""
+    return ", ".join(f"{stage} {name}" for stage, name in stages.items())
