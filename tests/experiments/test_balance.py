@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -40,7 +42,7 @@ def scene_of(name: str, **overrides: str) -> Scene:
 
 
 @pytest.mark.slow
-def test_table_is_balanced_below_the_published_torque(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_table_is_balanced_below_the_published_torque(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """5e-5 N m (Bahu & Modenini 2020): MuJoCo's mass, center and inertia are the truth."""
     monkeypatch.setattr(flight, "measured_attitudes", noisy_truth)
     scene = scene_of("cubesat_table")
@@ -54,6 +56,12 @@ def test_table_is_balanced_below_the_published_torque(monkeypatch: pytest.Monkey
         assert row["estimate"] == pytest.approx(row["truth"], rel=0.01)
     for row in result["estimates"][6:]:
         assert row["estimate"] == pytest.approx(row["truth"], abs=1.0)
+    report.write_all(tmp_path, result, [last], "skysim balance cubesat_table")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert 'id="end" class="">balanced' in page
+    assert page.count("<tr>") == 1 + 1 + 1 + 9
+    assert f"{last.true_torque_nm:.2g} N m" in page
+    assert json.loads((tmp_path / "balance.json").read_text())["report"] == str(tmp_path / "report.html")
 
 
 @pytest.mark.slow

@@ -23,7 +23,15 @@ import numpy as np
 from scipy.linalg import LinAlgError, solveh_banded
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration.mass_properties.dynamics import STATE, Motion, States, transition, turn
+from estimator.calibration.mass_properties.dynamics import (
+    STATE,
+    Motion,
+    States,
+    inverse_inertia,
+    momentum_scale,
+    transition,
+    turn,
+)
 from estimator.calibration.mass_properties.record import (
     BIAS,
     BearingRecord,
@@ -39,6 +47,7 @@ MAX_ITERATIONS = 30
 CONVERGED_SIGMA = 0.01  # largest step of a parameter, in its standard deviations
 MISFIT_TOLERANCE, MAX_FACTORS = 0.1, 8  # of the logarithm of the misfit; fits to reach it
 FACTOR_POWER, FACTOR_LIMITS = 1.5, (1e-3, 1e3)  # above 1: the random torque's share of the misfit stays
+MOMENTUM = slice(3, 6)  # of a state
 BANDS = 2 * STATE  # of the normal matrix: a state and its neighbor
 
 
@@ -62,7 +71,7 @@ def estimate_mass(records: Sequence[BearingRecord], lab: Lab, prior: Prior) -> M
     motions = [first_states(record, lab, values) for record in records]
     information, attitudes = np.diag(prior.sigma**-2), sum(len(record.t_s) for record in records)
     for iteration in range(1, MAX_ITERATIONS + 1):
-        parts = [reduced(*one, lab, values, prior.sigma) for one in zip(records, motions, strict=True)]
+        parts = [reduced(*one, lab, values, prior) for one in zip(records, motions, strict=True)]
         normal = information + sum(part.normal for part in parts)
         gradient = information @ (prior.values - values) + sum(part.gradient for part in parts)
         covariance: Floats = np.asarray(np.linalg.inv(normal))
@@ -99,7 +108,7 @@ def estimate_with_noise(records: Sequence[BearingRecord], lab: Lab, prior: Prior
 
 def first_states(record: BearingRecord, lab: Lab, values: Floats) -> States:
     """States to begin with: the measured attitudes, the momentum of their differences, no random torque."""
-    motion = Motion(record, lab, values[:, None])
+    motion = Motion(record, lab, values[:, None], values)
     turned = (record.lab_from_body[:-1].inv() * record.lab_from_body[1:]).as_rotvec() / np.diff(record.t_s)[:, None]
     middle_s = (record.t_s[1:] + record.t_s[:-1]) / 2
     rate = np.array([np.interp(record.t_s, middle_s, one) for one in turned.T])
@@ -109,10 +118,10 @@ def first_states(record: BearingRecord, lab: Lab, values: Floats) -> States:
     return States(quaternion, turn(quaternion, own), np.zeros_like(rate))
 
 
-def reduced(record: BearingRecord, states: States, lab: Lab, values: Floats, sigma: Floats) -> Reduced:
+def reduced(record: BearingRecord, states: States, lab: Lab, values: Floats, prior: Prior) -> Reduced:
     """Linearize a record's residuals and eliminate its states."""
     count, size = len(record.t_s), len(values)
-    rows = whitened_links(record, states, lab, values, sigma)
+    rows = whitened_links(record, states, lab, values, prior)
     products = rows.transpose(0, 2, 1) @ rows
     before, after, rest = slice(0, STATE), slice(STATE, 2 * STATE), slice(2 * STATE, None)
     diagonal, border = np.zeros((count, STATE, STATE)), np.zeros((count, STATE, size + 1))
@@ -130,15 +139,26 @@ def reduced(record: BearingRecord, states: States, lab: Lab, values: Floats, sig
     return Reduced(corner[:-1, :-1], -corner[:-1, -1], -solved[:, -1], solved[:, :-1], chi2)
 
 
-def whitened_links(record: BearingRecord, states: States, lab: Lab, values: Floats, sigma: Floats) -> Floats:
+def whitened_links(record: BearingRecord, states: States, lab: Lab, values: Floats, prior: Prior) -> Floats:
     """(N - 1, 9, 18 + P + 1) slopes of the transitions' residuals by state before, state after and parameters, and the
     residuals, in standard deviations.
+
+    Residuals of momentum m are those of the assumed inertia, R J0 J^-1 R^T m, whose noise does not depend on J; their
+    slopes by the elements of J are those of m and -R J0 J^-1 (dJ) J^-1 R^T m.
     """
-    link = transition(record, lab, 0, states.take(slice(None, -1)), values, sigma)
+    before = states.take(slice(None, -1))
+    link = transition(record, lab, 0, before, values, prior)
     misfit = link.after.minus(states.take(slice(1, None))).T[:, :, None]
     by_after = np.broadcast_to(-np.eye(STATE), link.by_state.shape)
     rows = np.concatenate([link.by_state, by_after, link.by_parameter, misfit], axis=2)
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(link.noise)) @ rows)
+    scale = np.tile(np.eye(STATE), (len(misfit), 1, 1))
+    scale[:, MOMENTUM, MOMENTUM] = momentum_scale(record, before, values, prior.values)
+    R_lab_from_body = before.rotation.as_matrix()
+    in_body = R_lab_from_body.transpose(0, 2, 1) @ misfit[:, MOMENTUM]
+    turned = np.einsum("ijp,kjl->kip", inertia_matrix(np.eye(6)), inverse_inertia(record, values) @ in_body)
+    rows[:, MOMENTUM, 2 * STATE : 2 * STATE + 6] -= R_lab_from_body @ turned
+    noise = scale @ link.noise @ scale.transpose(0, 2, 1)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(noise)) @ scale @ rows)
 
 
 def add_measured(

@@ -5,8 +5,13 @@ respect to inertial space, and a random torque d about lab axes:
 
     w = J^-1 (R^T H - A (1 + e) h) - R^T W              rate in the lab, body axes
     dR/dt = R [w]
-    dH/dt = (R m r) x g - W x H + T + d - R (v + q |w|) w
+    dH/dt = (R m r) x g - W x H + T + R J J0^-1 R^T d - R (v + q |w|) w
     dd/dt = -d / tau + noise
+
+J0 is the assumed inertia, so that d stands for the random acceleration J0^-1 R^T d. If it were a torque, a fit of J and
+of the motion at once would prefer small inertias, since with them small random torques explain a motion: it has the
+greatest joint probability of J and d, where that of J alone is sought (Box & Tiao, Bayesian Inference in Statistical
+Analysis, 1973, section 1.5).
 
 J is the inertia with the wheels locked, A the wheel axes, h the wheels' assumed momenta and e their relative errors,
 m r the mass times the center of mass, g gravity, W the Earth's rate, T a torque constant in the lab, v and q the air's
@@ -31,6 +36,7 @@ from estimator.calibration.mass_properties.record import (
     WHEELS,
     BearingRecord,
     Lab,
+    Prior,
     inertia_matrix,
 )
 from estimator.core.arrays import Floats, Ints
@@ -93,13 +99,17 @@ def turn(quaternion: Floats, vector: Floats, inverse: bool = False) -> Floats:
 
 
 class Motion:
-    """The equations of motion of one record, for given parameters (P, B) of B motions."""
+    """The equations of motion of one record, for given parameters (P, B) of B motions.
 
-    def __init__(self, record: BearingRecord, lab: Lab, parameters: Floats) -> None:
+    assumed : (P,) parameters with the inertia J0
+    """
+
+    def __init__(self, record: BearingRecord, lab: Lab, parameters: Floats, assumed: Floats) -> None:
         inertia = inertia_matrix(parameters[INERTIA]) + record.added_inertia_kg_m2[:, :, None]
         self.inverse: Floats = np.asarray(np.linalg.inv(inertia.transpose(2, 0, 1)), dtype=np.float64).transpose(
             1, 2, 0
         )
+        self.torque_scale = np.einsum("ijb,jk->ikb", inertia, inverse_inertia(record, assumed))
         self.moment = parameters[MOMENT] + record.added_moment_kg_m[:, None]
         self.lab_torque, self.drag = parameters[LAB_TORQUE], parameters[DRAG]
         self.wheel_scale = 1 + parameters[WHEELS:]
@@ -124,9 +134,10 @@ class Motion:
         viscous, quadratic = self.drag
         drag = turn(q, (viscous + quadratic * np.abs(rate)) * rate)
         torque = cross(turn(q, self.moment), self.gravity) - cross(self.earth, states.momentum)
+        in_body = np.einsum("ijb,jb->ib", self.torque_scale, turn(q, states.torque, inverse=True))
         vector = q[3] * rate + cross(q[:3], rate)
         spin = np.vstack([vector, -np.sum(q[:3] * rate, axis=0)[None]]) / 2
-        return States(spin, torque + self.lab_torque + states.torque - drag, np.zeros_like(rate))
+        return States(spin, torque + self.lab_torque + turn(q, in_body) - drag, np.zeros_like(rate))
 
     def integrate(self, begin_s: Floats, end_s: Floats, states: States, correlation_s: float) -> States:
         """States at end_s (B,) by the fourth-order Runge-Kutta method; the torque is its mean in each step."""
@@ -149,6 +160,11 @@ class Motion:
         return states
 
 
+def inverse_inertia(record: BearingRecord, values: Floats) -> Floats:
+    """(3, 3) inverse of the inertia of the vehicle as it was in a record, for parameters (P,)."""
+    return np.asarray(np.linalg.inv(inertia_matrix(values[INERTIA]) + record.added_inertia_kg_m2))
+
+
 def moved_on(states: States, slope: States, by_s: Floats | float) -> States:
     return States(*(one + by_s * rate for one, rate in zip(states, slope, strict=True)))
 
@@ -159,25 +175,23 @@ def difference_steps(values: Floats, sigma: Floats, momentum_nms: float, torque_
     return state, np.minimum(1e-3 * sigma, RELATIVE_STEP * np.maximum(np.abs(values), sigma))
 
 
-def transition(
-    record: BearingRecord, lab: Lab, first: int, before: States, values: Floats, sigma: Floats
-) -> Transition:
+def transition(record: BearingRecord, lab: Lab, first: int, before: States, values: Floats, prior: Prior) -> Transition:
     """Integrate K states (from attitude number `first` on) each to the next attitude's time, with derivatives.
 
-    values, sigma : (P,) parameters, and the standard deviations that scale the steps of their difference quotients
+    values : (P,) parameters;  prior : its standard deviations scale the steps of their difference quotients
 
     Every interval is integrated once for each element of state and parameters, a little changed, all at once.
     """
     count, size = before.momentum.shape[1], len(values)
     largest = float(np.max(np.abs(before.momentum), initial=1e-3 * float(np.max(values[INERTIA]))))
-    state_step, step = difference_steps(values, sigma, largest, float(np.max(lab.torque_rms_nm)))
+    state_step, step = difference_steps(values, prior.sigma, largest, float(np.max(lab.torque_rms_nm)))
     columns = 1 + STATE + size
     change = np.zeros((STATE, columns))
     change[:, 1 : 1 + STATE] = np.diag(state_step)
     parameters = np.repeat(values[:, None], columns, axis=1)
     parameters[:, 1 + STATE :] += np.diag(step)
     pick: Ints = np.repeat(np.arange(count), columns)
-    motion = Motion(record, lab, np.tile(parameters, count))
+    motion = Motion(record, lab, np.tile(parameters, count), prior.values)
     t_s = record.t_s[first : first + count + 1]
     start = before.take(pick).moved(np.tile(change, count))
     end = motion.integrate(t_s[:-1][pick], t_s[1:][pick], start, lab.torque_correlation_s)
@@ -188,16 +202,18 @@ def transition(
         after,
         slopes[:, :, :STATE],
         slopes[:, :, STATE:],
-        torque_noise(np.diff(t_s), motion.inverse[:, :, 0], before, lab, float(np.median(np.diff(record.wheel_t_s)))),
+        torque_noise(np.diff(t_s), record, before, values, prior.values, lab),
     )
 
 
-def torque_noise(duration_s: Floats, inverse: Floats, before: States, lab: Lab, sample_s: float) -> Floats:
+def torque_noise(
+    duration_s: Floats, record: BearingRecord, before: States, values: Floats, assumed: Floats, lab: Lab
+) -> Floats:
     """(K, 9, 9) covariance of the states after K intervals due to the random torque and to the wheels' speed noise.
 
     White noise of density 2 rms^2 / tau that acts at s before the end has by then changed torque, momentum and angle by
 
-        c = exp(-s / tau),   b = tau (1 - c),   a = J^-1 R^T tau (s - b)
+        c = exp(-s / tau),   R J J0^-1 R^T b,  b = tau (1 - c),   a = J0^-1 R^T tau (s - b)
 
     whose products are integrated over s by Gauss's rule. Noise of a measured momentum, sigma in every sample, moves the
     angle by J^-1 sigma times the sample's time, a random walk.
@@ -209,9 +225,19 @@ def torque_noise(duration_s: Floats, inverse: Floats, before: States, lab: Lab, 
     moments = np.einsum("iks,jks,ks->kij", *2 * [np.array([tau * (s - b), b, c])], duration_s[:, None] * GAUSS_W / 2)
     density = np.diag(2 * lab.torque_rms_nm**2 / tau)
     spread = np.zeros((len(duration_s), 3, 3, 3))
-    spread[:, 0] = inverse @ before.rotation.inv().as_matrix()
-    spread[:, 1:] = np.eye(3)
+    R_body_from_lab, inverse = before.rotation.inv().as_matrix(), inverse_inertia(record, assumed)
+    spread[:, 0] = inverse @ R_body_from_lab
+    spread[:, 1] = np.linalg.inv(momentum_scale(record, before, values, assumed))
+    spread[:, 2] = np.eye(3)
     noise = np.einsum("kij,kiab,bc,kjdc->kiajd", moments, spread, density, spread).reshape(-1, STATE, STATE)
+    sample_s = float(np.median(np.diff(record.wheel_t_s)))
     walk = lab.wheel_sigma_nms**2 * sample_s * inverse @ lab.wheel_axes @ lab.wheel_axes.T @ inverse.T
     noise[:, :3, :3] += walk * duration_s[:, None, None]
     return np.asarray(noise)
+
+
+def momentum_scale(record: BearingRecord, states: States, values: Floats, assumed: Floats) -> Floats:
+    """(K, 3, 3) R J0 J^-1 R^T: of a change of momentum it makes that of the assumed inertia at the same rate."""
+    R_lab_from_body = states.rotation.as_matrix()
+    scale = np.linalg.solve(inverse_inertia(record, assumed), inverse_inertia(record, values))
+    return np.asarray(R_lab_from_body @ scale @ R_lab_from_body.transpose(0, 2, 1))

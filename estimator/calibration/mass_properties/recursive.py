@@ -34,7 +34,7 @@ def filter_mass(record: BearingRecord, lab: Lab, prior: Prior) -> Iterator[MassE
     if len(record.t_s) < least:
         raise ImageError(f"mass properties: {len(record.t_s)} attitudes; allowed for a filter: {least} or more")
     begun, rest = estimate_mass([cut(record, slice(0, START))], lab, prior), cut(record, slice(START, None))
-    yield from filter_from(begun, rest, lab, prior.sigma)
+    yield from filter_from(begun, rest, lab, prior)
 
 
 def cut(record: BearingRecord, which: slice) -> BearingRecord:
@@ -47,7 +47,7 @@ def cut(record: BearingRecord, which: slice) -> BearingRecord:
     )
 
 
-def filter_from(begun: MassEstimate, record: BearingRecord, lab: Lab, prior_sigma: Floats) -> Iterator[MassEstimate]:
+def filter_from(begun: MassEstimate, record: BearingRecord, lab: Lab, prior: Prior) -> Iterator[MassEstimate]:
     """Yield the estimate after each attitude but the first two, from earlier parameters and their covariance."""
     size, values = len(begun.values), begun.values
     states = first_states(record, lab, values).take(slice(1, 2))
@@ -55,7 +55,7 @@ def filter_from(begun: MassEstimate, record: BearingRecord, lab: Lab, prior_sigm
     at_bias = slice(STATE + BIAS.start, STATE + BIAS.stop)
     chi2 = 0.0
     for n in range(2, len(record.t_s)):
-        link = transition(record, lab, n - 1, states, values, prior_sigma)
+        link = transition(record, lab, n - 1, states, values, prior)
         F = np.eye(STATE + size)
         F[:STATE] = np.hstack([link.by_state[0], link.by_parameter[0]])
         covariance = F @ covariance @ F.T

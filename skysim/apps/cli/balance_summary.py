@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from skysim.apps.cli.terminal import print_table, print_wrapped
+from skysim.experiments.balance import report
 
 
 def print_flight(row: dict[str, Any]) -> None:
@@ -23,16 +24,13 @@ def print_flight(row: dict[str, Any]) -> None:
 
 def print_balance(result: dict[str, Any]) -> None:
     """Print the mass properties and the end."""
-    tables = [("trim masses at zero, from all flights", result["estimates"])]
-    if "in_flight" in result:
-        tables.append(("by the filter in flight, from the last flight", result["in_flight"]))
-    for title, rows in tables:
+    for title, rows in report.tables(result):
         lines = [[row["what"], *(f"{row[key]:.5g}" for key in ("estimate", "sigma", "truth"))] for row in rows]
         print_table(title, ["what", "estimate", "1σ", "simulated vehicle"], lines)
     last = result["flights"][-1]
     end = "balanced" if result["balanced"] else "not balanced"
     print_wrapped(
         f"{end}: gravity torque at most {last['torque_bound_nm']:.2g} N m, bar {result['torque_bar_nm']:.2g} N m; the"
-        f" simulated vehicle's is {last['true_torque_nm']:.2g} N m; misfit {result['misfit']:.2f}; picture"
-        f" {result['picture']}"
+        f" simulated vehicle's is {last['true_torque_nm']:.2g} N m; misfit {result['misfit']:.2f}; report"
+        f" {result['report']}"
     )

@@ -1,19 +1,22 @@
-"""Statistics and picture of a balance: the estimates flight by flight, and beside them the simulated vehicle."""
+"""Statistics, picture and page of a balance: the estimates by flight, and beside them the simulated vehicle."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.calibration.mass_properties.record import INERTIA, MOMENT, MassEstimate, inertia_six
+from skysim.core.io import files
 from skysim.core.types import Floats
 from skysim.experiments.balance.assumptions import Assumptions
 from skysim.experiments.balance.flight import Flight
 from skysim.experiments.balance.observability import largest_tilt_deg
 from skysim.experiments.balance.procedure import Iteration, Plan, filtered
+from skysim.results.report import embed, render_page
 
 INERTIA_NAMES = ("Jxx", "Jyy", "Jzz", "Jxy", "Jxz", "Jyz")
 MOMENT_NAMES = ("x", "y", "z")
@@ -116,3 +119,30 @@ def balance_figure(iterations: Sequence[Iteration], torque_bar_nm: float) -> NDA
 def filter_rows(one: Iteration, assumptions: Assumptions) -> list[dict[str, Any]]:
     """As `estimate_rows`, of the filter in flight over an iteration's flight alone."""
     return estimate_rows(one.flight, filtered(one.flight.record, assumptions))
+
+
+def tables(statistics: dict[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
+    """Titles and rows of the tables of mass properties."""
+    found = [("With the trim masses at zero, from all flights", statistics["estimates"])]
+    if "in_flight" in statistics:
+        found.append(("By the filter in flight, from the last flight", statistics["in_flight"]))
+    return found
+
+
+def write_all(folder: Path, statistics: dict[str, Any], iterations: Sequence[Iteration], command: str) -> None:
+    """Write picture, JSON and the page, with the picture embedded; their paths are added to the statistics."""
+    picture = files.make_folder(folder) / "balance.png"
+    files.write_image(picture, balance_figure(iterations, statistics["torque_bar_nm"]))
+    statistics |= {"picture": str(picture), "report": str(folder / "report.html")}
+    files.write_text(folder / "balance.json", files.to_json(statistics))
+    text = render_page(
+        "balance.html",
+        title=f"Balance of {statistics['scene']}",
+        command=command,
+        balance=statistics,
+        last=statistics["flights"][-1],
+        frames=sum(one["frames"] for one in statistics["flights"]),
+        tables=tables(statistics),
+        picture=embed(picture.read_bytes()),
+    )
+    files.write_text(folder / "report.html", text)

@@ -1,13 +1,13 @@
 """The experiments of a datasheet as one study: each cell sets keys of the scene and of the trial, in the same fields.
 
 A field is a replicate: a random attitude, the same in all cells whose `attitude_seed` is the same. A cell draws units,
-thermal state, attitude and noise by number, so that terms can be told apart and causes compared on the same frames.
+thermal state, attitude and noise by number, so that terms can be separated and causes compared on the same frames.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,25 +17,29 @@ from skysim.camera import thermal
 from skysim.core.errors import InputError
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.loader import has_survey_errors
+from skysim.experiments.study.unused_options import tracks
 from skysim.scene.scene import BODIES_YEARS, Scene
 from skysim.scene.sections.layouts import OnPoints
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
 
 SCAN_PX = 3.37  # from one attitude of a field to the next: other phases in the pixels, the same stars
-STREAKS_PX = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # of the rates
-SEQUENCE = (0, 1, 2, 3, 5, 8, 13, 21)  # frames of a sequence at a constant rate
+STREAKS_PX = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # of the rates
+SEQUENCE = (0, 1, 2, 4, 8, 16)  # frames of a sequence at a constant rate
 SEQUENCE_RATES = 4  # beside rest, the slowest ones
 FAINTER = (-1.0, -0.5, 0.5)  # magnitudes by which the limit of the tracker's catalog is varied
 FALSE_STARS_PX, TRUE_STARS = 0.05, 20  # error and number of the centroids beside which false ones are drawn
 BENDS_PX = (1.0, 4.0, 16.0, 64.0)  # acceleration times the exposure time's square
+TRACKED = 2  # frames that are followed before one in tracking mode: the second has a rate
+TRACKED_STREAKS_PX = (2.0, 8.0, 16.0, 32.0)  # of the rates in tracking mode
+MISSED_PX = (3.0, 6.0, 12.0, 24.0)  # acceleration times the square of the time between frames, in tracking mode
 
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """Numbers of fields, of units, of thermal states, of attitudes and frames in a field, and of independent draws.
+    """Numbers of fields, of units, of thermal states, of attitudes and frames in a field, and of other cells.
 
-    draws : cells in which all is drawn anew in the fields of the terms;  sky : likewise with new attitudes
-    pairs : cells with all drawn anew to compare a cause with
+    draws : frames in each field with attitudes and noise of their own, in which units and thermal states take turns
+    sky   : frames in new fields, of other units;  pairs : frames with and without a cause to compare
     """
 
     fields: int
@@ -48,8 +52,8 @@ class Size:
     pairs: int
 
 
-QUICK = Size(fields=60, units=2, states=3, attitudes=2, frames=2, draws=8, sky=8, pairs=2)
-FULL = Size(fields=300, units=4, states=4, attitudes=3, frames=2, draws=24, sky=24, pairs=4)
+QUICK = Size(fields=40, units=4, states=3, attitudes=2, frames=2, draws=8, sky=12, pairs=2)
+FULL = Size(fields=300, units=8, states=4, attitudes=2, frames=2, draws=32, sky=4, pairs=2)
 
 
 class Cell(NamedTuple):
@@ -149,20 +153,25 @@ class Designer:
         turn_deg += draw.attitude * SCAN_PX * self.pixel_deg
         return chosen | {"trial.noise_seed": self.noise, "trial.turn_deg": turn_deg}
 
-    def independent(self, number: int) -> Draw:
-        """A draw that shares nothing but the field with those of other numbers, and none with those of the terms."""
-        return Draw(100 + number, number, 10 + number)
+    def in_turn(self, number: int) -> Draw:
+        """A draw with an attitude of its own, of the units and the thermal states of the terms in turn.
+
+        A bias that scatters among units would be another one among others, which few units cannot average out.
+        """
+        return Draw(number % self.units, number // self.units % self.states, 10 + number)
 
     def cells(self) -> Iterator[Cell]:
         """All cells, in the order in which they are run."""
         yield from self.terms()
-        yield from self.draws("total", self.size.draws)
+        combinations = self.units * self.states
+        yield from self.draws("total", math.ceil(self.size.draws / combinations) * combinations)
         for number in range(self.size.sky):
-            settings = self.settings(self.independent(200 + number)) | {"trial.attitude_seed": 1 + number}
+            settings = self.settings(Draw(100 + number, number)) | {"trial.attitude_seed": 1 + number}
             yield Cell("sky", {"draw": number}, settings)
         yield from self.rates()
         yield from self.sequences()
         yield from self.accelerations()
+        yield from self.tracked()
         yield from self.magnitudes()
         for name, change in self.causes().items():
             yield from self.draws("cause", self.size.pairs, change, cause=name)
@@ -179,23 +188,22 @@ class Designer:
                         yield Cell("terms", levels, self.settings(Draw(unit, state, attitude)))
 
     def draws(self, experiment: str, count: int, change: Settings | None = None, **levels: str) -> Iterator[Cell]:
-        """Independent draws; with a change the same as without it, noise included, so that they can be compared."""
+        """Frames of other attitudes; with a change the same as without it, noise included, for a comparison."""
         for number in range(count):
-            settings = self.settings(self.independent(number)) | {"trial.noise_seed": 10_000 + number}
+            settings = self.settings(self.in_turn(number)) | {"trial.noise_seed": 10_000 + number}
             settings |= change or {}
             if settings.get("trial.kind") == "centroids":
                 del settings["trial.turn_deg"]
             yield Cell(experiment, {**levels, "draw": number}, settings)
 
-    @property
-    def rates_deg_s(self) -> list[float]:
-        """Rates whose streaks are as long as STREAKS_PX, to two digits."""
+    def rates_deg_s(self, streaks_px: Sequence[float]) -> list[float]:
+        """Rates with streaks of these lengths, to two digits."""
         per_px = self.pixel_deg / self.scene.exposure.time_s
-        return [float(f"{streak * per_px:.2g}") for streak in STREAKS_PX]
+        return [float(f"{streak * per_px:.2g}") for streak in streaks_px]
 
     def rates(self) -> Iterator[Cell]:
         """At each rate two frames of each attitude that differ in their noise alone."""
-        for rate in self.rates_deg_s:
+        for rate in self.rates_deg_s(STREAKS_PX):
             for frame in range(2):
                 yield Cell(
                     "rate", {"rate_deg_s": rate, "frame": frame}, self.settings(Draw()) | {"trial.rate_deg_s": rate}
@@ -203,17 +211,36 @@ class Designer:
 
     def sequences(self) -> Iterator[Cell]:
         """Frames of one unit at the scene's frame rate, at rest and at constant rates."""
-        for rate in (0.0, *self.rates_deg_s[:SEQUENCE_RATES]):
+        for rate in (0.0, *self.rates_deg_s(STREAKS_PX[:SEQUENCE_RATES])):
             for step in SEQUENCE:
                 settings = self.settings(Draw(), rate * step / self.scene.exposure.rate_hz)
                 yield Cell("sequence", {"rate_deg_s": rate, "step": step}, settings | {"trial.rate_deg_s": rate})
 
     def accelerations(self) -> Iterator[Cell]:
-        """One frame of each attitude at accelerations with no rate at mid-exposure."""
+        """Two frames of each attitude at accelerations with no rate at mid-exposure."""
         for bend in BENDS_PX:
             acceleration = float(f"{bend * self.pixel_deg / self.scene.exposure.time_s**2:.2g}")
             change = {"trial.acceleration_deg_s2": acceleration}
-            yield Cell("acceleration", {"acceleration_deg_s2": acceleration}, self.settings(Draw()) | change)
+            for frame in range(2):
+                levels = {"acceleration_deg_s2": acceleration, "frame": frame}
+                yield Cell("acceleration", levels, self.settings(Draw()) | change)
+
+    def tracked(self) -> Iterator[Cell]:
+        """Two frames of each attitude in tracking mode, at constant rates and at accelerations; none without the mode.
+
+        The prediction extrapolates the mean rate between the last two frames, so under an acceleration a it misses the
+        next one, t later, by a t^2.
+        """
+        if not tracks(self.scene):
+            return
+        between_s = 1 / self.scene.exposure.rate_hz
+        bends = [float(f"{missed * self.pixel_deg / between_s**2:.2g}") for missed in MISSED_PX]
+        motions = [("rate_deg_s", rate) for rate in self.rates_deg_s(TRACKED_STREAKS_PX)]
+        motions += [("acceleration_deg_s2", bend) for bend in bends]
+        for key, value in motions:
+            for frame in range(2):
+                change = {f"trial.{key}": value, "trial.tracked": TRACKED}
+                yield Cell(f"tracked {key}", {key: value, "frame": frame}, self.settings(Draw()) | change)
 
     def magnitudes(self) -> Iterator[Cell]:
         """Pairs of frames with other limits of the tracker's catalog, under the stars."""

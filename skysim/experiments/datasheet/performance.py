@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,12 +12,15 @@ from skysim.core.types import Floats
 from skysim.experiments.datasheet.components import mean_known
 from skysim.experiments.datasheet.run import Sheet
 from skysim.experiments.datasheet.terms import GROUPS, rms
+from skysim.experiments.study.execution import setups, trials
 from skysim.results import metrics
 from skysim.results.metrics import Summary
+from skysim.tracking import factory
 
 CLAIMS = (0.95, 0.99, 0.997)  # probabilities of a right attitude
 LEVELS = (0.683, 0.954, 0.997)  # of the quantiles
-LIMIT = 0.95  # probability of a right attitude that bounds a rate or an acceleration
+LIMITS = (0.95, 0.9)  # probabilities of a right attitude that bound a rate or an acceleration
+TIMED = 50  # frames whose solution is timed
 
 
 class Counts(NamedTuple):
@@ -145,22 +149,57 @@ def by_acceleration(sheet: Sheet) -> list[dict[str, Any]]:
     return found
 
 
-def bracket(rows: list[dict[str, Any]], key: str) -> tuple[float, float]:
-    """Between which levels the probability of a right attitude falls below LIMIT, each shown at 95 % confidence.
+def by_tracked(sheet: Sheet, key: str) -> list[dict[str, Any]]:
+    """Error and outcomes in tracking mode by a rate or an acceleration; empty without the mode."""
+    experiment = f"tracked {key}"
+    return [
+        {key: value, **pair_row(sheet, sheet.rows(experiment, **{key: value}))}
+        for value in sheet.levels(experiment, key)
+    ]
 
-    The highest level up to which all are shown to be above it, NaN if none is; and the lowest that is shown to be below
-    it, infinite if none is.
+
+class Limit(NamedTuple):
+    """Between which levels the probability of a right attitude falls below `share`, each shown at 95 % confidence.
+
+    share : the highest of LIMITS that the frames of a level can show
+    above : the highest level up to which all are shown to be above it, NaN if none is
+    below : the lowest from which all are shown to be below it, infinite if none is
     """
+
+    share: float
+    above: float
+    below: float
+
+
+def bracket(rows: list[dict[str, Any]], key: str) -> Limit:
+    """The limit in a rate or an acceleration, from rows in rising order of it."""
+    fewest = min(row["counts"].frames for row in rows)
+    share = next((one for one in LIMITS if runs_needed(one) <= fewest), LIMITS[-1])
     above, below = math.nan, math.inf
     for row in rows:
-        if row["counts"].share("right").low < LIMIT:
+        if row["counts"].share("right").low < share:
             break
         above = row[key]
     for row in reversed(rows):
-        if row["counts"].share("right").high >= LIMIT:
+        if row["counts"].share("right").high >= share:
             break
         below = row[key]
-    return above, below
+    return Limit(share, above, below)
+
+
+def solution_times_s(sheet: Sheet) -> Floats:
+    """(TIMED,) seconds that the tracker took for frames lost in space, from pixels to attitude, on this machine.
+
+    All are solved twice and the second time counts: the first one compiles or loads what the solutions need.
+    """
+    setup = setups.prepared_setup(sheet.spec, sheet.cells[sheet.rows("sky")[0]].settings)
+    found = []
+    for replicate in (*range(TIMED), *range(TIMED)):
+        frame, _, _ = trials.render_trial_frame(setup, setups.seed_of(sheet.spec, 0, replicate))
+        begin_s = time.perf_counter()
+        factory.solve_frame(setup.estimator, frame)
+        found.append(time.perf_counter() - begin_s)
+    return np.array(found[TIMED:])
 
 
 def disturbances(sheet: Sheet) -> list[dict[str, Any]]:

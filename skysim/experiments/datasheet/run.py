@@ -19,7 +19,7 @@ from skysim.experiments.datasheet.cells import FULL, QUICK, Cell, Designer, Size
 from skysim.experiments.study import store
 from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution import runner
-from skysim.experiments.study.plan import Plan, Study, make_plan
+from skysim.experiments.study.plan import Plan, Study, TrialSpec, make_plan
 from skysim.scene.scene import Scene
 
 STUDY = "datasheet.yaml"
@@ -31,6 +31,7 @@ class Sheet:
     """The measured frames of a datasheet.
 
     columns : of the trials, (cells, fields) each;  scene_name : as it was given;  overrides : of the command line
+    spec    : what a trial needs to be run again
     """
 
     scene: Scene
@@ -40,6 +41,7 @@ class Sheet:
     designer: Designer
     cells: list[Cell]
     columns: dict[str, NDArray[Any]]
+    spec: TrialSpec
 
     def rows(self, experiment: str, **levels: Any) -> list[int]:
         """Rows of the cells of an experiment that have these levels."""
@@ -128,7 +130,7 @@ def measure(
         with store.writing(folder / store.STORE) as kept:
             runner.prepare_store(plan, kept, resume=kept.counts()["done"] > 0)
             runner.run(plan, kept, engine, watch(plan.trials) if watch else None)
-            return Sheet(scene, scene_name, overrides, size, designer, cells, read(plan, kept))
+            return Sheet(scene, scene_name, overrides, size, designer, cells, read(plan, kept), plan.spec)
     finally:
         engine.close()
 

@@ -6,9 +6,12 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from skysim.experiments.datasheet import performance, terms
+from skysim.experiments.datasheet.cells import TRACKED
 from skysim.experiments.datasheet.components import Bounded, Components
-from skysim.experiments.datasheet.performance import LIMIT, Counts
+from skysim.experiments.datasheet.performance import Counts, Limit
 from skysim.experiments.datasheet.run import Sheet
 from skysim.results.metrics import Summary
 
@@ -47,12 +50,15 @@ class Statement(NamedTuple):
     quantiles: list[dict[str, Any]]
     rates: list[dict[str, Any]]
     accelerations: list[dict[str, Any]]
+    tracked_rates: list[dict[str, Any]]
+    tracked_accelerations: list[dict[str, Any]]
     magnitudes: list[dict[str, Any]]
     disturbances: list[dict[str, Any]]
+    times_s: list[float]
 
 
 def state(sheet: Sheet) -> Statement:
-    """The statement of a measured sheet. Raises InputError where too few frames are solved."""
+    """The statement of a measured sheet, with times of this machine. Raises InputError where too few are solved."""
     _, solved = terms.term_errors(sheet)
     found = performance.counts(sheet, sheet.rows("sky"))
     return Statement(
@@ -66,8 +72,11 @@ def state(sheet: Sheet) -> Statement:
         performance.quantiles(sheet),
         performance.by_rate(sheet),
         performance.by_acceleration(sheet),
+        performance.by_tracked(sheet, "rate_deg_s"),
+        performance.by_tracked(sheet, "acceleration_deg_s2"),
         performance.by_magnitude(sheet),
         performance.disturbances(sheet),
+        performance.solution_times_s(sheet).tolist(),
     )
 
 
@@ -109,10 +118,21 @@ def numbers(statement: Statement) -> dict[str, Any]:
 
 
 def limits(statement: Statement) -> dict[str, Any]:
-    """The brackets of the limits in rate and acceleration."""
-    rate = performance.bracket(statement.rates, "rate_deg_s")
-    acceleration = performance.bracket(statement.accelerations, "acceleration_deg_s2")
-    return as_numbers({"rate_deg_s": rate, "acceleration_deg_s2": acceleration})
+    """The limits of acquisition and of tracking in rate and acceleration."""
+    measured = {
+        "acquisition": (statement.rates, statement.accelerations),
+        "tracking": (statement.tracked_rates, statement.tracked_accelerations),
+    }
+    return as_numbers(
+        {
+            mode: {
+                key: performance.bracket(rows, key)
+                for key, rows in zip(("rate_deg_s", "acceleration_deg_s2"), tables, strict=True)
+            }
+            for mode, tables in measured.items()
+            if tables[0]
+        }
+    )
 
 
 # As sections.
@@ -149,6 +169,7 @@ def sections(statement: Statement) -> list[Section]:
         rate_section(statement),
         acceleration_section(statement),
     ]
+    made += [tracking_section(statement)] if statement.tracked_rates else []
     made += [magnitude_section(statement)] if statement.magnitudes else []
     return [*made, disturbance_section(statement)]
 
@@ -175,25 +196,25 @@ def term_section(statement: Statement) -> Section:
         f" and y, about it the roll. Statistical interpretation: {ENSEMBLE}; temporal noise: {TEMPORAL}."
         f" {statement.fields} fields, {sheet.designer.units} units, {sheet.designer.states} thermal states,"
         f" {sheet.size.attitudes} attitudes a few pixels apart, {sheet.size.frames} frames each.",
-        f"Sum of the terms' variances over the mean square of {sheet.size.draws} independent frames in each of these"
-        f" fields, with all drawn anew: {ratios}.",
+        f"Sum of the terms' variances over the mean square of {len(sheet.rows('total'))} frames in each of these"
+        f" fields, with other attitudes and other noise: {ratios}.",
         f"Mean error about the camera's axes, arcseconds: x {x}, y {y}, roll {roll}.",
     ]
     if sheet.designer.units > 1:
-        texts.insert(2, unit_text(sheet.designer.units, sheet.size.draws))
+        texts.insert(2, unit_text(sheet.designer.units))
     return Section("Error terms", texts, ["term", "across ″", "%", "about ″", "%", "what it is"], rows, ["terms"])
 
 
-def unit_text(units: int, draws: int) -> str:
+def unit_text(units: int) -> str:
     """What the intervals over the fields leave out: that units are few (chi-square of a variance)."""
     from scipy.special import chdtri
 
     freedom = units - 1
     low, high = (math.sqrt(freedom / chdtri(freedom, tail)) for tail in (0.025, 0.975))
     return (
-        f"These intervals are over the fields. Where the bias scatters among units, {units} of them know it to a factor"
-        f" of {low:.2g} to {high:.2g} (95 %), and the independent frames are of {draws} other units: a bias that"
-        " dominates needs more units before the two can agree."
+        f"These intervals are over the fields, for the {units} units that were measured, which both sides of the"
+        f" comparison have. Where the bias scatters among units, {units} of them bound its size for all units to a"
+        f" factor of {low:.2g} to {high:.2g} (95 %)."
     )
 
 
@@ -229,6 +250,11 @@ def probability_section(statement: Statement) -> Section:
         "A claim needs so many runs without a failure that the upper bound of the failures' probability is below its"
         " complement: n = ln(1 - c) / ln(p), rounded up.",
     ]
+    median_ms, high_ms = (1000 * quantile for quantile in np.quantile(statement.times_s, (0.5, 0.95)))
+    texts.append(
+        f"Time of a solution lost in space, from pixels to attitude, on the machine that wrote this: median"
+        f" {median_ms:.3g} ms, 95 % within {high_ms:.3g} ms ({len(statement.times_s)} frames, one process)."
+    )
     if statement.sheet.designer.under_stars:
         texts.append(
             f"Sky coverage, the share of the sky in which a frame is solved: {percent(counts.share('right'))} %."
@@ -289,12 +315,12 @@ PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about 
 OUTCOME_HEADERS = ["right %", "refused", "false"]
 
 
-def bracket_text(what: str, ends: tuple[float, float], unit: str) -> str:
+def bracket_text(what: str, limit: Limit, unit: str) -> str:
     """A sentence on a limit."""
-    above = "at no level tested" if math.isnan(ends[0]) else f"up to {ends[0]:g} {unit}"
-    below = "at none tested" if math.isinf(ends[1]) else f"from {ends[1]:g} {unit} on"
-    share = f"{100 * LIMIT:g} %"
-    return f"Limit of acquisition in {what}: {share} of right attitudes are shown {above}, fewer are shown {below}."
+    above = "at no level tested" if math.isnan(limit.above) else f"up to {limit.above:g} {unit}"
+    below = "at none tested" if math.isinf(limit.below) else f"from {limit.below:g} {unit} on"
+    share = f"{100 * limit.share:g} %"
+    return f"Limit of {what}: {share} of right attitudes are shown {above}, fewer are shown {below}."
 
 
 def rate_section(statement: Statement) -> Section:
@@ -302,7 +328,7 @@ def rate_section(statement: Statement) -> Section:
     texts = [
         "Two frames of each attitude that differ in their noise, at a constant rate across the boresight, each lost in"
         f" space. NEA: temporal noise of one axis, 1 σ ({TEMPORAL}). rms: all errors of one axis ({ENSEMBLE}).",
-        bracket_text("rate", performance.bracket(statement.rates, "rate_deg_s"), "°/s"),
+        bracket_text("acquisition in rate", performance.bracket(statement.rates, "rate_deg_s"), "°/s"),
     ]
     rows = [
         [f"{row['rate_deg_s']:g}", f"{row['streak_px']:.2g}", *pair_cells(row), *outcome_cells(row)]
@@ -315,10 +341,12 @@ def rate_section(statement: Statement) -> Section:
 def acceleration_section(statement: Statement) -> Section:
     """Error and acquisition by acceleration."""
     texts = [
-        "One frame of each attitude, with no rate at mid-exposure and a constant acceleration across the boresight"
+        "Two frames of each attitude, with no rate at mid-exposure and a constant acceleration across the boresight"
         f" ({ENSEMBLE}). All lights move to one side, so their mean is a T² / 24 from where they are at mid-exposure:"
         " predicted, with the error at rest.",
-        bracket_text("acceleration", performance.bracket(statement.accelerations, "acceleration_deg_s2"), "°/s²"),
+        bracket_text(
+            "acquisition in acceleration", performance.bracket(statement.accelerations, "acceleration_deg_s2"), "°/s²"
+        ),
     ]
     rows = [
         [
@@ -332,6 +360,22 @@ def acceleration_section(statement: Statement) -> Section:
     ]
     headers = ["acceleration °/s²", "rms across ″", "predicted ″", "rms about ″", *OUTCOME_HEADERS]
     return Section("By acceleration", texts, headers, rows)
+
+
+def tracking_section(statement: Statement) -> Section:
+    """Error and outcomes in tracking mode."""
+    rates, accelerations = statement.tracked_rates, statement.tracked_accelerations
+    texts = [
+        f"Two frames of each attitude that differ in their noise, solved in tracking mode after {TRACKED} frames of the"
+        " same motion, without a gyro: stars are detected in windows of 8 pixels around their predicted places. A frame"
+        " that only the lost-in-space search would solve counts as refused. The prediction extrapolates the rate"
+        " between the last two frames, so an acceleration a misses by a t².",
+        bracket_text("tracking in rate", performance.bracket(rates, "rate_deg_s"), "°/s"),
+        bracket_text("tracking in acceleration", performance.bracket(accelerations, "acceleration_deg_s2"), "°/s²"),
+    ]
+    rows = [[f"{row['rate_deg_s']:g}", "", *pair_cells(row), *outcome_cells(row)] for row in rates]
+    rows += [["", f"{row['acceleration_deg_s2']:g}", *pair_cells(row), *outcome_cells(row)] for row in accelerations]
+    return Section("In tracking mode", texts, ["rate °/s", "acceleration °/s²", *PAIR_HEADERS, *OUTCOME_HEADERS], rows)
 
 
 def magnitude_section(statement: Statement) -> Section:

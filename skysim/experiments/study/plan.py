@@ -130,6 +130,8 @@ class FrameTrial(RandomAttitude):
         a sequence of frames, or a fraction of a pixel
     rate_axis  : perpendicular: a random axis perpendicular to the boresight; boresight; or an axis of body or camera
     gyro : whether the tracker receives the streak vector of the stars
+    tracked : number of frames before it, at the scene's frame rate in the same motion, that the tracker has followed in
+        its tracking mode; the frame is then solved in windows around the predicted stars, or not at all
     """
 
     kind: Literal["frames"]
@@ -138,6 +140,7 @@ class FrameTrial(RandomAttitude):
     turn_deg: Number = 0.0
     rate_axis: RateAxis = "perpendicular"
     gyro: bool = False
+    tracked: Annotated[int, Field(ge=0, le=100)] = 0
 
 
 def expand_start(value: Any) -> Any:

@@ -25,8 +25,9 @@ from skysim.experiments.study.plan import (
 from skysim.scene.keys import unused
 from skysim.scene.keys.unused import Rule
 from skysim.scene.scene import Scene
+from skysim.scene.sections.camera import RollingShutterConfig
 from skysim.scene.sections.layouts import CelestialConfig, OnPoints
-from skysim.scene.sections.light import DomeConfig
+from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.tracking import settings
 
 STREAK_ALGORITHMS = ("default", "streak")  # detectors and centroiders that use the streak measured by a gyro
@@ -61,6 +62,15 @@ def ignores_streak(scene: Scene, trial: Trial) -> bool:
     return isinstance(trial, FrameTrial) and not unused.external(scene) and not used
 
 
+def tracks(scene: Scene) -> bool:
+    """Whether the scene's tracker has a tracking mode."""
+    return (
+        isinstance(scene.light, StarsConfig)
+        and not unused.external(scene)
+        and not isinstance(scene.camera.shutter, RollingShutterConfig)
+    )
+
+
 def in_dome(scene: Scene, trial: Trial) -> bool:
     return isinstance(scene.light, DomeConfig)
 
@@ -78,6 +88,12 @@ RULES = (
         ignores_streak,
         "neither the detector nor the centroider uses the streak that a gyro measures",
         f"tracker.detector: default, or tracker.centroider: {STREAK_ALGORITHMS[1]}",
+    ),
+    Rule(
+        ("trial.tracked",),
+        lambda scene, trial: not tracks(scene),
+        "the tracker has no tracking mode",
+        "a scene with light of kind stars, no rolling shutter and skysim's tracker",
     ),
     Rule(
         ("trial.tilt_deg",),
@@ -120,7 +136,9 @@ RULES = (
     Rule(
         ("exposure.first", "exposure.trigger_jitter"),
         lambda scene, trial: (
-            isinstance(trial, FrameTrial) and (not isinstance(scene.light, DomeConfig) or unused.steady(scene))
+            isinstance(trial, FrameTrial)
+            and not trial.tracked
+            and (not isinstance(scene.light, DomeConfig) or unused.steady(scene))
         ),
         "the light of a trial's frame is steady",
         "trial.kind: flight",

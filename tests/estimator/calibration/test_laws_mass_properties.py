@@ -46,7 +46,7 @@ def test_momentum_in_the_lab_changes_by_external_torques_only(rng: np.random.Gen
     """Without gravity's moment, drag and torques H stays, whatever the wheels do; rate and slope agree."""
     free = SMALL.truth.copy()
     free[6:14] = 0
-    motion = Motion(RECORD, SMALL.lab, np.tile(free[:, None], 4))
+    motion = Motion(RECORD, SMALL.lab, np.tile(free[:, None], 4), free)
     states = drawn_states(rng, 4)._replace(torque=np.zeros((3, 4)))
     begin = rng.uniform(0, 10, 4)
     after = motion.integrate(begin, begin + 3.0, states, 2.0)
@@ -65,10 +65,10 @@ def test_a_transition_predicts_small_changes(rng: np.random.Generator) -> None:
     """Of a state and of the parameters, by its derivatives; its noise is a covariance."""
     assumed, _ = prior(SMALL, rng)
     states = batch.first_states(RECORD, SMALL.lab, assumed.values).take(slice(0, 6))
-    link = dynamics.transition(RECORD, SMALL.lab, 0, states, assumed.values, assumed.sigma)
+    link = dynamics.transition(RECORD, SMALL.lab, 0, states, assumed.values, assumed)
     change = np.outer(np.repeat([1e-4, 1e-6, 1e-8], 3), np.ones(6)) * rng.standard_normal((STATE, 6))
     by = 1e-3 * assumed.sigma * rng.standard_normal(20)
-    other = dynamics.transition(RECORD, SMALL.lab, 0, states.moved(change), assumed.values + by, assumed.sigma)
+    other = dynamics.transition(RECORD, SMALL.lab, 0, states.moved(change), assumed.values + by, assumed)
     expected = np.einsum("kij,jk->ik", link.by_state, change) + (link.by_parameter @ by).T
     scale = np.repeat([1e-6, 1e-8, 1e-10], 3)[:, None]
     np.testing.assert_allclose((other.after.minus(link.after) - expected) / scale, 0, atol=1)
@@ -94,8 +94,8 @@ def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) ->
     assumed, vehicle = prior(SMALL, rng)
     lab, values = vehicle.lab, assumed.values
     states = batch.first_states(RECORD, lab, values)
-    part = batch.reduced(RECORD, states, lab, values, assumed.sigma)
-    rows = batch.whitened_links(RECORD, states, lab, values, assumed.sigma)
+    part = batch.reduced(RECORD, states, lab, values, assumed)
+    rows = batch.whitened_links(RECORD, states, lab, values, assumed)
     count, size = len(RECORD.t_s), len(values)
     whole = np.zeros((STATE * count + size + 1,) * 2)
     for k, row in enumerate(rows):
@@ -148,7 +148,7 @@ def test_a_filter_grows_only_surer(rng: np.random.Generator) -> None:
     scale = np.sqrt(np.diag(whole))
     assert_covariance(whole / np.outer(scale, scale))
     rest = recursive.cut(RECORD, slice(20, None))
-    first = next(recursive.filter_from(begun, rest, vehicle.lab, assumed.sigma))
+    first = next(recursive.filter_from(begun, rest, vehicle.lab, assumed))
     np.testing.assert_array_equal(first.values, estimates[0].values)
 
 

@@ -22,7 +22,8 @@ def test_every_cell_is_another(scene):
     assert shared == paired & {cell.settings["trial.noise_seed"] for cell in cells if cell.experiment == "total"}
 
 
-def test_draws_share_no_unit_with_the_terms():
+def test_the_total_has_the_units_of_the_terms_in_turn():
+    """As often each, so that terms and total can agree with few units; the probabilities' frames are of others."""
     designer = Designer(load("afit_simsat", {}), FULL)
     cells = list(designer.cells())
     assert designer.seeds == ["camera.detector.hardware_seed", "tracker.survey.seed", "light.layout.hardware_seed"]
@@ -31,9 +32,27 @@ def test_draws_share_no_unit_with_the_terms():
         for name in ("terms", "total", "sky")
     }
     assert len(set(seeds["terms"])) == FULL.units
-    assert len(set(seeds["total"])) == FULL.draws
+    assert set(Counter(seeds["total"]).values()) == {FULL.draws // FULL.units}
+    assert set(seeds["total"]) == set(seeds["terms"])
     assert len(set(seeds["sky"])) == FULL.sky
-    assert not set(seeds["terms"]) & set(seeds["total"] + seeds["sky"])
+    assert not set(seeds["terms"]) & set(seeds["sky"])
+
+
+def test_units_and_thermal_states_are_combined_as_often_each():
+    designer = Designer(load("thermal_drift", {}), QUICK)
+    draws = [cell.settings for cell in designer.cells() if cell.experiment == "total"]
+    combined = Counter(
+        (one["camera.detector.hardware_seed"], one["thermal.temperature"]["temperature_c"]) for one in draws
+    )
+    assert len(combined) == designer.units * designer.states
+    assert set(combined.values()) == {1}
+
+
+def test_only_a_tracker_with_a_tracking_mode_has_its_limits():
+    rolling = {"camera.shutter": "{kind: rolling, row_time: 20 us}"}
+    for scene, overrides, has in (("shefex2", {}, True), ("shefex2", rolling, False), ("afit_simsat", {}, False)):
+        cells = Designer(load(scene, overrides), QUICK).cells()
+        assert any(cell.experiment.startswith("tracked") for cell in cells) == has
 
 
 def test_units_are_equal_without_a_pattern():

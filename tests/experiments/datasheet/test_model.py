@@ -5,14 +5,18 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from skysim.experiments.datasheet.model import export, fit
+from skysim.experiments.datasheet.cells import QUICK, Designer
+from skysim.experiments.datasheet.model import check, export, fit
 from skysim.experiments.datasheet.model.errors import ErrorModel, State, correlated
+from skysim.experiments.datasheet.run import AXES, Sheet
+from skysim.scene.loader import load
 
 CONSTANTS: dict[str, Any] = {
     "mean": [0.3, -0.2, 1.0],
@@ -85,6 +89,24 @@ def test_steps_have_the_statistics_of_draws(model):
         assert (found - expected) / spread == pytest.approx(np.zeros(3), abs=0.08)
 
 
+@pytest.mark.parametrize("turned_deg", [0.0, 0.05, 3.0])
+def test_correlations_are_those_of_draws(model, turned_deg):
+    """Of pairs of errors that the boresight's turn separates, at rest and at a rate: each pair in another field."""
+    rate_deg_s, count = 2.0, 150_000
+    rng = np.random.default_rng(11)
+    normal = {
+        name: rng.standard_normal((2, count, width)) for name, width in (("field", 3), ("pixel", 3), ("scale", 1))
+    }
+    for name, one in normal.items():
+        left = np.exp(-turned_deg / model.constants[f"{name}_deg"])
+        one[1] = left * one[0] + np.sqrt(1 - left**2) * one[1]
+    noise = model.noise_arcsec(np.array([rate_deg_s])) * rng.standard_normal((2, count, 3))
+    slow = model.field * normal["field"] + model.pixel * normal["pixel"]
+    errors = np.stack([model.scales(scale[:, 0]) for scale in normal["scale"]]) * (slow + noise)
+    found = np.mean(errors[0] * errors[1], axis=0) / np.mean(errors**2, axis=(0, 1))
+    assert found == pytest.approx(model.correlation(turned_deg, rate_deg_s), abs=0.02)
+
+
 def test_more_than_a_hundred_thousand_errors_a_second(model):
     """A million in the best of three runs: ten times what is asked, even on a busy machine."""
     rng, rates = np.random.default_rng(8), np.full(100_000, 1.0)
@@ -140,3 +162,50 @@ def test_the_scatter_of_the_fields_comes_from_two_estimates_of_each():
     assert fit.log_scale(first, second) == pytest.approx(0.7, rel=0.05)
     assert fit.log_scale(first, first) > 0.8
     assert fit.log_scale(np.ones(9), np.ones(9)) == 0
+
+
+def drawn_sheet(model: ErrorModel, fields: int) -> Sheet:
+    """A datasheet of shefex2 whose errors are drawn from a model: every cell of a field at its turn and rate."""
+    scene, size = load("shefex2", {}), replace(QUICK, fields=fields)
+    designer = Designer(scene, size)
+    cells = list(designer.cells())
+    rng = np.random.default_rng(12)
+    turns = np.array([cell.settings.get("trial.turn_deg", 0.0) for cell in cells])
+    rates = np.array([cell.settings.get("trial.rate_deg_s", 0.0) for cell in cells])
+    order = np.argsort(turns)
+    steps = np.diff(turns[order], prepend=turns[order][0])
+    errors = np.empty((3, len(cells), fields))
+    for field in range(fields):
+        state = model.start(rng, unit=False)
+        for row, step_deg in zip(order, steps, strict=True):
+            state = turned(model, state, step_deg, rng)
+            noise = model.noise_arcsec(np.array([rates[row]]))[0] * rng.standard_normal(3)
+            slow = model.field * state.field + model.pixel * state.pixel
+            errors[:, row, field] = state.bias + model.scales(np.array([state.scale]))[0] * (slow + noise)
+    ones = np.ones((len(cells), fields))
+    columns = dict(zip(AXES, errors, strict=True)) | {"solved": ones, "wrong": 0 * ones}
+    return Sheet(scene, "shefex2", {}, size, designer, cells, columns, None)
+
+
+def turned(model: ErrorModel, state: State, step_deg: float, rng: np.random.Generator) -> State:
+    """The state after a turn."""
+    new = []
+    for name in ("field", "pixel", "scale"):
+        left = np.exp(-step_deg / model.constants[f"{name}_deg"])
+        old = np.asarray(getattr(state, name))
+        new.append(left * old + np.sqrt(1 - left**2) * rng.standard_normal(old.shape))
+    return State(new[0], new[1], float(new[2]), state.bias)
+
+
+@pytest.mark.slow
+def test_a_model_agrees_with_other_fields_of_its_own_errors_and_not_with_others():
+    """Fitted to half of 300 fields that a model drew; wrong noise and wrong memory are noticed in the other half."""
+    truth = ErrorModel(CONSTANTS | {"rates_deg_s": [0.0, 0.28, 0.57, 1.1, 2.3], "noise": [[1.0, 1.0, 10.0]] * 5})
+    sheet = drawn_sheet(truth, 300)
+    found = check.agreements(sheet)
+    assert np.mean([p > 0.05 for one in found for p in one.p_values]) >= 0.8
+    assert [one.correlation for one in found] == pytest.approx([one.expected_correlation for one in found], abs=0.06)
+    noisy = truth.constants | {"noise": [[2.0, 2.0, 20.0]] * 5}
+    assert max(check.agreement(ErrorModel(noisy), sheet, 0.0).p_values) < 0.01
+    fleeting = check.agreement(ErrorModel(truth.constants | {"field_deg": 0.02}), sheet, 2.3)
+    assert fleeting.correlation - fleeting.expected_correlation > 0.1

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import scipy
 
-from skysim.experiments.datasheet import performance
 from skysim.experiments.datasheet.performance import Counts, bracket, claims, noise_equivalent_angle, runs_needed
 
 
@@ -59,7 +58,13 @@ def test_a_limit_lies_between_what_is_shown_above_and_below():
     rows = [
         {"rate": n, "counts": Counts(200, right, 200 - right, 0)} for n, right in enumerate([200, 199, 190, 150, 3])
     ]
-    assert bracket(rows, "rate") == (1, 3)
-    assert bracket(rows[:1], "rate") == (0, math.inf)
-    assert math.isnan(bracket(rows[3:], "rate")[0])
-    assert performance.LIMIT == 0.95
+    assert bracket(rows, "rate") == (0.95, 1, 3)
+    assert bracket(rows[:1], "rate") == (0.95, 0, math.inf)
+    assert math.isnan(bracket(rows[3:], "rate").above)
+
+
+def test_a_limit_is_of_the_highest_share_that_so_many_frames_can_show():
+    """59 frames without a failure show 95 %, and 29 show 90 %."""
+    for frames, share, above in ((59, 0.95, 1), (58, 0.9, 1), (29, 0.9, 1), (28, 0.9, math.nan)):
+        found = bracket([{"rate": 1, "counts": Counts(frames, frames, 0, 0)}], "rate")
+        assert found[:2] == pytest.approx((share, above), nan_ok=True)

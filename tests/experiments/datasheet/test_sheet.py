@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.datasheet import cells, page, run
+from skysim.experiments.datasheet import cells, page, performance, run
 from skysim.experiments.datasheet.cells import Designer, Size
 from skysim.experiments.datasheet.components import components
-from skysim.experiments.datasheet.statement import numbers, sections, state
+from skysim.experiments.datasheet.statement import Statement, numbers, sections, state
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.plan import TrialSpec
 from skysim.scene.loader import load
@@ -31,6 +31,9 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cells, "SEQUENCE", (0, 1))
     monkeypatch.setattr(cells, "BENDS_PX", (4.0,))
     monkeypatch.setattr(cells, "FAINTER", (-1.0,))
+    monkeypatch.setattr(cells, "TRACKED_STREAKS_PX", (1.0,))
+    monkeypatch.setattr(cells, "MISSED_PX", (3.0, 24.0))
+    monkeypatch.setattr(performance, "TIMED", 3)
 
 
 def measured(folder: Path, watch: Callable[[int], Any] | None = None, fields: int | None = None) -> run.Sheet:
@@ -50,12 +53,20 @@ def stop_after(batches: int) -> Callable[[int], Any]:
     return lambda trials: watch
 
 
+def untimed(statement: Statement) -> str:
+    """All numbers but the times of this machine."""
+    return json.dumps(numbers(statement._replace(times_s=[])))
+
+
 def test_a_stopped_datasheet_goes_on_and_is_the_same(small: None, tmp_path: Path) -> None:
     whole = state(measured(tmp_path / "whole"))
+    assert len(whole.times_s) == 3
+    assert min(whole.times_s) > 0
+    assert numbers(whole)["limits"]["tracking"]["acceleration_deg_s2"]["below"] == pytest.approx(54)
     with pytest.raises(KeyboardInterrupt):
         measured(tmp_path / "stopped", stop_after(4))
     again = state(measured(tmp_path / "stopped"))
-    assert json.dumps(numbers(again)) == json.dumps(numbers(whole))
+    assert untimed(again) == untimed(whole)
     paths = page.write_all(tmp_path / "whole", whole, True)
     assert json.loads(paths["json"].read_text())["fields"] == 12
     text = paths["report"].read_text(encoding="utf-8")

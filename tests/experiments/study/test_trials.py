@@ -411,3 +411,37 @@ def test_accelerated_lights_are_seen_where_the_law_puts_them():
     assert near.sum() >= 3
     assert lag_px == pytest.approx(bend_px / 24, rel=0.03)
     assert np.linalg.norm(truth.rate_cam_rad_s) == pytest.approx(0, abs=1e-12)
+
+
+def tracked_statuses(settings: dict[str, Any], seeds: range) -> list[str]:
+    """Statuses of frames in tracking mode after two of the same motion."""
+    setup = setups.prepared_setup(AT_REST, {"trial.tracked": 2} | settings)
+    return [trials.run_frame_trial(setup, seed).status for seed in seeds]
+
+
+@pytest.mark.parametrize("gyro", [False, True])
+def test_tracking_follows_a_motion_until_its_prediction_leaves_the_windows(gyro):
+    """The rate of the last two frames, extrapolated, misses by a t^2: stars leave windows of 8 px.
+
+    At 4 px all are found and at 14 px, which is more than 8 px along one axis in any direction, none. A gyro measures
+    the acceleration too.
+    """
+    pixel_deg, between_s = math.degrees(9.9e-6 / 25e-3), 0.1
+    accelerations = [missed_px * pixel_deg / between_s**2 for missed_px in (4.0, 14.0)]
+    near, far = (
+        tracked_statuses({"trial.acceleration_deg_s2": one, "trial.gyro": gyro}, range(6)) for one in accelerations
+    )
+    assert near == ["solved"] * 6
+    assert [status.startswith("tracking lost") for status in far] == [not gyro] * 6
+    assert tracked_statuses({"trial.rate_deg_s": 2.0, "trial.gyro": gyro}, range(6)) == ["solved"] * 6
+
+
+def test_a_tracked_frame_has_the_motion_of_its_time():
+    """The attitude of the last frame is the trial's, and that of the frame before is a step of the rate behind it."""
+    settings = {"trial.rate_deg_s": 2.0}
+    truth = rendered(settings | {"trial.tracked": 2})
+    assert (truth.cam_from_lab * rendered(settings).cam_from_lab.inv()).magnitude() < 1e-12
+    setup = setups.prepared_setup(AT_REST, settings | {"trial.tracked": 2})
+    testbed = trials.moving_testbed(setup, 5)[0]
+    step = trials.rotation_between(testbed, truth.t_s - 0.1, truth.t_s)
+    assert np.degrees(step.magnitude()) == pytest.approx(0.2, rel=1e-9)

@@ -29,6 +29,7 @@ def study(folder: Path, scene: str, trial: str, factors: str, settings: str = "{
 @pytest.mark.parametrize(
     ("scene", "trial", "factors", "settings", "told"),
     [
+        ("afit_simsat", "{kind: frames, tracked: 2}", NOISE, "{}", r"trial.tracked: has no effect.*line 6\)"),
         ("afit_simsat", "{kind: frames, gyro: true}", NOISE, "{}", r"trial.gyro: has no effect.*line 6\)"),
         (
             "afit_simsat",

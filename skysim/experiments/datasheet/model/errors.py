@@ -96,6 +96,19 @@ class ErrorModel:
         slow = self.field * later.field + self.pixel * later.pixel
         return later, later.bias + self.scales(np.array([later.scale]))[0] * (slow + noise)
 
+    def correlation(self, angle_deg: float, rate_deg_s: float) -> Any:
+        """(3,) correlation of two errors of one unit at a rate, between which the boresight turns by an angle.
+
+        E[s_k s_l] = exp(-v^2 (1 - r) / 4) for lognormal scales whose normal numbers have the correlation r.
+        """
+        field, pixel, scale = (
+            math.exp(-abs(angle_deg) / self.constants[f"{name}_deg"]) for name in ("field", "pixel", "scale")
+        )
+        noise = self.noise_arcsec(np.array([abs(rate_deg_s)]))[0]
+        shared = self.field**2 * field + self.pixel**2 * pixel
+        total = self.field**2 + self.pixel**2 + noise**2
+        return np.exp(-(self.scale**2) * (1 - scale) / 4) * shared / total
+
     def scales(self, normal: Any) -> Any:
         """(N, 3) scales of standard normal numbers: s^2 = exp(v q - v^2 / 2) has the mean 1."""
         return np.exp(0.5 * (np.multiply.outer(normal, self.scale) - self.scale**2 / 2))

@@ -15,9 +15,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.core.types import RateEstimate
+from estimator.core.errors import ImageError
+from estimator.core.types import Attitude, Centroids, RateEstimate
 from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.pipeline import Report
+from estimator.trackers.star_tracker import StarTracker
+from estimator.trackers.tracking_mode import Health, TrackedReport, TrackingMode
 from skysim.camera import render
 from skysim.core import quaternion
 from skysim.core.paths import ROOT
@@ -56,7 +59,7 @@ from skysim.sources.solar_system.places import place
 from skysim.tracking import factory
 
 GYRO_RAD_S = 1e-5  # standard deviation that a frame trial's gyro claims, 2 arcseconds a second
-KNOTS = 9  # samples of a frame trial's trajectory
+KNOTS = 9  # samples of a frame trial's trajectory in each exposure
 STREAK_POSES = 9  # poses along the streak of a frame that is not rendered
 
 
@@ -139,9 +142,13 @@ def streams(setup: Setup, seed: int) -> tuple[np.random.Generator, np.random.Gen
 
 
 def run_frame_trial(setup: Setup, seed: int) -> Outcome:
-    """Frame trial: random attitude, one rendered frame, solved."""
-    frame, truth, streak_px = render_trial_frame(setup, seed)
-    report = factory.solve_frame(setup.estimator, frame, streak_px, gyro_rate(setup, truth))
+    """Frame trial: random attitude, one rendered frame, solved lost in space or in tracking mode."""
+    testbed, streak_px = moving_testbed(setup, seed)
+    frame, truth = exposure.render_frame(testbed, tracked_frames(setup))
+    if tracked_frames(setup):
+        report = tracked_report(setup, testbed, frame, streak_px)
+    else:
+        report = factory.solve_frame(setup.estimator, frame, streak_px, gyro_rate(setup, truth))
     return score(setup.testbed, setup.estimator, report, true_lights(truth))
 
 
@@ -246,6 +253,18 @@ def zyz(first_rad: float, second_rad: float, third_rad: float) -> Floats:
 
 def render_trial_frame(setup: Setup, seed: int) -> tuple[Frame, Truth, tuple[float, float] | None]:
     """Frame of a frame trial, its truth and, with a gyro, the streak vector (dx, dy) in pixels at the image center."""
+    testbed, streak_px = moving_testbed(setup, seed)
+    return *exposure.render_frame(testbed, tracked_frames(setup)), streak_px
+
+
+def tracked_frames(setup: Setup) -> int:
+    """How many frames of a frame trial are followed before its own; this is also the index of its own."""
+    assert isinstance(setup.trial, FrameTrial)
+    return setup.trial.tracked
+
+
+def moving_testbed(setup: Setup, seed: int) -> tuple[Testbed, tuple[float, float] | None]:
+    """The test bed in the motion of a frame trial and, with a gyro, the streak vector of its frame."""
     trial, (attitude_rng, noise) = setup.trial, streams(setup, seed)
     assert isinstance(trial, FrameTrial)
     testbed = setup.testbed.in_run(int(noise.integers(2**62)))
@@ -258,11 +277,37 @@ def render_trial_frame(setup: Setup, seed: int) -> tuple[Frame, Truth, tuple[flo
         for value in (trial.rate_deg_s, trial.turn_deg, trial.acceleration_deg_s2)
     )
     middle = middle * Rotation.from_rotvec(turn_body)
-    trajectory = constant_acceleration(testbed.scene, middle, rate_body, acceleration_body)
-    frame, truth = exposure.render_frame(replace(testbed, trajectory=trajectory), 0)
+    trajectory = constant_acceleration(testbed.scene, middle, rate_body, acceleration_body, trial.tracked)
     streak_px = exposure_window(testbed.scene, 0).exposure_s * testbed.scene.camera.focal_px
     # For a star on the boresight: d(x / z)/dt = -w_y, d(y / z)/dt = w_x.
-    return frame, truth, (-rate_cam[1] * streak_px, rate_cam[0] * streak_px) if trial.gyro else None
+    streak = (-rate_cam[1] * streak_px, rate_cam[0] * streak_px) if trial.gyro else None
+    return replace(testbed, trajectory=trajectory), streak
+
+
+def tracked_report(setup: Setup, testbed: Testbed, frame: Frame, streak_px: tuple[float, float] | None) -> Report:
+    """The report on a frame trial's last frame by a tracker in its tracking mode, which has solved those before.
+
+    Without an attitude if the prediction failed and the frame had to be solved lost in space. A gyro's prediction is
+    the true rotation since the frame before.
+    """
+    assert isinstance(setup.estimator, StarTracker)
+    tracker = TrackingMode(setup.estimator)
+    for index in range(frame.index + 1):
+        shown = frame if index == frame.index else exposure.render_frame(testbed, index)[0]
+        turned = rotation_between(testbed, tracker.last.t_s, shown.t_mid_s) if streak_px and tracker.last else None
+        try:
+            report = tracker.solve(shown.image_dn, shown.t_mid_s, turned, streak_px, shown.exposure_s)
+        except ImageError as error:
+            report = TrackedReport(Attitude(str(error)), Centroids.empty())
+    if report.attitude.solved and report.health & Health.SEARCHED:
+        report.attitude = Attitude("tracking lost: the frame is solved lost in space")
+    return report
+
+
+def rotation_between(testbed: Testbed, then_s: float, now_s: float) -> Rotation:
+    """True rotation cam(now) from cam(then)."""
+    now, then = (testbed.mount.cam_from_body * testbed.trajectory.attitude_at(t_s).inv() for t_s in (now_s, then_s))
+    return now * then.inv()
 
 
 def gyro_rate(setup: Setup, truth: Truth) -> RateEstimate | None:
@@ -285,14 +330,17 @@ def constant_rate(scene: Scene, middle: Rotation, rate_body: Floats) -> Trajecto
     return constant_acceleration(scene, middle, rate_body, np.zeros(3))
 
 
-def constant_acceleration(scene: Scene, middle: Rotation, rate_body: Floats, acceleration_body: Floats) -> Trajectory:
-    """A trajectory around the first frame's exposure, with the attitude and the rate `rate_body` at mid-exposure.
+def constant_acceleration(
+    scene: Scene, middle: Rotation, rate_body: Floats, acceleration_body: Floats, frame: int = 0
+) -> Trajectory:
+    """A trajectory through the exposures up to that of a frame, in the middle of which it has this attitude and rate.
 
     The acceleration is along the rate or there is no rate: the rotation vector is rate t + acceleration t^2 / 2.
     """
-    window, rows = exposure_window(scene, 0), scene.camera.height_px
-    t_s = np.linspace(window.open_s - MARGIN_S, window.close_s(rows) + MARGIN_S, KNOTS)
-    since_s = t_s - window.middle_s(rows)
+    windows, rows = [exposure_window(scene, index) for index in range(frame + 1)], scene.camera.height_px
+    exposures = [np.linspace(one.open_s - MARGIN_S, one.close_s(rows) + MARGIN_S, KNOTS) for one in windows]
+    t_s = np.unique(np.concatenate(exposures))
+    since_s = t_s - windows[-1].middle_s(rows)
     turned = np.outer(since_s, rate_body) + np.outer(since_s**2 / 2, acceleration_body)
     rate = rate_body + np.outer(since_s, acceleration_body)
     return Trajectory(t_s, middle * Rotation.from_rotvec(turned), rate)

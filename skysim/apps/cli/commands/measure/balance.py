@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from enum import StrEnum
 from typing import Annotated
 
@@ -57,7 +59,6 @@ def balance(
     The star tracker is the instrument. Every flight is simulated, its frames are rendered and solved.
     """
     from skysim.apps.cli.balance_summary import print_balance, print_flight
-    from skysim.core.io import files
     from skysim.experiments.balance import assumptions, observability, procedure, report
 
     if estimate_only and flights is not None:
@@ -75,10 +76,7 @@ def balance(
     statistics = report.statistics(loaded.name, plan, iterations)
     if in_flight:
         statistics["in_flight"] = report.filter_rows(iterations[-1], procedure.assumed(loaded, uncertainty))
-    picture = files.make_folder(folder) / "balance.png"
-    files.write_image(picture, report.balance_figure(iterations, plan.torque_bar_nm))
-    statistics["picture"] = str(picture)
-    files.write_text(folder / "balance.json", files.to_json(statistics))
+    report.write_all(folder, statistics, iterations, shlex.join(["skysim", *sys.argv[1:]]))
     if json:
         print_json(statistics)
     else:

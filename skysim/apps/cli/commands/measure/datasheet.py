@@ -14,6 +14,7 @@ from skysim.apps.cli.terminal import print_json, print_table, print_wrapped, tri
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
+    from skysim.experiments.datasheet.model.check import Agreement
     from skysim.experiments.datasheet.statement import Statement
 
 
@@ -49,7 +50,7 @@ def datasheet(
     """
     from skysim.core.io.yaml_reader import parse_overrides
     from skysim.experiments.datasheet import page, run
-    from skysim.experiments.datasheet.model import export, fit
+    from skysim.experiments.datasheet.model import check, export, fit
     from skysim.experiments.datasheet.statement import numbers, state
 
     if fmu and model is None:
@@ -70,14 +71,18 @@ def datasheet(
     if markdown:
         page.write_markdown(markdown, statement, quick)
     if model:
-        written = export.write_model(model, fit.constants(sheet)) + ([export.write_fmu(model)] if fmu else [])
+        agreements = check.agreements(sheet)
+        constants = fit.constants(sheet) | {"agreement": [one._asdict() for one in agreements]}
+        written = export.write_model(model, constants) + ([export.write_fmu(model)] if fmu else [])
     if json:
         print_json(numbers(statement))
     else:
         print_statement(statement)
         print(f"report: {paths['report']}")
-        for path in written if model else ():
-            print(path)
+        if model:
+            print_agreements(agreements)
+            for path in written:
+                print(path)
     if open_:
         typer.launch(str(paths["report"]))
 
@@ -91,3 +96,21 @@ def print_statement(statement: Statement) -> None:
         for text in section.texts:
             print_wrapped(text)
         print()
+
+
+def print_agreements(agreements: list[Agreement]) -> None:
+    """Print how well the model, fitted to half of the fields, agrees with the other half."""
+    rows = [
+        [
+            f"{one.rate_deg_s:g}",
+            str(one.frames),
+            *(f"{p:.2g}" for p in one.p_values),
+            f"{one.correlation:.3f}",
+            f"{one.expected_correlation:.3f}",
+        ]
+        for one in agreements
+    ]
+    headers = ["rate °/s", "frames", "p of x", "p of y", "p of roll", "correlation", "of the model"]
+    print_table("The model, fitted to half of the fields, beside the other half", headers, rows)
+    print_wrapped("p: Kolmogorov-Smirnov. correlation: mean over the axes and the pairs of frames of the sequences.")
+    print()
