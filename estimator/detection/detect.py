@@ -27,6 +27,7 @@ SPARE = 4  # blobs that are classified, per blob returned: hot pixels and tracks
 MIN_GROWN_PX = 8  # smallest area of a blob that is significant only as a whole
 # With fewer stars than FEW_STARS, faint streaks of SEARCH_LENGTH_PX are searched in DIRECTIONS directions.
 FEW_STARS, DIRECTIONS, SEARCH_LENGTH_PX = 8, 8, 10.0
+LONGER, LENGTHENED = 1.5, 1.15  # length of the next filter, and growth of the streak that justifies it
 LARGE_PX = 150  # a blob this large is not a faint streak, and a line filter finds many in its noise
 MAX_STREAK_PX = 1024  # longest streak filtered for: a longer one spreads the star too thinly
 MAX_TURN_PX = 4.0  # largest difference of streaks by a roll, at the corners, for which they are filtered along one
@@ -79,11 +80,15 @@ def _classified(image: NDArray, threshold_sigma: float, min_area_px: int, max_bl
             if priors.streak_px is not None or stars >= FEW_STARS or np.any(blobs.area_px >= LARGE_PX):
                 return blobs
             faint = detect_faint_streaks(image, background, threshold_sigma, max_blobs, priors)
-            return classify.classify(image, faint, priors) if len(faint) > stars + 1 else blobs
+            if len(faint) <= stars + 1:
+                return blobs
+            return in_full_length(image, classify.classify(image, faint, priors), threshold_sigma, max_blobs, priors)
         if abs(blobs.turn_rad) > largest_turn_rad or max(map(abs, blobs.streak_px)) > MAX_STREAK_PX:
             return blobs
         # The bright blobs have revealed the streak: detect again with the filter along it.
-        priors = FramePriors(blobs.streak_px, priors.saturation, blobs.turn_rad)
+        along = FramePriors(blobs.streak_px, priors.saturation, blobs.turn_rad)
+        streaks = classify.classify(image, detect_streaks(image, background, threshold_sigma, max_blobs, along), along)
+        return in_full_length(image, streaks, threshold_sigma, max_blobs, priors)
     streaks = detect_streaks(image, background, threshold_sigma, max_blobs, priors)
     return classify.classify(image, streaks, priors)
 
@@ -351,6 +356,31 @@ def detect_faint_streaks(
         along = FramePriors(streak_px, priors.saturation)
         candidates.append(detect_streaks(image, background, threshold_sigma + 0.5, max_blobs, along))
     return max(candidates, key=len)
+
+
+def in_full_length(image: NDArray, found: Blobs, threshold_sigma: float, max_blobs: int, priors: FramePriors) -> Blobs:
+    """Streaks, detected with longer and longer filters as long as the streak that they share grows.
+
+    Noise breaks a long faint streak into pieces with centers anywhere along it, so that a frame's first streak is too
+    short; pieces of streaks that the border cuts off do not touch it. A longer filter finds longer pieces. The last
+    detection is with the filter of the last streak, since a longer one joins neighbors.
+    """
+    first = found
+    while found.streak_px is not None:
+        length_px = np.hypot(*found.streak_px)
+        x, y = LONGER * np.array(found.streak_px)
+        if max(abs(x), abs(y)) > MAX_STREAK_PX:
+            break
+        longer = FramePriors((float(x), float(y)), priors.saturation, found.turn_rad)
+        again = detect_streaks(image, found.background, threshold_sigma, max_blobs, longer)
+        again = classify.classify(image, again, priors)
+        if again.streak_px is None or np.hypot(*again.streak_px) < LENGTHENED * length_px:
+            break
+        found = again
+    if found is first:
+        return found
+    along = FramePriors(found.streak_px, priors.saturation, found.turn_rad)
+    return classify.classify(image, detect_streaks(image, found.background, threshold_sigma, max_blobs, along), along)
 
 
 def line_taps(streak_px: tuple[float, float]) -> Ints:

@@ -104,6 +104,7 @@ def test_a_brighter_sky_hides_no_star(rng: np.random.Generator, up: int, name: s
     detect.detect_blobs,
     detect.detect_streaks,
     detect.detect_faint_streaks,
+    detect.in_full_length,
     detect.flat_background,
     background.estimate_background,
     slow=True,
@@ -121,7 +122,9 @@ def test_what_stands_out_less_is_found_with_less(
         assert_inside(blobs, 99)
     assert found[0].area_px.sum() >= found[1].area_px.sum()
     assert_inside(detect.detect_streaks(frame, sky, sigma, 99, FramePriors(streak_px)), 99)
-    assert_inside(detect.detect_faint_streaks(frame, sky, sigma, 99, FramePriors()), 99)
+    faint = detect.detect_faint_streaks(frame, sky, sigma, 99, FramePriors())
+    assert_inside(faint, 99)
+    assert_inside(detect.in_full_length(frame, replace(faint, streak_px=streak_px), sigma, 99, FramePriors()), 99)
 
 
 @law(components.runs_above, background.estimate_background, background.accumulator_type)
