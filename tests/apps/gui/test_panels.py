@@ -446,14 +446,6 @@ def test_trials_that_were_wrong_or_refused_are_told_apart_from_solved_ones() -> 
     assert study_process.unsolved(columns) == [(8, "wrong"), (5, "no match")]
 
 
-@pytest.mark.parametrize("pedestal_dn", [0, 1000])
-def test_brighter_is_brighter_by_as_much_on_any_pedestal(pedestal_dn: int) -> None:
-    image = (pedestal_dn + np.arange(401)[None, :]).astype(np.uint16)
-    between = (pedestal_dn, pedestal_dn + 400.0)
-    gray, brighter = (stretch.to_8bit(image, "linear", by, between) for by in (1.0, 2.0))
-    np.testing.assert_allclose(brighter, np.minimum(2.0 * gray, 255), rtol=0, atol=1)
-
-
 def test_a_pedestal_under_a_frame_changes_nothing_for_the_eye() -> None:
     """Black and white are measured from the sky."""
     image = np.random.default_rng(2).poisson(20, (200, 200)).astype(np.uint16)

@@ -7,7 +7,7 @@ import base64
 import functools
 import itertools
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,8 +47,7 @@ class Canvas(ui.element, component="frame/frame.js", esm={"skysim-frame": "frame
 class Sensor:
     """The view and its controls. It shows a frame of the scene, or another image such as a user's.
 
-    hovered : the light under the mouse as (detection, true light), or None
-    on_hover : called with the number of the light that the mouse is on, or None
+    hover_px : place of the light under the mouse, or None
     sent_number, drawn_number : number of the last frame sent to the browser, and of the last it reported as drawn
     """
 
@@ -62,7 +61,6 @@ class Sensor:
         self.pose: Pose | None = None
         self.statistics = ""  # numbers of the frame, shown while the mouse is on no light
         self.hover_px: tuple[float, float] | None = None
-        self.on_hover: list[Callable[[int | None], None]] = []
         self.sent_number = self.drawn_number = 0
         self.frame_drawn = asyncio.Event()
         with ui.element("div").classes("lab-sensor"):
@@ -195,20 +193,14 @@ class Sensor:
         return LABELS.get(id, f"HIP {id}" if id < 1_000_000 else f"star {id}")
 
     def hover_changed(self, event: Any) -> None:
-        """The mouse is on another light, or on none: tell of it, here and in the linked views."""
+        """The mouse is on another light, or on none."""
         self.hover_px = (event.args["x"], event.args["y"]) if event.args["inside"] else None
         self.update_text()
-        for listener in self.on_hover:
-            listener(event.args["id"] if self.hover_px else None)
 
     def light_chosen(self, event: Any) -> None:
         """A click: what is known of the light there stays on the page until the mouse is on another one."""
         self.hover_px = (event.args["x"], event.args["y"]) if event.args["id"] is not None else None
         self.update_text()
-
-    def highlight(self, id: int | None) -> None:
-        """Ring a light that the mouse is on elsewhere on the page."""
-        self.canvas.run_method("highlight", id)
 
     def nearest(self, x: float, y: float) -> tuple[Detection | None, Light | None]:
         """The nearest detection and the nearest true light within a few marks' width, or None."""

@@ -46,7 +46,6 @@ export default {
       pressed: null,
       held: null, // the limit that is dragged: 0 or 1
       hovered: null, // number of the light under the cursor
-      highlighted: null, // number of the light that is hovered elsewhere on the page
       fetching: false,
     });
   },
@@ -74,14 +73,6 @@ export default {
     },
     setLens(lens) {
       this.lens = lens;
-    },
-    highlight(id) {
-      this.highlighted = id;
-      this.paint();
-    },
-    clearCut() {
-      this.cut = null;
-      this.paint();
     },
     fit() {
       this.zoom = null;
@@ -197,7 +188,7 @@ export default {
       drawMarks(pen, marks, this.toScreen);
       drawNames(pen, names, this.toScreen, window, "#6fdc7f");
       if (this.cut) this.paintCut(pen);
-      const ringed = lights.find((light) => light[2] === (this.hovered ?? this.highlighted) && light[2] >= 0);
+      const ringed = lights.find((light) => light[2] === this.hovered && light[2] >= 0);
       if (ringed) drawHighlight(pen, this.toScreen(ringed[0], ringed[1]), PALE);
       canvas.dataset.frame = this.drawn.src;
       canvas.dataset.placement = [left, top, scale].map((value) => value.toFixed(4)).join(" ");

@@ -8,8 +8,8 @@ const DEG = 180 / Math.PI;
 function interpolated(table, n, u, v) {
   const x = Math.min(Math.max(u * (n - 1), 0), n - 1), y = Math.min(Math.max(v * (n - 1), 0), n - 1);
   const column = Math.min(Math.floor(x), n - 2), row = Math.min(Math.floor(y), n - 2), at = row * n + column;
-  const top = table[at] + (x - column) * (table[at + 1] - table[at]);
-  const under = table[at + n] + (x - column) * (table[at + n + 1] - table[at + n]);
+  const [a, b, c, d] = [at, at + 1, at + n, at + n + 1].map((node) => table[node] ?? NaN); // null: no value there
+  const top = a + (x - column) * (b - a), under = c + (x - column) * (d - c);
   return top + (y - row) * (under - top);
 }
 
