@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from nicegui import app, ui
+from nicegui import app, core, ui
 from starlette.datastructures import MutableHeaders
 from starlette.requests import HTTPConnection
 from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
@@ -33,6 +33,7 @@ REPORT_POLICY = (
 SECURITY_HEADERS = {"x-frame-options": "DENY", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
 CONNECT_TIMEOUT_S = 50.0  # for a browser to load the page
 RECONNECT_S = 6.0  # for a lost browser to reconnect, before its work ends
+PING_INTERVAL_S, PING_TIMEOUT_S = 5.0, 30.0  # of the connection; a busy machine answers late
 
 
 class Guard:
@@ -126,9 +127,15 @@ def report_path(out: Path, name: str) -> Path | None:
         return None
 
 
+def be_patient() -> None:
+    """Let a connection live although its browser answers late; NiceGUI takes both times from the reconnect time."""
+    core.sio.eio.ping_interval, core.sio.eio.ping_timeout = PING_INTERVAL_S, PING_TIMEOUT_S
+
+
 def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str]) -> None:
     """Register all routes, with a spare worker ready for the next tab."""
     spare = SpareWorker(str(find(scene).resolve()))
+    app.on_startup(be_patient)
     app.on_startup(spare.start)
     app.on_shutdown(spare.close)
 

@@ -114,6 +114,7 @@ def tab(browser: Any, server: Server) -> Iterator[Any]:
 def page(tab: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
     """The tab, with its first panel before it; a picture of how the test left it."""
     tab.get_by_role("tab", name="Lab").click()
+    tab.get_by_role("button", name="fit", exact=True).click()
     yield tab
     pictured(tab, request.node.name)
 
@@ -227,6 +228,12 @@ def screen(page: Any, x: float, y: float) -> tuple[float, float]:
     box = page.locator(".lab-frame canvas").bounding_box()
     left, top, scale = map(float, page.locator(".lab-frame canvas").get_attribute("data-placement").split())
     return box["x"] + left + (x + 0.5) * scale, box["y"] + top + (y + 0.5) * scale
+
+
+def frame_pixel(page: Any, x: float, y: float) -> tuple[float, float]:
+    """Which pixel of a frame is at a place on the screen."""
+    (left, top), (right, below) = screen(page, 0, 0), screen(page, 1, 1)
+    return (x - left) / (right - left), (y - top) / (below - top)
 
 
 def picture(page: Any, **how: Any) -> np.ndarray:

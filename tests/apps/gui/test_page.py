@@ -29,6 +29,7 @@ from labpage import (
     come,
     differs,
     exported,
+    frame_pixel,
     onto_the_page,
     opened,
     panel,
@@ -196,16 +197,17 @@ def test_limits_are_zscale_s_or_dragged_and_curves_brighten_what_is_faint(page: 
 
 def test_the_wheel_zooms_about_the_cursor_a_drag_pans_and_fit_shows_the_whole_frame(page: Any) -> None:
     canvas = page.locator(".lab-frame canvas")
-    whole, at = canvas.get_attribute("data-placement"), screen(page, 200, 300)
+    whole, at = canvas.get_attribute("data-placement"), np.round(screen(page, 200, 300))  # a mouse counts whole pixels
+    spot = frame_pixel(page, *at)
     page.mouse.move(*at)
     page.mouse.wheel(0, -500)
     assert come(lambda: canvas.get_attribute("data-placement") != whole)
     assert float(canvas.get_attribute("data-placement").split()[2]) > 2 * float(whole.split()[2])
-    np.testing.assert_allclose(screen(page, 200, 300), at, rtol=0, atol=0.01)
+    np.testing.assert_allclose(screen(page, *spot), at, rtol=0, atol=0.01)
     page.mouse.down()
     page.mouse.move(at[0] + 40, at[1] - 25)
     page.mouse.up()
-    np.testing.assert_allclose(screen(page, 200, 300), (at[0] + 40, at[1] - 25), rtol=0, atol=0.01)
+    np.testing.assert_allclose(screen(page, *spot), (at[0] + 40, at[1] - 25), rtol=0, atol=0.01)
     page.get_by_role("button", name="fit", exact=True).click()
     assert canvas.get_attribute("data-placement") == whole
 

@@ -90,7 +90,7 @@ class Sensor:
             self.grid = ui.checkbox("grid", value=False, on_change=self.update_display).props("dense size=xs")
             self.grid.mark("grid")
             ui.space()
-            self.stretch = self.select("Stretch", STRETCHES, "w-24")
+            self.stretch = self.select("Stretch", STRETCHES, "w-28")
             self.limits = self.select("Limits", LIMITS, "w-24")
             self.colors = self.select("Colors", list(COLOR_MAPS), "w-24")
 
@@ -267,4 +267,4 @@ def statistics_text(
     lights = ("lights", f"{len(view.lights)} in the field") if view else ()
     detected = ("identified", f"{result.identified} of {len(result.detections)}") if result else ()
     rows += [(*lights, *detected, "", "", "", "")[:4]]
-    return "\n".join(f"{a:<10s}{b:<18s}{c:<11s}{d}".rstrip() for a, b, c, d in rows)
+    return "\n".join(f"{a:<11s}{b:<18s}{c:<11s}{d}".rstrip() for a, b, c, d in rows)

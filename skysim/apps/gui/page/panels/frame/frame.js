@@ -191,7 +191,7 @@ export default {
       const ringed = lights.find((light) => light[2] === this.hovered && light[2] >= 0);
       if (ringed) drawHighlight(pen, this.toScreen(ringed[0], ringed[1]), PALE);
       canvas.dataset.frame = this.drawn.src;
-      canvas.dataset.placement = [left, top, scale].map((value) => value.toFixed(4)).join(" ");
+      canvas.dataset.placement = [left, top, scale].map((value) => value.toFixed(6)).join(" ");
       canvas.dataset.ringed = ringed ? ringed[2] : "";
       canvas.ariaLabel = this.drawn.label;
       this.paintUnder();

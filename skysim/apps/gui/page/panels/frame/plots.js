@@ -40,7 +40,7 @@ export function drawHistogram(pen, { pixels, sampled }, levels, [width, height])
   });
   pen.textAlign = "left";
   pen.fillStyle = QUIET;
-  pen.fillText("histogram: drag the limits", MARGIN.left, 11);
+  pen.fillText("drag the limits", MARGIN.left, 11);
   return axis;
 }
 
