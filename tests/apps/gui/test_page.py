@@ -389,11 +389,12 @@ def test_monte_carlo_of_200_by_2(page: Any) -> None:
 
 
 def test_a_dropped_picture_is_solved_shown_or_refused(page: Any, tmp_path: Path) -> None:
-    before = angles(page)
+    before, frame = angles(page), source(page)
     panel(page, "Image")
     photo = cv2.imread(str(ROOT / "docs" / "images" / "sky.jpg"), cv2.IMREAD_GRAYSCALE)
     page.set_input_files("input[type=file]", ROOT / "docs" / "images" / "sky.jpg")
     page.get_by_text("sky.jpg: solved").wait_for()
+    changed(page, frame)
     assert page.get_by_label("angle 1").input_value() == ""  # nobody knows where it was taken
     page.mouse.click(*screen(page, 600, 400))
     for x, y, dn in pixels(page):  # the picture's, not the scene's
