@@ -27,6 +27,8 @@ SPARE = 4  # blobs that are classified, per blob returned: hot pixels and tracks
 MIN_GROWN_PX = 8  # smallest area of a blob that is significant only as a whole
 # With fewer stars than FEW_STARS, faint streaks of SEARCH_LENGTH_PX are searched in DIRECTIONS directions.
 FEW_STARS, DIRECTIONS, SEARCH_LENGTH_PX = 8, 8, 10.0
+# Streaks that are followed: shorter ones are those of a turn about the field, and texture grows to any length.
+SHORTEST_PX, MAX_GROWN_PX = 2.0, 64
 LONGER, LENGTHENED = 1.5, 1.15  # length of the next filter, and growth of the streak that justifies it
 LARGE_PX = 150  # a blob this large is not a faint streak, and a line filter finds many in its noise
 MAX_STREAK_PX = 1024  # longest streak filtered for: a longer one spreads the star too thinly
@@ -369,12 +371,12 @@ def in_full_length(image: NDArray, found: Blobs, threshold_sigma: float, max_blo
     while found.streak_px is not None:
         length_px = np.hypot(*found.streak_px)
         x, y = LONGER * np.array(found.streak_px)
-        if max(abs(x), abs(y)) > MAX_STREAK_PX:
+        if length_px < SHORTEST_PX or max(abs(x), abs(y)) > MAX_GROWN_PX:
             break
         longer = FramePriors((float(x), float(y)), priors.saturation, found.turn_rad)
         again = detect_streaks(image, found.background, threshold_sigma, max_blobs, longer)
         again = classify.classify(image, again, priors)
-        if again.streak_px is None or np.hypot(*again.streak_px) < LENGTHENED * length_px:
+        if again.streak_px is None or np.hypot(*again.streak_px) <= LENGTHENED * length_px:
             break
         found = again
     if found is first:

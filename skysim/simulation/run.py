@@ -8,7 +8,8 @@ the controller use their attitudes. `live` yields frames during the motion and k
 from __future__ import annotations
 
 import collections
-from collections.abc import Callable, Iterator
+import contextlib
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -51,9 +52,22 @@ def simulate_motion(testbed: Testbed, watch: ProgressCallback | None = None) -> 
     `filter`, frames are rendered and solved as their exposures end; the star tracker's attitudes reach the
     filter (and with feedback: filter the controller) after the declared latency.
     """
+    steps = motion_steps(testbed)
+    with contextlib.closing(steps):
+        while True:
+            try:
+                now_s, end_s = next(steps)
+            except StopIteration as end:
+                return end.value
+            if watch:
+                watch(now_s, end_s)
+
+
+def motion_steps(testbed: Testbed) -> Generator[tuple[float, float], None, Testbed]:
+    """`simulate_motion` as a generator: yields (t_s, end_s) after every control period, returns the test bed."""
     loop = ClosedLoop(testbed)
     try:
-        captured, recorder = fly(loop, watch)
+        captured, recorder = yield from fly(loop)
     finally:
         loop.close()
     motion: dict[str, Any] = {
@@ -75,8 +89,10 @@ class Captured(NamedTuple):
     exposures_s: dict[int, float]
 
 
-def fly(loop: ClosedLoop, watch: ProgressCallback | None) -> tuple[list[Captured], TelemetryRecorder]:
-    """Simulate the whole motion; with a filter also the frames. Returns those of each camera, and the telemetry."""
+def fly(loop: ClosedLoop) -> Generator[tuple[float, float], None, tuple[list[Captured], TelemetryRecorder]]:
+    """Simulate the whole motion; with a filter also the frames. Yields (t_s, end_s) after every control period;
+    returns the frames of each camera, and the telemetry.
+    """
     testbed, simulation = loop.testbed, loop.simulation
     # Raises InputError for too fast vibration before any long work.
     loop.vibration.subdivisions(simulation.times_s(0, simulation.last_step + 1))
@@ -95,8 +111,7 @@ def fly(loop: ClosedLoop, watch: ProgressCallback | None) -> tuple[list[Captured
                 reports, update_statuses, exposures_s = captured[camera.number]
                 reports[frame.index], update_statuses[frame.index] = report, status
                 exposures_s[frame.index] = frame.exposure_s
-        if watch:
-            watch(simulation.now_s, simulation.now_s + simulation.steps_left * simulation.step_s)
+        yield simulation.now_s, simulation.now_s + simulation.steps_left * simulation.step_s
     return captured, recorder
 
 

@@ -227,7 +227,7 @@ def torque_noise(
     spread = np.zeros((len(duration_s), 3, 3, 3))
     R_body_from_lab, inverse = before.rotation.inv().as_matrix(), inverse_inertia(record, assumed)
     spread[:, 0] = inverse @ R_body_from_lab
-    spread[:, 1] = np.linalg.inv(momentum_scale(record, before, values, assumed))
+    spread[:, 1] = momentum_scale(record, before, assumed, values)
     spread[:, 2] = np.eye(3)
     noise = np.einsum("kij,kiab,bc,kjdc->kiajd", moments, spread, density, spread).reshape(-1, STATE, STATE)
     sample_s = float(np.median(np.diff(record.wheel_t_s)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,7 +159,40 @@ class LabGeometry:
 
 @dataclass(frozen=True, slots=True)
 class MotionLog:
-    """A simulated motion for playback: curves against time, decimated for display."""
+    """Curves of a simulated motion against time, decimated for display."""
 
     t_s: tuple[float, ...]
     curves: dict[str, tuple[float, ...]] = field(default_factory=dict)
+
+
+class FrameRow(NamedTuple):
+    """One frame of a flight in numbers; NaN where it was not solved, or the scene has no filter.
+
+    t_s : begin of its exposure;  cross, roll : the tracker's error and standard error, arcsec
+    lights, identified : in the field, and identified
+    filter_arcsec, innovation_arcsec : see `FrameView`
+    """
+
+    t_s: float
+    cross_arcsec: float
+    cross_sigma_arcsec: float
+    roll_arcsec: float
+    roll_sigma_arcsec: float
+    lights: int
+    identified: int
+    filter_arcsec: float
+    innovation_arcsec: float
+
+
+@dataclass(frozen=True, slots=True)
+class FlightStep:
+    """Progress of a flight that is being computed: its motion in seconds, then its frames.
+
+    rows : of the frames since the last step;  log : of the motion, in the first step after it has ended
+    """
+
+    phase: Literal["motion", "frames", "done"]
+    done: float
+    total: float
+    rows: tuple[FrameRow, ...] = ()
+    log: MotionLog | None = None

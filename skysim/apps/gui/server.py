@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import hmac
+import re
 import secrets
-from collections.abc import Sequence
+import signal
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from nicegui import app, core, ui
 from starlette.datastructures import MutableHeaders
-from starlette.requests import HTTPConnection
+from starlette.requests import HTTPConnection, Request
 from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
 
 from skysim.apps.gui.page.page import Tab
 from skysim.apps.gui.page.panels.photo import LIMIT_BYTES
 from skysim.apps.gui.page.panels.sensor import FRAMES
-from skysim.apps.gui.worker.session import SpareWorker
+from skysim.apps.gui.worker.session import MAX_WORKERS, SpareWorker
+from skysim.apps.gui.worker.study_process import StudyProcess, is_shown
 from skysim.scene.loader import find
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
@@ -31,6 +34,7 @@ REPORT_POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; frame-ancestors 'none'"
 )
 SECURITY_HEADERS = {"x-frame-options": "DENY", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
+USER, USER_BYTES, YEAR_S = "skysim_user", 8, 365 * 86400  # cookie with the number of a browser
 CONNECT_TIMEOUT_S = 50.0  # for a browser to load the page
 RECONNECT_S = 6.0  # for a lost browser to reconnect, before its work ends
 PING_INTERVAL_S, PING_TIMEOUT_S = 5.0, 30.0  # of the connection; a busy machine answers late
@@ -70,12 +74,14 @@ class Guard:
             return PlainTextResponse("request of another site refused", 403)
         if int(headers.get("content-length") or 0) > LIMIT_BYTES + 2**16:
             return PlainTextResponse("request too large; allowed: 64 MB", 413)
-        if token_matches(request.cookies.get(self.cookie, ""), self.token):
-            return None
-        if token_matches(request.query_params.get("token", ""), self.token):
+        if token_matches(request.query_params.get("token", ""), self.token):  # the address does not keep it
             response = RedirectResponse("/", 303)
             response.set_cookie(self.cookie, self.token, path="/", httponly=True, samesite="strict")
+            user = user_of(request.cookies) or secrets.token_hex(USER_BYTES)
+            response.set_cookie(USER, user, YEAR_S, path="/", httponly=True, samesite="strict")
             return response
+        if token_matches(request.cookies.get(self.cookie, ""), self.token):
+            return None
         return PlainTextResponse("token missing or wrong; open the address that the server printed: /?token=...", 401)
 
 
@@ -118,11 +124,18 @@ def limited(receive: Any) -> Any:
     return receive_limited
 
 
-def report_path(out: Path, name: str) -> Path | None:
-    """The report of a study in the folder; None if there is none of that name."""
+def user_of(cookies: Mapping[str, str]) -> str:
+    """The number of a browser, which its cookie keeps; empty if it has none."""
+    user = cookies.get(USER, "")
+    return user if re.fullmatch(rf"[0-9a-f]{{{2 * USER_BYTES}}}", user) else ""
+
+
+def report_path(out: Path, name: str, user: str = "") -> Path | None:
+    """The report of a study in the folder; None if there is none of that name, or it is another user's."""
     try:
         path = (out / name / "report.html").resolve()
-        return path if path.is_relative_to(out.resolve()) and path.is_file() else None
+        is_here = path.parent.parent == out.resolve() and is_shown(path.parent.name, user)
+        return path if is_here and path.is_file() else None
     except (ValueError, OSError):  # a name with a null byte, or too long
         return None
 
@@ -132,12 +145,19 @@ def be_patient() -> None:
     core.sio.eio.ping_interval, core.sio.eio.ping_timeout = PING_INTERVAL_S, PING_TIMEOUT_S
 
 
+def stop_studies() -> None:
+    """End the studies of all pages with the server; their trials so far are kept."""
+    for process in StudyProcess.begun:
+        process.stop(signal.SIGTERM)
+
+
 def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str]) -> None:
     """Register all routes, with a spare worker ready for the next tab."""
     spare = SpareWorker(str(find(scene).resolve()))
     app.on_startup(be_patient)
     app.on_startup(spare.start)
     app.on_shutdown(spare.close)
+    app.on_shutdown(stop_studies)
 
     @app.get("/frame/{tab}/{number}")
     def frame(tab: str, number: int) -> Response:
@@ -148,25 +168,31 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str]) -> None:
         return Response(data, media_type="application/octet-stream", headers={"Cache-Control": "no-store"})
 
     @app.get("/report/{name}")
-    def report(name: str) -> Response:
-        """A finished study's report."""
-        path = report_path(out, name)
+    def report(name: str, request: Request) -> Response:
+        """A finished study's report, for its user."""
+        path = report_path(out, name, user_of(request.cookies))
         if path is None:
             return Response(status_code=404)
         return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_POLICY})
 
     @ui.page("/", title="skysim gui", dark=True)
-    async def index() -> None:
-        tab = Tab(scene, folder, out, cameras)
+    async def index(request: Request) -> None:
+        tab = Tab(scene, folder, out, cameras, user_of(request.cookies))
         tab.build()
         client = ui.context.client
         try:
             await client.connected(timeout=CONNECT_TIMEOUT_S)
         except TimeoutError:  # no browser has connected: start no worker
             return
-        tab.session = spare.take()
+        session = spare.take()
+        if session is None:
+            tab.sensor.show_waiting(
+                f"{MAX_WORKERS} of {MAX_WORKERS} workers in use.", "Close another page, then reload this one."
+            )
+            return
+        tab.session, tab.new_session = session, spare.take
         client.on_delete(tab.close)
-        await tab.open(scene)
+        await tab.start()
         await tab.scene_3d.adapt_frame_rate()
         spare.start()
 

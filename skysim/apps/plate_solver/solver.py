@@ -222,12 +222,15 @@ def make_solver(
 
 
 @functools.lru_cache(maxsize=1)
-def kept_solver(fov_deg: float | None, time_utc: datetime.datetime | None = None) -> Solver:
+def kept_solver(
+    fov_deg: float | None, time_utc: datetime.datetime | None = None, stages: tuple[tuple[str, str], ...] = ()
+) -> Solver:
     """The solver of `make_solver` with the shipped catalog, kept with its trackers for the next picture.
 
     To index the fields of view from 2 to 100 degrees takes longer than to solve a picture.
+    stages : pairs of stage and algorithm
     """
-    return make_solver(fov_deg, None, time_utc)
+    return make_solver(fov_deg, None, time_utc, dict(stages))
 
 
 def check_stages(stages: Mapping[str, str]) -> None:

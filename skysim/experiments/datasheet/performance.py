@@ -24,7 +24,10 @@ TIMED = 50  # frames whose solution is timed
 
 
 class Counts(NamedTuple):
-    """Numbers of frames: all, with a right attitude, refused, and with a false one."""
+    """Numbers of independent frames: all, with a right attitude, refused, and with a false one.
+
+    Of fields with several frames: all fields, with right attitudes alone, with a refused one, and with a false one.
+    """
 
     frames: int
     right: int
@@ -40,6 +43,13 @@ class Counts(NamedTuple):
 def counts(sheet: Sheet, rows: list[int]) -> Counts:
     """The outcomes of some cells."""
     right, false = sheet.right(rows), sheet.false(rows)
+    return Counts(right.size, int(right.sum()), int((~right & ~false).sum()), int(false.sum()))
+
+
+def counts_of_fields(sheet: Sheet, rows: list[int]) -> Counts:
+    """The outcomes of fields with a frame in each of some cells, which succeed and fail together."""
+    false = sheet.false(rows).any(axis=0)
+    right = sheet.right(rows).all(axis=0)
     return Counts(right.size, int(right.sum()), int((~right & ~false).sum()), int(false.sum()))
 
 
@@ -99,7 +109,7 @@ def pair_row(sheet: Sheet, rows: list[int]) -> dict[str, Any]:
     """Outcomes, temporal noise and rms error about one axis of a pair of cells, arcseconds."""
     first, second = (sheet.errors([row]) for row in rows[:2])
     return {
-        "counts": counts(sheet, rows),
+        "counts": counts_of_fields(sheet, rows),
         **{f"nea_{name}": noise_equivalent_angle(first[axes], second[axes]) for name, axes in GROUPS.items()},
         **{f"rms_{name}": rms(sheet, rows, axes) for name, axes in GROUPS.items()},
     }
@@ -141,7 +151,7 @@ def by_acceleration(sheet: Sheet) -> list[dict[str, Any]]:
         found.append(
             {
                 "acceleration_deg_s2": acceleration,
-                "counts": counts(sheet, rows),
+                "counts": counts_of_fields(sheet, rows),
                 "predicted_across": predicted,
                 **errors,
             }
@@ -164,11 +174,13 @@ class Limit(NamedTuple):
     share : the highest of LIMITS that the frames of a level can show
     above : the highest level up to which all are shown to be above it, NaN if none is
     below : the lowest from which all are shown to be below it, infinite if none is
+    fields : fewest fields at a level
     """
 
     share: float
     above: float
     below: float
+    fields: int
 
 
 def bracket(rows: list[dict[str, Any]], key: str) -> Limit:
@@ -184,7 +196,7 @@ def bracket(rows: list[dict[str, Any]], key: str) -> Limit:
         if row["counts"].share("right").high >= share:
             break
         below = row[key]
-    return Limit(share, above, below)
+    return Limit(share, above, below, fewest)
 
 
 def solution_times_s(sheet: Sheet) -> Floats:

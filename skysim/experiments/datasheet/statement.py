@@ -11,7 +11,7 @@ import numpy as np
 from skysim.experiments.datasheet import performance, terms
 from skysim.experiments.datasheet.cells import TRACKED
 from skysim.experiments.datasheet.components import Bounded, Components
-from skysim.experiments.datasheet.performance import Counts, Limit
+from skysim.experiments.datasheet.performance import Counts, Limit, runs_needed
 from skysim.experiments.datasheet.run import Sheet
 from skysim.results.metrics import Summary
 
@@ -188,7 +188,7 @@ def term_section(statement: Statement) -> Section:
         for table in tables.values():
             share = table.squares[name].value / table.squares["total"].value
             row += [size(table.squares[name]), f"{100 * share:.1f}"]
-        rows.append([*row, terms.TERMS.get(name, "all terms together")])
+        rows.append([*row, terms.TERMS.get(name, "of the terms of this scene")])
     ratios = ", ".join(f"{bounded(table.ratio)} {name}" for name, table in tables.items())
     x, y, roll = (bounded(one, 2) for one in statement.bias)
     texts = [
@@ -198,6 +198,8 @@ def term_section(statement: Statement) -> Section:
         f" {sheet.size.attitudes} attitudes a few pixels apart, {sheet.size.frames} frames each.",
         f"Sum of the terms' variances over the mean square of {len(sheet.rows('total'))} frames in each of these"
         f" fields, with other attitudes and other noise: {ratios}.",
+        "A term that is smaller than its error may come out negative, and the others then exceed 100 %; it is below the"
+        " bound at 97.5 % confidence.",
         f"Mean error about the camera's axes, arcseconds: x {x}, y {y}, roll {roll}.",
     ]
     if sheet.designer.units > 1:
@@ -291,13 +293,13 @@ def quantile_section(statement: Statement) -> Section:
         [f"{100 * one['level']:g} %", *(quantile_text(one[name]) for name in terms.GROUPS)]
         for one in statement.quantiles
     ]
-    return Section("Performance at a confidence", texts, ["probability", "across ″", "about ″"], rows)
+    return Section("Performance at a confidence", texts, ["probability", "boresight angle ″", "about ″"], rows)
 
 
 def quantile_text(found: Summary) -> str:
     """A quantile with its interval, or how many more frames it needs for one."""
     if math.isnan(found.low):
-        return f"{found.value:.3g} (an interval needs {found.needs} more frames)"
+        return f"not established: {found.needs} more frames needed"
     return f"{found.value:.3g} ({found.low:.3g} to {found.high:.3g})"
 
 
@@ -313,29 +315,42 @@ def pair_cells(row: dict[str, Any]) -> list[str]:
 
 PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about ″"]
 OUTCOME_HEADERS = ["right %", "refused", "false"]
+FIELD_HEADERS = ["both right %", "one refused", "one false"]
 
 
 def bracket_text(what: str, limit: Limit, unit: str) -> str:
-    """A sentence on a limit."""
+    """A sentence on a limit, for fields that are right in both of their frames."""
+    if limit.fields < runs_needed(limit.share):
+        return f"Limit of {what}: not established: {limit.fields} attitudes, {runs_needed(limit.share)} needed."
     above = "at no level tested" if math.isnan(limit.above) else f"up to {limit.above:g} {unit}"
     below = "at none tested" if math.isinf(limit.below) else f"from {limit.below:g} {unit} on"
     share = f"{100 * limit.share:g} %"
-    return f"Limit of {what}: {share} of right attitudes are shown {above}, fewer are shown {below}."
+    return f"Limit of {what}: {share} of right attitudes are shown {above}; fewer than {share} are shown {below}."
 
 
 def rate_section(statement: Statement) -> Section:
     """Noise-equivalent angle, error and acquisition by rate."""
     texts = [
         "Two frames of each attitude that differ in their noise, at a constant rate across the boresight, each lost in"
-        f" space. NEA: temporal noise of one axis, 1 σ ({TEMPORAL}). rms: all errors of one axis ({ENSEMBLE}).",
+        f" space. NEA: temporal noise of one axis, 1 σ ({TEMPORAL}). rms: all errors of one axis ({ENSEMBLE})."
+        f" Shares are of attitudes that are right in both frames. {precision_text(statement.sheet)}",
         bracket_text("acquisition in rate", performance.bracket(statement.rates, "rate_deg_s"), "°/s"),
     ]
     rows = [
         [f"{row['rate_deg_s']:g}", f"{row['streak_px']:.2g}", *pair_cells(row), *outcome_cells(row)]
         for row in statement.rates
     ]
-    headers = ["rate °/s", "streak px", *PAIR_HEADERS, *OUTCOME_HEADERS]
+    headers = ["rate °/s", "streak px", *PAIR_HEADERS, *FIELD_HEADERS]
     return Section("By rate", texts, headers, rows, ["rates"])
+
+
+def precision_text(sheet: Sheet) -> str:
+    """How well rms and NEA of F fields are known: 1 / sqrt(2 F) about two axes, 1 / sqrt(F) about one.
+
+    For two Gaussian values a field and axis, with a scatter of the fields' variances that doubles the error's square.
+    """
+    across, about = (100 / math.sqrt(axes * sheet.size.fields) for axes in (2, 1))
+    return f"NEA and rms are known to about {across:.0f} % across and {about:.0f} % about the boresight (1 σ)."
 
 
 def acceleration_section(statement: Statement) -> Section:
@@ -358,7 +373,7 @@ def acceleration_section(statement: Statement) -> Section:
         ]
         for row in statement.accelerations
     ]
-    headers = ["acceleration °/s²", "rms across ″", "predicted ″", "rms about ″", *OUTCOME_HEADERS]
+    headers = ["acceleration °/s²", "rms across ″", "predicted ″", "rms about ″", *FIELD_HEADERS]
     return Section("By acceleration", texts, headers, rows)
 
 
@@ -375,7 +390,7 @@ def tracking_section(statement: Statement) -> Section:
     ]
     rows = [[f"{row['rate_deg_s']:g}", "", *pair_cells(row), *outcome_cells(row)] for row in rates]
     rows += [["", f"{row['acceleration_deg_s2']:g}", *pair_cells(row), *outcome_cells(row)] for row in accelerations]
-    return Section("In tracking mode", texts, ["rate °/s", "acceleration °/s²", *PAIR_HEADERS, *OUTCOME_HEADERS], rows)
+    return Section("In tracking mode", texts, ["rate °/s", "acceleration °/s²", *PAIR_HEADERS, *FIELD_HEADERS], rows)
 
 
 def magnitude_section(statement: Statement) -> Section:
@@ -384,18 +399,25 @@ def magnitude_section(statement: Statement) -> Section:
         "The faintest stars of the tracker's catalog, at rest: two frames of each attitude that differ in their noise"
         f" (NEA: {TEMPORAL}; rms: {ENSEMBLE})."
     ]
-    rows = [[f"{row['limit_mag']:g}", *pair_cells(row), *outcome_cells(row)] for row in statement.magnitudes]
-    return Section("By magnitude limit", texts, ["limit V", *PAIR_HEADERS, *OUTCOME_HEADERS], rows, ["magnitudes"])
+    own = statement.sheet.scene.tracker.limit_mag
+    rows = [
+        [f"{row['limit_mag']:g}{' (of the scene)' * (row['limit_mag'] == own)}", *pair_cells(row), *outcome_cells(row)]
+        for row in statement.magnitudes
+    ]
+    return Section("By magnitude limit", texts, ["limit V", *PAIR_HEADERS, *FIELD_HEADERS], rows, ["magnitudes"])
 
 
 def disturbance_section(statement: Statement) -> Section:
     """Outcomes and errors under disturbances."""
     texts = [
         f"One frame in each field with a disturbance beyond what the scene has ({ENSEMBLE}); the Moon's frames have"
-        " attitudes of their own, with the Moon in the field. rms: of one axis, right attitudes alone."
+        " attitudes of their own, with the Moon in the field. rms: of one axis, over the right attitudes alone, which"
+        " may be those of the fields with the brightest stars. False stars are added to centroids, not to frames."
     ]
     rows = [
         [row["disturbance"], *outcome_cells(row), arcsec(row["rms_across"]), arcsec(row["rms_about"])]
         for row in statement.disturbances
     ]
-    return Section("Under disturbances", texts, ["disturbance", *OUTCOME_HEADERS, "rms across ″", "rms about ″"], rows)
+    return Section(
+        "Under disturbances", texts, ["disturbance", *OUTCOME_HEADERS, "rms of the right: across ″", "about ″"], rows
+    )

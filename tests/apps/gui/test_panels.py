@@ -4,35 +4,39 @@ from __future__ import annotations
 
 import asyncio
 import re
-import time
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
+from estimator.trackers.pipeline import Report
+from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui.messages import Detection, Light, TrackerResult
 from skysim.apps.gui.page import forms, keys, overlay
 from skysim.apps.gui.page.panels.sensor import Sensor
 from skysim.apps.gui.page.star_names import NAMES
-from skysim.apps.gui.server import Guard, host_of, report_path
-from skysim.apps.gui.worker import export, pixels, pointing, study_process, workbench
+from skysim.apps.gui.server import Guard, host_of, report_path, user_of
+from skysim.apps.gui.worker import export, photo, pixels, pointing, study_process, workbench
 from skysim.apps.gui.worker.photo import SUFFIXES
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.io.images import IMAGE_SUFFIXES
-from skysim.core.paths import SCENES
+from skysim.core.paths import ROOT, SCENES
 from skysim.core.types import Mount
 from skysim.dynamics import multibody
 from skysim.experiments.study import loader as study_loader
-from skysim.results import stretch
+from skysim.results import scoring, stretch
 from skysim.scene import loader
 from skysim.simulation import exposure, run
+from skysim.simulation.testbed import build_tracker
 from skysim.sources import catalog, stars
 
 
@@ -267,6 +271,7 @@ async def page(scope: dict, receive: object, send) -> None:
     ("headers", "query", "status"),
     [
         ({"host": "127.0.0.1:8080", "cookie": "skysim_gui_8080=right"}, "", 200),
+        ({"host": "127.0.0.1:8080", "cookie": "skysim_gui_8080=right"}, "token=right", 303),
         ({"host": "127.0.0.1:8080"}, "", 401),
         ({"host": "127.0.0.1:8080", "cookie": "skysim_gui_8081=right"}, "", 401),
         ({"host": "evil.example"}, "token=right", 403),
@@ -324,6 +329,19 @@ def test_a_report_that_is_none_of_the_folder_is_not_found(name: str, tmp_path: P
     assert report_path(tmp_path / "out", "study") is not None
 
 
+def test_a_report_of_a_study_of_the_page_is_its_user_s_alone(tmp_path: Path) -> None:
+    mine, other = "0123456789abcdef", "fedcba9876543210"
+    names = f"monte_carlo_{mine}_tab_1", f"monte_carlo_{other}_tab_1", "afit_sensitivity"
+    for name in names:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "report.html").write_text("report")
+        (tmp_path / name / "study.sqlite").touch()
+    assert [report_path(tmp_path, name, mine) is not None for name in names] == [True, False, True]
+    assert [report_path(tmp_path, name) is not None for name in names] == [False, False, True]
+    assert user_of({"skysim_user": mine}) == mine
+    assert user_of({"skysim_user": "../x"}) == user_of({}) == ""
+
+
 def test_a_host_is_told_with_or_without_its_port() -> None:
     assert [host_of(one) for one in ("a:1", "a", "[::1]:8", "[::1]")] == ["a", "a", "[::1]", "[::1]"]
 
@@ -360,29 +378,62 @@ def test_a_session_answers_refuses_and_ends_with_its_tab() -> None:
 
 
 @pytest.mark.long
-def test_a_flight_is_flown_played_and_stopped() -> None:
+def test_a_flight_is_that_of_the_command_line_and_its_frames_are_kept() -> None:
     async def story() -> None:
         session = Session()
         try:
             await session.run("open", "simsat_slew", {"exposure.frames": "4"}, False)
-            log = await session.run("simulate")
+            with pytest.raises(InputError, match="no flight has begun"):
+                await session.run("advance_flight", 0.01)
+            steps = [await session.run("begin_flight")]
+            await session.run("move", 0.0, 0.0, 1.0, False)  # other tasks have their turn
+            while steps[-1].phase != "done":
+                steps.append(await session.run("advance_flight", 0.5))
+                if len(steps) == 3:
+                    await session.run("move", 0.0, 0.0, 1.0, False)
+            rows = [row for step in steps for row in step.rows]
+            log = next(step.log for step in steps if step.log)
             assert log.t_s[-1] > 1.0
             assert set(log.curves) >= {"momentum", "pointing"}
-            view = await session.run("play", 0.5, True)
-            assert abs(view.t_s - 0.5) < 1e-9
+            # They are the frames of the command line: the same truth, errors and lights.
+            scene = loader.load("simsat_slew", {"exposure.frames": "4"})
+            testbed = run.prepare(scene)
+            expected = [scoring.row(one, scene, testbed.mount) for one in run.run(testbed, build_tracker(testbed))]
+            np.testing.assert_array_equal([row.cross_arcsec for row in rows], [one.cross_arcsec for one in expected])
+            np.testing.assert_array_equal([row.roll_arcsec for row in rows], [one.roll_arcsec for one in expected])
+            assert len(rows) == 4
+            view = await session.run("flight_frame", 2)
+            assert view.t_s == rows[2].t_s
             assert view.result.solved
-            await session.run("open", "simsat_slew", {}, False)
-            begun = time.monotonic()
-            flying = asyncio.create_task(session.run("simulate"))
-            while session.progress_fraction == 0.0 and time.monotonic() - begun < 20:
-                await asyncio.sleep(0.01)
-            session.halt()
-            with pytest.raises(InputError, match="stopped"):
-                await flying
+            files = await session.run("export")
+            frame, _ = exposure.render_frame(testbed, 2)
+            np.testing.assert_array_equal(fits.getdata(BytesIO(files["frame.fits"])), frame.image_dn)
+            assert view.pixels == pixels.encoded(frame.image_dn)
+            with pytest.raises(InputError, match="the flight has no frame 4"):
+                await session.run("flight_frame", 4)
         finally:
             session.close()
 
     asyncio.run(story())
+
+
+@pytest.mark.long
+def test_a_photograph_is_solved_by_the_chosen_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tracker's own settings say so; a stage that does not exist is refused."""
+    used: list[str] = []
+    solved = photo.solved_photo
+
+    def watched(image: np.ndarray, report: Report, tracker: StarTracker) -> photo.PhotoPixels:
+        used.append(tracker.settings.identifier)
+        return solved(image, report, tracker)
+
+    monkeypatch.setattr(photo, "solved_photo", watched)
+    data = (ROOT / "docs" / "images" / "sky.jpg").read_bytes()
+    for stages in ((), (("identifier", "pyramid"),)):
+        photo.photo_from_file("sky.jpg", data, 40.0, stages)
+    assert used == ["default", "pyramid"]
+    with pytest.raises(InputError, match="identifier"):
+        photo.photo_from_file("sky.jpg", data, 40.0, (("identifier", "none"),))
 
 
 # Monte Carlo.
@@ -390,7 +441,8 @@ def test_a_flight_is_flown_played_and_stopped() -> None:
 
 @pytest.mark.long
 def test_monte_carlo_is_a_study_that_runs_and_its_results_is_the_store_s(tmp_path: Path) -> None:
-    text = study_process.monte_carlo("shefex2", {"camera.f_number": "2"}, {"kind": "centroids", "noise_px": 0.2}, 40, 7)
+    trial = {"kind": "centroids", "noise_px": 0.2}
+    text = study_process.monte_carlo("shefex2", {"camera.focal_length": "24 mm"}, trial, 40, 7)
     path = tmp_path / "monte_carlo.yaml"
     path.write_text(text)
     values = study_loader.load(path)
@@ -409,7 +461,7 @@ def test_monte_carlo_is_a_study_that_runs_and_its_results_is_the_store_s(tmp_pat
     assert results.done == 40
     assert sum(results.counts) == round(40 * (1 - results.statistics["refused"][0]))
     assert results.statistics["identified"][0] > 0.8
-    assert tmp_path in study_process.finished(tmp_path.parent)
+    assert tmp_path in study_process.finished(tmp_path.parent, "")
 
 
 def test_a_histogram_counts_every_trial_once() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from bearing_motion import SMALL, prior, record
 from hypothesis import given
+from hypothesis import strategies as some
 from laws import SEEDS, assert_covariance, law, turn
 from scipy.spatial.transform import Rotation
 
@@ -159,3 +160,16 @@ def test_a_longer_record_is_surer() -> None:
         for n in (12, 26)
     )
     assert (long <= short * (1 + 1e-3)).all()
+
+
+@law(dynamics.inverse_inertia, dynamics.momentum_scale)
+@given(rng=SEEDS, factor=some.floats(0.1, 10))
+def test_a_momentum_is_scaled_as_the_inertia(rng: np.random.Generator, factor: float) -> None:
+    """By the assumed over the estimated inertia, whatever the attitudes; the inverse is that of the inertia."""
+    assumed, _ = prior(SMALL, rng)
+    scaled = np.concatenate([factor * assumed.values[:6], assumed.values[6:]])
+    states = drawn_states(rng, 4)
+    found = dynamics.momentum_scale(RECORD, states, scaled, assumed.values)
+    np.testing.assert_allclose(found, np.tile(np.eye(3) / factor, (4, 1, 1)), rtol=0, atol=1e-9 / factor)
+    inverse = dynamics.inverse_inertia(RECORD, scaled)
+    np.testing.assert_allclose(inverse @ inertia_matrix(scaled[:6]), np.eye(3), rtol=0, atol=1e-9)

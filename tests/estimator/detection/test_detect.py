@@ -1,5 +1,7 @@
 """Detection: false alarms against Gaussian theory, blobs against scipy.ndimage, refusals word by word."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import ndimage, stats
@@ -304,3 +306,10 @@ def test_faint_streaks_are_found_in_their_length(length_px: float, angle_deg: fl
     direction_deg = np.degrees(np.arctan2(*blobs.streak_px[::-1])) % 180
     assert direction_deg == pytest.approx(angle_deg, abs=5)
     assert nearest_px(blobs.xy_px, places).max() < 3
+
+
+def test_a_field_that_only_turns_is_left_as_it_is() -> None:
+    """Its streaks are those of a turn, and that at the center has no length to grow from."""
+    image, _ = field_of_stars(4)
+    turning = replace(detect.default(image), streak_px=(0.0, 0.0), turn_rad=0.01)
+    assert detect.in_full_length(image, turning, 5.0, 99, FramePriors()) is turning

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import scipy
 
+from skysim.experiments.datasheet import performance
 from skysim.experiments.datasheet.performance import Counts, bracket, claims, noise_equivalent_angle, runs_needed
 
 
@@ -58,8 +60,8 @@ def test_a_limit_lies_between_what_is_shown_above_and_below():
     rows = [
         {"rate": n, "counts": Counts(200, right, 200 - right, 0)} for n, right in enumerate([200, 199, 190, 150, 3])
     ]
-    assert bracket(rows, "rate") == (0.95, 1, 3)
-    assert bracket(rows[:1], "rate") == (0.95, 0, math.inf)
+    assert bracket(rows, "rate") == (0.95, 1, 3, 200)
+    assert bracket(rows[:1], "rate") == (0.95, 0, math.inf, 200)
     assert math.isnan(bracket(rows[3:], "rate").above)
 
 
@@ -68,3 +70,10 @@ def test_a_limit_is_of_the_highest_share_that_so_many_frames_can_show():
     for frames, share, above in ((59, 0.95, 1), (58, 0.9, 1), (29, 0.9, 1), (28, 0.9, math.nan)):
         found = bracket([{"rate": 1, "counts": Counts(frames, frames, 0, 0)}], "rate")
         assert found[:2] == pytest.approx((share, above), nan_ok=True)
+
+
+def test_frames_of_one_field_count_once():
+    """Four fields with two frames each: right, refused in the second, false in the first, refused and false."""
+    outcome = {"right": [[1, 1, 0, 0], [1, 0, 1, 0]], "false": [[0, 0, 1, 0], [0, 0, 0, 1]]}
+    sheet = SimpleNamespace(**{name: lambda rows, name=name: np.array(outcome[name], bool)[rows] for name in outcome})
+    assert performance.counts_of_fields(sheet, [0, 1]) == Counts(4, 1, 1, 2)

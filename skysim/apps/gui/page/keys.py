@@ -6,7 +6,10 @@ from typing import NamedTuple
 
 
 class Key(NamedTuple):
-    """Keys as the browser names them, their action, and their label and description on the screen and in the help."""
+    """Keys as the browser names them, their action, and their label and description on the screen and in the help.
+
+    A key without a description is in the help alone.
+    """
 
     keys: tuple[str, ...]
     label: str
@@ -33,10 +36,16 @@ KEYS = (
     Key(("F6",), "F6", "sensor", "sensor", "select the detection algorithm"),
     Key(("F7",), "F7", "identifier", "identifier", "select the star identification algorithm"),
     Key(("F8",), "F8", "runs", "runs, field", "set the number of runs and the field of view"),
+    Key(("p",), "P", "play", "", "play the flight, or pause"),
+    Key((",", "."), ", .", "step", "", "show the previous or the next frame of the flight"),
+    Key(("l",), "L", "live", "", "return to the live scene"),
+    Key(("Ctrl+z",), "Ctrl Z", "undo", "", "undo the last change; Ctrl Shift Z: redo"),
+    Key(("Ctrl+k",), "Ctrl K", "palette", "actions", "list every action; type a part of its name"),
     Key(("F10",), "F10", "log", "log", "show the log of this session"),
     Key(("F1",), "F1", "help", "help", "show this help"),
     Key(("Escape",), "Esc", "close", "close", "close the help"),
 )
+PERFORMED = {"identify", "monte_carlo", "play", "live", "attitude", "sensor", "identifier", "runs", "log", "help"}
 ACTION_BY_KEY = {name: key.action for key in KEYS for name in key.keys}
 
 # A list or tab keeps the keyboard focus after a choice, so the focus is removed from it.

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import secrets
 import signal
 import time
-from collections.abc import Awaitable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +17,7 @@ import numpy as np
 from nicegui import ui
 from nicegui.events import KeyEventArguments
 
-from skysim.apps.gui.messages import FrameView, SceneInfo
+from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.page import forms, keys, style
 from skysim.apps.gui.page.panels.attitude import AttitudeCard
 from skysim.apps.gui.page.panels.monte_carlo import MonteCarloPanel
@@ -23,8 +26,14 @@ from skysim.apps.gui.page.panels.run import RunPanel
 from skysim.apps.gui.page.panels.scene import ScenePanel
 from skysim.apps.gui.page.panels.sensor import FRAMES, Sensor
 from skysim.apps.gui.page.scene_3d import Scene3D
+from skysim.apps.gui.page.shell.arrangement import Arrangement
+from skysim.apps.gui.page.shell.history import History
+from skysim.apps.gui.page.shell.palette import Command, Palette
+from skysim.apps.gui.page.shell.wording import for_page
+from skysim.apps.gui.state import View
 from skysim.apps.gui.worker import export, pointing
-from skysim.apps.gui.worker.session import Session, WorkerLost
+from skysim.apps.gui.worker.photo import Photo
+from skysim.apps.gui.worker.session import MAX_WORKERS, Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.scene.loader import find, load
@@ -36,34 +45,57 @@ MAX_LOG_LINES = 500
 class Tab:
     """One tab: its worker, its scene, and its page elements.
 
-    session : its worker; set when a browser has connected
+    session : its worker; set when a browser has connected;  new_session : gives another, None if there are too many
     folder : where scenes are saved;  out : where studies are;  cameras : live ones that it may watch
-    overrides : keys of the scene that differ from its file
+    user : its browser, see `server.user_of`
+    state : what the page shows;  view : the newest frame of the scene
     feedback : of the scene's controller; None without a controller
     solving : whether every frame is solved
     steps : (3,) right, up, roll: movements requested by keys that no frame shows yet
     """
 
     session: Session
+    new_session: Callable[[], Session | None]
 
-    def __init__(self, scene: str, folder: Path, out: Path, cameras: Sequence[str] = ()) -> None:
-        self.id = secrets.token_hex(8)
-        self.scene, self.folder, self.out, self.cameras = scene, folder, out, cameras
-        self.overrides: dict[str, str] = {}
+    def __init__(self, scene: str, folder: Path, out: Path, cameras: Sequence[str] = (), user: str = "") -> None:
+        self.id, self.user = secrets.token_hex(8), user
+        self.folder, self.out, self.cameras = folder, out, cameras
+        self.state = View(scene)
         self.scene_info: SceneInfo | None = None
         self.view: FrameView | None = None
         self.feedback: str | None = None
-        self.solving, self.is_open = True, True
+        self.solving, self.is_open, self.restarting = True, True, False
         self.steps, self.moving = np.zeros(3), False
         self.message_text = ""
+        self.editing = asyncio.Lock()
         self.lines: list[str] = []
 
-    def close(self) -> None:
+    async def close(self) -> None:
         """Release the tab's resources after its browser has gone: frames, study and worker."""
         self.is_open = False
         FRAMES.pop(self.id, None)
         self.study_panel.process.stop(signal.SIGTERM)
-        self.session.close()
+        await asyncio.to_thread(self.session.close)
+
+    async def restart(self) -> None:
+        """Show the view again with a new worker after the old one has ended."""
+        lost, session = self.session, self.new_session()
+        await asyncio.to_thread(lost.close)
+        if session is None:
+            self.show_message(f"the worker of this page has stopped; {MAX_WORKERS} of {MAX_WORKERS} workers in use")
+            return
+        self.session, self.view, wanted = session, None, self.state
+        self.log("the worker of this page has stopped; a new one shows the view again")
+        await self.restore(wanted)
+
+    @property
+    def scene(self) -> str:
+        return self.state.scene
+
+    @property
+    def overrides(self) -> Mapping[str, str]:
+        """Keys of the scene that differ from its file."""
+        return self.state.overrides
 
     # Page elements.
 
@@ -71,22 +103,27 @@ class Tab:
         ui.add_css(style.CSS)
         ui.add_body_html(f"<script>{keys.SUPPRESS_DEFAULTS_JS}</script>")
         ui.colors(
-            primary=style.COLORS["accent"],
-            negative=style.COLORS["bad"],
-            dark=style.COLORS["panel"],
-            dark_page=style.COLORS["ground"],
+            primary=style.DARK["accent"],
+            negative=style.DARK["bad"],
+            dark=style.DARK["panel"],
+            dark_page=style.DARK["ground"],
         )
         with ui.element("div").classes("lab"):
             self.build_header()
             self.sensor = Sensor(self)
             with ui.element("div").classes("lab-side"):
+                Arrangement.splitter()
                 self.attitude = AttitudeCard(self)
                 self.build_panels()
             with ui.element("div").classes("lab-keys").mark("keys"):
                 for key in keys.KEYS:
-                    ui.html(f"<span><kbd>{key.label}</kbd>{key.description}</span>", sanitize=False)
+                    if key.description:
+                        ui.html(f"<span><kbd>{key.label}</kbd>{key.description}</span>", sanitize=False)
         self.help = self.build_help()
         ui.keyboard(on_key=self.key, ignore=["input", "textarea"])
+        self.history = History(self, self.scene)
+        self.palette = Palette(self.commands)
+        self.arrangement = Arrangement([self.run_panel.strips.chart, self.study_panel.chart])
 
     def build_header(self) -> None:
         with ui.element("div").classes("lab-head"):
@@ -94,6 +131,9 @@ class Tab:
             self.picker = ui.select(self.scenes(), value=self.scene, on_change=self.scene_picked)
             self.picker.props('dense borderless options-dense aria-label="Scene"').classes("w-44").mark("scene")
             self.picker.on("popup-hide", js_handler=keys.BLUR_JS)
+            self.banner = ui.label("live").classes("lab-banner").mark("banner")
+            self.live_button = ui.button("Live", on_click=self.go_live).props("dense outline size=sm").mark("live")
+            self.live_button.set_visibility(False)
             self.title = ui.label().classes("lab-title quiet ellipsis")
             self.message = ui.label().classes("lab-said").props('role="status"').mark("message")
             self.spinner = ui.spinner(size="16px").classes("lab-busy").mark("busy")
@@ -151,29 +191,97 @@ class Tab:
                     ui.label(key.help)
         return dialog
 
+    def commands(self) -> list[Command]:
+        """Every action with its key: those of keys, the panels, the exports."""
+        found = [
+            Command(key.help, key.label, partial(self.perform, key.action))
+            for key in keys.KEYS
+            if key.action in keys.PERFORMED
+        ]
+        found += [
+            Command("show the next frame of the flight", ".", partial(self.run_panel.step, 1)),
+            Command("show the previous frame of the flight", ",", partial(self.run_panel.step, -1)),
+            Command("undo the last change", "Ctrl Z", self.history.undo),
+            Command("redo the change that was undone", "Ctrl Shift Z", self.history.redo),
+            Command("compute the flight of the scene, or stop that", "", self.run_panel.simulate),
+            Command("change between the dark and the light theme", "", self.arrangement.toggle),
+        ]
+        found += [Command(f"panel: {name}", "", partial(self.tabs.set_value, name)) for name in PANELS]
+        return found + [Command(f"export: {name}", "", partial(self.export, name)) for name in export.FILE_BY_ITEM]
+
     # Actions.
 
     async def scene_picked(self) -> None:
         if self.picker.value != self.scene:
             await self.open(str(self.picker.value))
 
-    async def open(self, scene: str, overrides: Mapping[str, str] | None = None) -> None:
-        """Set up a scene and show a first frame; keep the old scene if that fails."""
+    async def start(self) -> None:
+        """Show the first view: that of the page's address or of the browser's storage, else the server's scene."""
+        await self.arrangement.restore()
+        await self.show_query(await self.history.read())
+        refusal = self.message_text
+        if self.is_open and self.view is None and await self.open(self.scene):
+            self.show_message(refusal)
+
+    async def show_query(self, query: str) -> None:
+        """Show the view of an address; refuse one that is not of this server."""
+        try:
+            wanted = View.from_query(query, self.scenes())
+            if wanted:
+                await asyncio.to_thread(forms.validated_scene, wanted.scene, wanted.overrides)
+        except InputError as error:
+            self.show_message(str(error))
+            return
+        if wanted:
+            await self.restore(wanted)
+
+    async def restore(self, wanted: View) -> None:
+        """Show a view again: open its scene if it is another, point there, then fly or replay."""
+        now = self.state
+        is_open = self.view is not None and (now.scene, now.overrides) == (wanted.scene, wanted.overrides)
+        if not is_open or wanted.angles_deg is None:
+            if not await self.open(wanted.scene, wanted.overrides, wanted.angles_deg):
+                return
+        elif wanted.kind == "live" and (now.kind != "live" or now.angles_deg != wanted.angles_deg):
+            self.stop_playback()
+            await self.show_live(self.session.run("point", wanted.angles_deg, self.solving))
+        if wanted.study != self.state.study:
+            await self.study_panel.show_study(wanted.study)
+        if wanted.kind == "flight":
+            await self.run_panel.restore(wanted.t_s)
+        elif wanted.kind == "replay" and wanted.study == self.state.study:
+            await self.study_panel.replay(wanted.trial)
+        elif wanted.kind == "photo":
+            self.show_message(f"{wanted.photo}: drop the image again to see it", "quiet")
+
+    def set_state(self, **changes: Any) -> None:
+        """Change what the page shows, as the banner says."""
+        self.state = replace(self.state, **changes)
+        self.banner.set_text(self.state.banner)
+        self.banner.classes(remove="live flight replay photo", add=self.state.kind)
+        self.live_button.set_visibility(self.state.kind != "live")
+
+    async def open(
+        self, scene: str, overrides: Mapping[str, str] | None = None, angles_deg: Triple | None = None
+    ) -> bool:
+        """Set up a scene and show a first frame, at its start or at other angles; keep the old scene if that fails."""
         self.stop_playback()
-        before = self.scene, self.overrides
-        self.scene, self.overrides = scene, dict(overrides or {})
+        self.run_panel.stop_computing()
+        overrides = dict(overrides or {})
         # At first the sensor view shows this message.
         activity = f"setting up {Path(scene).name} …" if self.view else ""
-        result = await self.run_task("open", self.scene_path, self.overrides, self.solving, activity=activity)
+        path = str(find(scene).resolve())
+        result = await self.run_task("open", path, overrides, self.solving, angles_deg, activity=activity)
         if result is None:
-            self.scene, self.overrides = before
             self.picker.set_value(self.scene)
             if self.view is None:
                 self.sensor.show_waiting(f"{Path(scene).name} cannot be set up:", self.message_text)
-            return
+            return False
         self.scene_info, view = result
-        control = load(self.scene_path, self.overrides).motion.control
+        control = (await asyncio.to_thread(load, path, overrides)).motion.control
         self.feedback = control.feedback if control else None
+        self.set_state(scene=scene, overrides=overrides)
+        self.picker.set_value(scene)
         self.title.props["title"] = self.scene_info.title  # tooltip with the full title
         self.title.set_text(self.scene_info.title)
         self.attitude.set_scene(self.scene_info)
@@ -181,20 +289,22 @@ class Tab:
         self.sensor.clear_zoom()
         self.run_panel.set_scene()
         self.study_panel.set_scene()
-        self.display_frame(view)
+        self.display_live(view)
         await self.scene_panel.set_scene()
-        self.log(f"opened {Path(scene).name}" + (f" with {', '.join(self.overrides)}" if self.overrides else ""))
+        self.log(f"opened {Path(scene).name}" + (f" with {', '.join(overrides)}" if overrides else ""))
+        return True
 
     async def apply_overrides(self, overrides: Mapping[str, str]) -> None:
-        """Reopen the scene with further overrides."""
-        await self.open(self.scene, {**self.overrides, **overrides})
+        """Reopen the scene with further overrides; edits made meanwhile follow one after the other."""
+        async with self.editing:
+            await self.open(self.scene, {**self.overrides, **overrides})
 
     async def set_field_of_view(self, field_deg: float) -> None:
         """Change the field of view by the focal length: f' = f tan(field / 2) / tan(field' / 2)."""
         if self.scene_info is None or not 0.5 <= field_deg <= 120:
             self.show_message("field: allowed: 0.5 to 120 deg")
             return
-        camera = load(self.scene_path, self.overrides).camera
+        camera = (await asyncio.to_thread(load, self.scene_path, self.overrides)).camera
         factor = math.tan(math.radians(self.scene_info.field_deg / 2)) / math.tan(math.radians(field_deg / 2))
         await self.apply_overrides({"camera.focal_length": f"{1e3 * camera.focal_length_m * factor:.5g} mm"})
 
@@ -203,20 +313,39 @@ class Tab:
         """Absolute path of the scene file, since study files are written to other folders."""
         return str(find(self.scene).resolve())
 
-    async def show_frame(self, pending: Awaitable[Any]) -> FrameView | None:
-        """Wait for a frame and display it; None if the request failed or the tab has closed."""
+    async def show_live(self, pending: Awaitable[Any]) -> FrameView | None:
+        """Wait for a frame of the live scene and display it; None if the request failed or the tab has closed."""
         begin = time.perf_counter()
         view = await self.await_result(pending)
         if view is not None:
-            self.display_frame(view)
+            self.display_live(view)
             self.latency.set_text(f"{1e3 * (time.perf_counter() - begin):.0f} ms")
         return view
 
+    def display_live(self, view: FrameView) -> None:
+        self.set_state(kind="live", angles_deg=view.angles_deg)
+        self.display_frame(view)
+
     def display_frame(self, view: FrameView) -> None:
+        """Show a frame of the scene: live, or of its flight."""
         self.view = view
         self.sensor.show(view)
         self.attitude.show(view)
         self.scene_3d.show(view)
+
+    def display_photo(self, photo: Photo, /, **state: Any) -> None:
+        """Show an image that is not of the scene as it is now: a photograph, or a trial again.
+
+        state : what the page shows thereby
+        """
+        self.set_state(**state)
+        self.sensor.show_photo(photo)
+        self.attitude.show_photo(photo)
+
+    async def go_live(self) -> None:
+        """Return to the live scene at the newest attitude."""
+        self.stop_playback()
+        await self.show_live(self.session.run("render", self.solving))
 
     def stop_playback(self) -> None:
         """Stop playback and the live camera, because the sensor view is needed for something else."""
@@ -242,14 +371,24 @@ class Tab:
         """Await a result; display an error in one line and return None."""
         try:
             result = await pending
-        except (InputError, WorkerLost) as error:
+        except InputError as error:
             if self.is_open:
                 self.show_message(str(error))
+            return None
+        except WorkerLost as error:
+            if self.is_open and not self.restarting:
+                self.restarting = True
+                self.show_message(f"{error}; a new one shows the view again")
+                try:
+                    await self.restart()
+                finally:
+                    self.restarting = False
             return None
         return result if self.is_open else None
 
     def show_message(self, text: str, color: str = "warn") -> None:
         """Show a message in the head until the next action; warnings are also logged."""
+        text = for_page(text)
         if text == self.message_text:
             return
         self.message_text = text
@@ -284,13 +423,15 @@ class Tab:
         action = keys.ACTION_BY_KEY.get(name)
         if not event.action.keydown or action is None or event.modifiers.ctrl or event.modifiers.meta:
             return
-        if self.help.value and action not in ("help", "close"):
+        if self.palette.dialog.value or (self.help.value and action not in ("help", "close")):
             return
         if action == "move":
             right, up, roll_sign = keys.MOVES[name]
             step = pointing.COARSE if event.modifiers.shift else pointing.FINE
             roll = pointing.ROLL_COARSE_DEG if event.modifiers.shift else pointing.ROLL_FINE_DEG
             await self.move(right * step, up * step, roll_sign * roll)
+        elif action == "step":
+            await self.run_panel.step(1 if name == "." else -1)
         elif not event.action.repeat:
             await self.perform(action)
 
@@ -305,7 +446,7 @@ class Tab:
         try:
             while self.steps.any():
                 steps, self.steps = self.steps.tolist(), np.zeros(3)
-                await self.show_frame(self.session.run("move", *steps, self.solving))
+                await self.show_live(self.session.run("move", *steps, self.solving))
                 await self.sensor.wait_drawn()
         finally:
             self.moving = False
@@ -314,11 +455,15 @@ class Tab:
         self.show_message("")
         if action == "identify":
             self.stop_playback()
-            await self.show_frame(self.session.run("render", True))
+            await self.show_live(self.session.run("render", True))
             self.log(f"identify: {self.view.result.status if self.view and self.view.result else 'no result'}")
         elif action == "monte_carlo":
             self.tabs.set_value("Monte Carlo")
             await self.study_panel.start()
+        elif action == "play":
+            self.run_panel.toggle()
+        elif action == "live":
+            await self.go_live()
         elif action == "attitude":
             self.attitude.inputs[0].run_method("focus")
             self.attitude.inputs[0].run_method("select")

@@ -9,7 +9,7 @@ from nicegui import ui
 from scipy.spatial.transform import Rotation
 
 from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo, Triple
-from skysim.apps.gui.page.style import COLORS
+from skysim.apps.gui.page.style import DARK
 from skysim.core.types import Floats
 
 BRIGHTNESS_CLASSES = 3  # each with its own point size
@@ -28,9 +28,9 @@ class Scene3D:
 
     def __init__(self) -> None:
         self.scene = ui.scene(
-            width=400, height=300, grid=False, background_color=COLORS["ground"], fps=FPS_SLOW, click_events=[]
+            width=400, height=300, grid=False, background_color=DARK["ground"], fps=FPS_SLOW, click_events=[]
         )
-        self.scene.classes("w-full h-full").mark("space")
+        self.scene.classes("w-full h-full lab-space").mark("space")
         self.fps = FPS_SLOW
         self.scene.on("pointerenter", lambda: self.scene.props(f"fps={FPS}"), args=[])
         self.scene.on("pointerleave", lambda: self.scene.props(f"fps={self.fps}"), args=[])
@@ -83,8 +83,8 @@ class Scene3D:
             shape.material("#" + "".join(f"{round(255 * min(max(value, 0.12), 1)):02x}" for value in rgb))
         pupil, corners = geometry.camera_m.tolist(), geometry.corners_m.tolist()
         for n, corner in enumerate(corners):
-            self.scene.line(pupil, corner).material(COLORS["accent"])
-            self.scene.line(corner, corners[(n + 1) % 4]).material(COLORS["accent"])
+            self.scene.line(pupil, corner).material(DARK["accent"])
+            self.scene.line(corner, corners[(n + 1) % 4]).material(DARK["accent"])
 
     def show(self, view: FrameView) -> None:
         """Queue the newest attitude for the timer."""

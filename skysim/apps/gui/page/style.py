@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
-COLORS = {
+DARK = {
     **{"ground": "#0d1015", "panel": "#141922", "line": "#252c38", "text": "#d7dce4", "quiet": "#8b95a5"},
     **{"accent": "#5aa9ff", "good": "#63c174", "warn": "#f0b429", "bad": "#ff6b6b"},
 }
-CURVE_COLORS = ["#5aa9ff", "#f0b429", "#63c174", "#ff6b6b", "#b48ead", "#88c0d0", "#b48ead", "#88c0d0"]
+LIGHT = {
+    **{"ground": "#f4f6f9", "panel": "#ffffff", "line": "#d3d9e2", "text": "#1b2330", "quiet": "#56606f"},
+    **{"accent": "#1463b8", "good": "#1d7a35", "warn": "#8a5a00", "bad": "#b3261e"},
+}
+COLORS = {name: f"var(--lab-{name})" for name in DARK}  # in CSS: of the theme
+CURVE_COLORS = ["#3d8fe0", "#d1901a", "#3f9a52", "#e05555", "#9b6fa3", "#4f9fb5", "#9b6fa3", "#4f9fb5"]  # of both
+
+
+def chart_color(name: str) -> str:
+    """JavaScript of a theme's color, for ECharts; the name of an option that has it begins with a colon."""
+    return f'getComputedStyle(document.body).getPropertyValue("--lab-{name}").trim()'
+
+
+def variables(colors: dict[str, str]) -> str:
+    return "; ".join(f"--lab-{name}: {color}" for name, color in colors.items())
+
+
 TOOLTIP = {
-    **{"trigger": "axis", "confine": True, "backgroundColor": COLORS["line"], "borderWidth": 0},
-    "textStyle": {"color": COLORS["text"], "fontSize": 11},
+    **{"trigger": "axis", "confine": True, ":backgroundColor": chart_color("panel"), "borderWidth": 1},
+    **{":borderColor": chart_color("line"), "textStyle": {":color": chart_color("text"), "fontSize": 11}},
 }
 
 
@@ -19,18 +35,24 @@ def format_number(value: float) -> str:
 
 
 CSS = f"""
+body.body--dark {{ {variables(DARK)} }}
+body.body--light {{ {variables(LIGHT)}; --q-primary: {LIGHT["accent"]} !important }}
+body.body--light .lab-bar .q-checkbox__label {{ filter: brightness(.62) }}
 :root {{ --nicegui-default-padding: 0; --nicegui-default-gap: 0 }}
 body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   font: 13px/1.45 Inter, system-ui, sans-serif }}
 .nicegui-content {{ padding: 0; gap: 0; height: 100vh; overflow: hidden }}
 .lab {{ display: grid; width: 100vw; height: 100vh; grid-template-rows: 44px minmax(0, 1fr) 30px;
-  grid-template-columns: minmax(0, 1fr) clamp(430px, 36vw, 660px);
+  grid-template-columns: minmax(0, 1fr) min(var(--lab-side, clamp(430px, 36vw, 660px)), 70vw);
   grid-template-areas: "head head" "sensor side" "keys keys" }}
 .lab-head {{ grid-area: head }} .lab-sensor {{ grid-area: sensor }} .lab-side {{ grid-area: side }}
 .lab-keys {{ grid-area: keys }}
 .lab-head, .lab-keys {{ display: flex; align-items: center; gap: 14px; padding: 0 14px; background: {COLORS["panel"]};
   border: 0 solid {COLORS["line"]} }}
 .lab-name {{ font-weight: 600; letter-spacing: .02em; white-space: nowrap }}
+.lab-banner {{ flex: none; padding: 1px 8px; border-radius: 9px; font-size: 12px; max-width: 30ch; overflow: hidden;
+  text-overflow: ellipsis; white-space: nowrap; border: 1px solid {COLORS["line"]}; color: {COLORS["quiet"]} }}
+.lab-banner.flight, .lab-banner.replay, .lab-banner.photo {{ border-color: {COLORS["warn"]}; color: {COLORS["warn"]} }}
 .lab-title {{ flex: 0 1 auto; min-width: 0; max-width: 32% }} .lab-rate {{ width: 56px; text-align: right }}
 .lab-said {{ flex: 1 1 0; min-width: 0; text-align: right; line-height: 1.3; max-height: 2.6em; overflow: hidden;
   display: -webkit-box; -webkit-box-orient: vertical; -webkit-line-clamp: 2; overflow-wrap: anywhere }}
@@ -38,8 +60,8 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-busy.hidden {{ display: inline-flex; visibility: hidden }}
 .lab-head {{ border-bottom-width: 1px }} .lab-keys {{ border-top-width: 1px; gap: 18px; overflow: hidden;
   white-space: nowrap; color: {COLORS["quiet"]}; font-size: 12px }}
-.lab-keys kbd {{ background: {COLORS["line"]}; color: {COLORS["text"]}; border-radius: 3px; padding: 1px 5px;
-  font: 11px ui-monospace, monospace; margin-right: 5px }}
+.lab-keys kbd, .lab-command kbd {{ background: {COLORS["line"]}; color: {COLORS["text"]}; border-radius: 3px;
+  padding: 1px 5px; font: 11px ui-monospace, monospace; margin-right: 5px }}
 .lab-sensor {{ display: grid; grid-template-rows: auto minmax(0, 1fr); min-width: 0; min-height: 0 }}
 .lab-bar {{ display: flex; flex-wrap: wrap; align-items: center; gap: 0 8px; padding: 2px 14px; min-width: 0 }}
 .lab-view {{ display: grid; grid-template: minmax(0, 1fr) 24px 176px / minmax(0, 1fr); min-width: 0; min-height: 0 }}
@@ -63,14 +85,22 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-under > * {{ min-width: 0; overflow: hidden }}
 .lab-loupe {{ width: 252px; height: 160px; outline: 1px dashed {COLORS["line"]} }}
 .lab-plot {{ width: 100%; height: 160px; touch-action: none; cursor: ew-resize }}
-.lab-run {{ display: flex; flex-direction: column; gap: 2px }}
-.lab-run .lab-strips {{ flex: 1 1 0; margin-top: 8px; min-height: 380px }}
+.lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-run > * {{ flex: none }}
 .mono.lab-log {{ white-space: pre-wrap; overflow-wrap: anywhere }}
 .q-uploader__subtitle {{ display: none }} .q-uploader__title {{ font-size: 13px; font-weight: 500 }}
 .lab-turn {{ position: absolute; left: 24px; bottom: 16px; font-size: 11px; pointer-events: none }}
 .stale {{ opacity: .45 }}
 .lab-side {{ display: grid; grid-template: auto auto minmax(0, 1fr) / minmax(0, 1fr);
   border-left: 1px solid {COLORS["line"]}; min-height: 0; min-width: 0; background: {COLORS["panel"]} }}
+.lab-side {{ position: relative }}
+.lab-split {{ position: absolute; left: -4px; top: 0; width: 7px; height: 100%; cursor: col-resize; z-index: 5;
+  touch-action: none }}
+.lab-split:hover, .lab-split:focus-visible {{ background: {COLORS["accent"]}; opacity: .6; outline: none }}
+.lab-palette {{ width: min(560px, 94vw); max-width: none; padding: 8px 12px; gap: 4px }}
+.lab-commands {{ max-height: 60vh; overflow: auto; width: 100% }}
+.lab-command {{ display: flex; justify-content: space-between; gap: 12px; padding: 3px 8px; cursor: pointer;
+  border-radius: 4px }}
+.lab-command.chosen, .lab-command:hover {{ background: {COLORS["line"]} }}
 .lab-card {{ padding: 10px 14px; border-bottom: 1px solid {COLORS["line"]}; width: 100% }}
 .lab-panels {{ min-height: 0; overflow: hidden; background: transparent !important }}
 .lab-panels .q-tab-panel {{ padding: 10px 14px; height: 100%; overflow: auto }}
@@ -106,5 +136,22 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .q-btn {{ text-transform: none }} .q-btn .q-btn__content {{ font-size: 12px; line-height: 1.5 }}
 .lab-sections .q-item {{ padding: 2px 0 }}
 .q-field--borderless.q-field--focused, :focus-visible {{ outline: 2px solid {COLORS["accent"]}; outline-offset: 1px }}
+@media (max-width: 1000px) {{
+  .nicegui-content {{ overflow: auto }}
+  .lab {{ height: auto; grid-template: auto auto auto auto / minmax(0, 1fr);
+    grid-template-areas: "head" "sensor" "side" "keys" }}
+  .lab-head {{ flex-wrap: wrap; row-gap: 0; min-height: 44px }} .lab-title, .lab-split {{ display: none }}
+  .lab-said {{ text-align: left; flex-basis: 200px }}
+  .lab-keys {{ flex-wrap: wrap; padding: 6px 14px; row-gap: 4px }}
+  .lab-sensor {{ grid-template-rows: auto min(60vh, 100vw) auto }} .lab-bar {{ flex-wrap: wrap; padding: 4px 14px }}
+  .lab-under {{ grid-template-columns: repeat(auto-fit, minmax(252px, 1fr)); overflow: auto }}
+  .lab-side {{ grid-template-rows: auto auto 620px; border-left: 0 }}
+  .lab-run > .row:first-child {{ flex-wrap: wrap }}
+}}
+@media (max-width: 600px) {{
+  .lab-stages {{ grid-template-columns: repeat(2, minmax(0, 1fr)) }}
+  .lab-trial {{ grid-template-columns: repeat(2, minmax(0, 1fr)) }}
+  .lab-grid {{ grid-template-columns: 60px repeat(3, minmax(0, 1fr)); gap: 2px 6px }}
+}}
 .empty {{ color: {COLORS["quiet"]}; padding: 28px 8px; text-align: center; line-height: 1.6 }}
 """

@@ -44,9 +44,7 @@ def frame_files(workbench: Workbench, base: str, overrides: dict[str, str]) -> d
         raise InputError("no frame has been rendered yet")
     with tempfile.TemporaryDirectory() as folder:
         frames.write_frame(Path(folder), workbench.frame, workbench.truth, workbench.scene)
-        contents = {
-            path.name.replace("frame_0000", "frame"): path.read_bytes() for path in sorted(Path(folder).iterdir())
-        }
+        contents = {f"frame{path.suffix}": path.read_bytes() for path in sorted(Path(folder).iterdir())}
     annotated = scoring.annotated(workbench.frame, workbench.truth, workbench.report)
     contents["figure.png"] = bytes(cv2.imencode(".png", annotated)[1])
     if result := workbench.result:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import tempfile
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +34,6 @@ from skysim.experiments.study.execution.trials import run_trial
 from skysim.experiments.study.store import STORE
 from skysim.results import scoring, stretch
 from skysim.simulation.run import FrameResult
-from skysim.tracking.settings import STAR_ALGORITHMS
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +44,6 @@ class Photo:
     names, true_deg : of its three angles, and their true values if known
     lights, prefix : true lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
     hint : of a refused file the likely cause, of a solved one what was assumed
-    stages : the algorithms that solved it, by stage
     """
 
     size_px: tuple[int, int]
@@ -63,7 +59,6 @@ class Photo:
     lights: tuple[Light, ...] = ()
     prefix: str = "HIP"
     hint: str = ""
-    stages: Mapping[str, str] = field(default_factory=dict)
 
 
 PhotoPixels = tuple[Photo, NDArray]  # with the image's pixels
@@ -71,31 +66,15 @@ PhotoPixels = tuple[Photo, NDArray]  # with the image's pixels
 SUFFIXES = tuple(dict.fromkeys("." + suffix.rpartition(".")[2] for suffix in images.IMAGE_SUFFIXES))
 
 
-@functools.lru_cache(maxsize=1)
-def kept_solver(fov_deg: float | None, stages: tuple[tuple[str, str], ...]) -> plate_solver.Solver:
-    """A solver with chosen algorithms, (stage, name) each, kept with its trackers for the next picture."""
-    return plate_solver.make_solver(fov_deg, None, stages=dict(stages))
+Stages = tuple[tuple[str, str], ...]  # chosen algorithms: pairs of stage and name
 
 
-def usable_stages(stages: Mapping[str, str]) -> dict[str, str]:
-    """The chosen algorithms as far as they solve stars: an identifier or solver of LEDs gives way to the default."""
-    return {stage: name if name in STAR_ALGORITHMS[stage] else "default" for stage, name in stages.items()}
-
-
-def used_stages(stages: Mapping[str, str], fov_deg: float | None) -> dict[str, str]:
-    """The algorithms that solve a picture: quads of stars identify it if its field of view is unknown."""
-    return dict(stages) if fov_deg else {**stages, "identifier": "quads"}
-
-
-def photo_from_file(name: str, data: bytes, fov_deg: float | None, stages: Mapping[str, str]) -> PhotoPixels:
-    """Solve an uploaded file, as it is viewed, by the chosen algorithms. Raises InputError if it is no readable image.
-
-    stages : names of algorithms by stage
-    """
+def photo_from_file(name: str, data: bytes, fov_deg: float | None, stages: Stages = ()) -> PhotoPixels:
+    """Solve an uploaded file, as it is viewed. Raises InputError if it is no readable image."""
     suffix = images.image_suffix(name)
     if not suffix:
         raise InputError(f"{Path(name).name}: allowed: {', '.join(images.IMAGE_SUFFIXES)}")
-    solver = kept_solver(fov_deg, tuple(usable_stages(stages).items()))
+    solver = plate_solver.kept_solver(fov_deg, stages=stages)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"upload{suffix}"
         path.write_bytes(data)
@@ -107,7 +86,7 @@ def photo_from_file(name: str, data: bytes, fov_deg: float | None, stages: Mappi
     outcome = plate_solver.solve_picture(picture, solver, date_utc)
     hint = plate_solver.outcome_fields(outcome, date_utc)["hint"]
     photo, image = solved_photo(outcome.hypothesis.pixels, outcome.report, outcome.tracker)
-    return replace(photo, hint=hint, stages=used_stages(usable_stages(stages), fov_deg)), image
+    return replace(photo, hint=hint), image
 
 
 def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
@@ -139,12 +118,10 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     return photo, frame.image_dn
 
 
-def solve_frame(image: NDArray, fov_deg: float | None, stages: Mapping[str, str]) -> PhotoPixels:
+def solve_frame(image: NDArray, fov_deg: float | None, stages: Stages = ()) -> PhotoPixels:
     """Solve a frame of a live camera; the result's status says why if there is no solution."""
     check_size(image)
-    solver = kept_solver(fov_deg, tuple(usable_stages(stages).items()))
-    photo, image = solved_photo(image, *plate_solver.solve_array(image, solver, None))
-    return replace(photo, stages=used_stages(usable_stages(stages), fov_deg)), image
+    return solved_photo(image, *plate_solver.solve_array(image, plate_solver.kept_solver(fov_deg, stages=stages), None))
 
 
 def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoPixels:

@@ -1,21 +1,98 @@
-"""Playback of a simulated motion: renders a frame at any time of it, solved on request."""
+"""A scene's flight: its motion and all its frames, computed piece by piece and kept for playback."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from skysim.apps.gui.messages import FrameView, MotionLog
-from skysim.apps.gui.worker.workbench import Workbench
+from estimator.trackers.pipeline import Report
+from skysim.apps.gui.messages import NAN, FlightStep, FrameRow, FrameView, MotionLog
+from skysim.apps.gui.worker import pixels
+from skysim.apps.gui.worker.workbench import Workbench, tracker_result
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Telemetry
 from skysim.results import telemetry_report
-from skysim.simulation.testbed import MARGIN_S, Testbed, exposure_window
+from skysim.simulation import exposure, run
+from skysim.simulation.run import FrameResult
+from skysim.simulation.testbed import Testbed, build_tracker, exposure_window
 
 MAX_POINTS = 500  # of a curve on the page, roughly
 FLOOR = 1e-3  # arcsec; lower limit of values on a logarithmic axis
+
+
+@dataclass
+class KeptFrame:
+    """A frame of a flight without its pixels, which are rendered again, bit for bit, when it is shown."""
+
+    view: FrameView
+    report: Report
+
+
+class Flight:
+    """A flight of a workbench's scene. Frames are those of `skysim run`.
+
+    Its computation is a series of short steps, so that the worker does other tasks between them.
+
+    moved : the testbed after the simulation of its motion, None before;  told : number of frames reported by `advance`
+    """
+
+    def __init__(self, bench: Workbench) -> None:
+        self.bench, self.frames = bench, list[KeptFrame]()
+        self.moved: Testbed | None = None
+        self.told, self.told_log = 0, False
+        self.progress = (0.0, 1.0)
+        self.steps = self.compute()
+
+    def compute(self) -> Iterator[tuple[float, float]]:
+        """Simulate the motion, then render and solve every frame; yields (done, total) of either."""
+        self.moved = yield from run.motion_steps(self.bench.testbed)
+        count = self.moved.scene.exposure.frames
+        yield 0, count
+        tracker = build_tracker(self.moved)
+        for result in run.run(self.moved, tracker):
+            solved = tracker_result(self.moved, tracker, result)
+            view = self.bench.frame_view(result.frame, result.truth, solved, sum(result.seconds.values()))
+            t_s = exposure_window(self.moved.scene, result.frame.index, result.frame.exposure_s).open_s
+            error, innovation = filter_errors(self.moved, result, t_s)
+            view = replace(view, pixels=b"", t_s=t_s, filter_arcsec=error, innovation_arcsec=innovation)
+            self.frames.append(KeptFrame(view, result.report))
+            yield len(self.frames), count
+
+    def advance(self, budget_s: float) -> FlightStep:
+        """Compute for about a time, and report what is new."""
+        end_s, is_done = time.perf_counter() + budget_s, False
+        while not is_done and time.perf_counter() < end_s:
+            progress = next(self.steps, None)
+            is_done, self.progress = progress is None, progress or self.progress
+        rows = tuple(frame_row(frame.view) for frame in self.frames[self.told :])
+        self.told, log = len(self.frames), None
+        if self.moved and not self.told_log:
+            self.told_log, log = True, curves(self.moved.log)
+        return FlightStep("done" if is_done else "frames" if self.moved else "motion", *self.progress, rows, log)
+
+    def show(self, index: int) -> FrameView:
+        """The view of a kept frame with its pixels; the scene is seen from there from now on."""
+        assert self.moved is not None
+        kept, bench = self.frames[index], self.bench
+        frame, truth = exposure.render_frame(self.moved, index, exposure_s=kept.view.exposure_s)
+        bench.frame, bench.truth, bench.report = frame, truth, kept.report
+        bench.lab_from_body = truth.lab_from_body
+        return replace(kept.view, pixels=pixels.encoded(frame.image_dn))
+
+
+def frame_row(view: FrameView) -> FrameRow:
+    """A frame of a flight in numbers."""
+    result = view.result
+    if result is None:
+        return FrameRow(view.t_s, NAN, NAN, NAN, NAN, len(view.lights), 0, view.filter_arcsec, view.innovation_arcsec)
+    cross_sigma, roll_sigma = result.sigma_arcsec
+    errors = result.cross_arcsec, cross_sigma, result.roll_arcsec, roll_sigma
+    counts = len(view.lights), result.identified
+    return FrameRow(view.t_s, *errors, *counts, view.filter_arcsec, view.innovation_arcsec)
 
 
 def curves(log: Telemetry) -> MotionLog:
@@ -33,35 +110,14 @@ def curves(log: Telemetry) -> MotionLog:
     return MotionLog(tuple(log.t_s[::every].tolist()), thinned)
 
 
-def render_at(workbench: Workbench, moved: Testbed, t_s: float, solve: bool) -> FrameView:
-    """Render the frame whose exposure begins at t_s, limited so that it ends within the motion.
-
-    moved : the workbench's testbed after the simulation of its motion
-
-    The noise seed depends on the time, so that the same time always gives the same frame.
-    """
-    scene = moved.scene
-    last_s = float(moved.trajectory.t_s[-1]) - MARGIN_S - scene.exposure.trigger_jitter_s
-    window = exposure_window(scene, 0)
-    duration_s = window.close_s(scene.camera.height_px) - window.open_s
-    begin_s = min(max(t_s, 0.0), last_s - duration_s)
-    exposure = scene.exposure.model_copy(update={"first_s": begin_s})
-    # The start time in units of 0.1 ms is part of the seed.
-    testbed = moved.in_run(scene.seed + 1 + round(begin_s * 1e4))
-    workbench.lab_from_body = moved.trajectory.attitude_at(begin_s)
-    view = workbench.render(replace(testbed, scene=testbed.scene.model_copy(update={"exposure": exposure})), solve)
-    filter_error, innovation = filter_errors(workbench, moved, begin_s)
-    return replace(view, t_s=begin_s, filter_arcsec=filter_error, innovation_arcsec=innovation)
-
-
-def filter_errors(workbench: Workbench, moved: Testbed, t_s: float) -> tuple[float, float]:
+def filter_errors(moved: Testbed, result: FrameResult, t_s: float) -> tuple[float, float]:
     """Error of the filter, and angle between the star tracker's attitude and the filter's, arcsec; NaN if none."""
     log = moved.log
     if log.lab_from_filter is None:
         return math.nan, math.nan
     n = min(int(np.searchsorted(log.t_s, t_s)), len(log.t_s) - 1)
     error_arcsec = float((log.lab_from_filter[n].inv() * log.lab_from_body[n]).magnitude()) / ARCSEC_RAD
-    cam_from_lab = workbench.report.attitude.cam_from_ref if workbench.report else None
+    cam_from_lab = result.report.attitude.cam_from_ref
     if cam_from_lab is None:
         return error_arcsec, math.nan
     lab_from_body = cam_from_lab.inv() * moved.mount.cam_from_body

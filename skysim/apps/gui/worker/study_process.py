@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import yaml
@@ -28,6 +28,8 @@ RESPONSES = {  # label on the page by response
     "time_ms_median": "ms per trial",
 }
 BINS = 28
+PAGE_STUDY = "monte_carlo_"  # of the folders of Monte Carlo studies, followed by their user
+MAX_STUDIES = 4  # at once, of all pages
 MAX_FAILED = 20  # maximum number of failed trials in the results
 
 
@@ -63,7 +65,12 @@ def monte_carlo(scene: str, overrides: Mapping[str, str], trial: Mapping[str, An
 
 
 class StudyProcess:
-    """One study's process, which ends with its tab."""
+    """One study's process, which ends with its tab.
+
+    begun : processes of all tabs; those that have ended are taken out before another begins
+    """
+
+    begun: ClassVar[set[StudyProcess]] = set()
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -84,6 +91,14 @@ class StudyProcess:
             stderr=asyncio.subprocess.PIPE,
             start_new_session=True,
         )
+        StudyProcess.begun.add(self)
+
+    @classmethod
+    def check_count(cls) -> None:
+        """Raise InputError if MAX_STUDIES run already."""
+        cls.begun = {process for process in cls.begun if process.running}
+        if len(cls.begun) >= MAX_STUDIES:
+            raise InputError(f"{MAX_STUDIES} of {MAX_STUDIES} studies are running; start again after one has ended")
 
     async def wait(self) -> str:
         """Wait for the process; return the last line of its standard error if it failed, else ""."""
@@ -136,7 +151,13 @@ def histogram(error_arcsec: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
     return tuple(np.sqrt(edges[1:] * edges[:-1]).tolist()), tuple(counts.tolist())
 
 
-def finished(folder: Path) -> list[Path]:
-    """Folders of the studies that have a report, the newest first."""
+def is_shown(name: str, user: str) -> bool:
+    """Whether a user may see a study: all but the Monte Carlo studies that another user has started in the page."""
+    return not name.startswith(PAGE_STUDY) or name.startswith(f"{PAGE_STUDY}{user}_")
+
+
+def finished(folder: Path, user: str) -> list[Path]:
+    """Folders of the studies that have a report and are shown to a user, the newest first."""
     folders = [path.parent for path in folder.glob("*/report.html") if (path.parent / STORE).is_file()]
+    folders = [path for path in folders if is_shown(path.name, user)]
     return sorted(folders, key=lambda path: -(path / "report.html").stat().st_mtime)

@@ -2,37 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import FrameView, MotionLog, SceneInfo, Triple
+from skysim.apps.gui.messages import FlightStep, FrameView, SceneInfo, Triple
 from skysim.apps.gui.worker import export, photo, playback, pointing
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core.errors import InputError
 from skysim.core.io import images
-from skysim.simulation import run
-from skysim.simulation.testbed import Testbed
-
-
-class Stopped(Exception):
-    """Raised in a task that the user has stopped."""
 
 
 @dataclass
 class Worker:
-    """State between tasks: the workbench, its simulated motion, and the other image if the page shows one.
+    """State between tasks: the workbench, its flight, and the other image if the page shows one.
 
-    report_progress : reports progress (done, total) of a long task; raises Stopped if the task shall end
-    moved : the testbed after the simulation of its motion
     other, image : an image that is not of the scene, and its (H, W) pixels;  camera : an open live camera
     """
 
-    report_progress: Callable[[float, float], None]
     current: Workbench | None = None
-    moved: Testbed | None = None
+    flight: playback.Flight | None = None
     other: photo.Photo | None = None
     image: NDArray | None = None
     scene: str = ""
@@ -62,11 +53,16 @@ class Worker:
         """Set up a scene and solve one frame, so that code is imported and compiled."""
         Workbench.open(scene, {}).render_at_rest(solve=True)
 
-    def open(self, scene: str, overrides: Mapping[str, str], solve: bool) -> tuple[SceneInfo, FrameView]:
-        """Set up a scene and render a first frame."""
-        self.current = Workbench.open(scene, overrides, self.current)
-        self.scene, self.overrides, self.moved = scene, dict(overrides), None
-        return self.current.scene_info, self.render(solve)
+    def open(
+        self, scene: str, overrides: Mapping[str, str], solve: bool, angles_deg: Triple | None = None
+    ) -> tuple[SceneInfo, FrameView]:
+        """Set up a scene and render a first frame; angles_deg : of another attitude than the kept one or the start."""
+        bench = Workbench.open(scene, overrides, self.current)
+        if angles_deg is not None:
+            bench.lab_from_body = pointing.from_angles(bench.scene, bench.testbed.mount, angles_deg)
+        self.current = bench
+        self.scene, self.overrides, self.flight = scene, dict(overrides), None
+        return bench.scene_info, self.render(solve)
 
     def render(self, solve: bool) -> FrameView:
         return self.show_frame(self.workbench.render_at_rest(solve))
@@ -81,16 +77,22 @@ class Worker:
         bench.lab_from_body = pointing.moved(bench.scene, bench.testbed.mount, bench.lab_from_body, right, up, roll_deg)
         return self.render(solve)
 
-    def simulate(self) -> MotionLog:
-        """Simulate the whole motion, for playback."""
-        self.moved = run.simulate_motion(self.workbench.testbed, self.report_progress)
-        return playback.curves(self.moved.log)
+    def begin_flight(self) -> FlightStep:
+        """Begin to compute the scene's flight; `advance_flight` does the work."""
+        self.flight = playback.Flight(self.workbench)
+        return self.flight.advance(0.0)
 
-    def play(self, t_s: float, solve: bool) -> FrameView:
-        """Render the frame at time t_s of the motion. Raises InputError if none was simulated."""
-        if self.moved is None:
-            raise InputError("no motion has been simulated yet")
-        return self.show_frame(playback.render_at(self.workbench, self.moved, t_s, solve))
+    def advance_flight(self, budget_s: float) -> FlightStep:
+        """Compute the flight for about a time. Raises InputError if none has begun."""
+        if self.flight is None:
+            raise InputError("no flight has begun")
+        return self.flight.advance(budget_s)
+
+    def flight_frame(self, index: int) -> FrameView:
+        """A kept frame of the flight. Raises InputError if it has not been computed."""
+        if self.flight is None or not 0 <= index < len(self.flight.frames):
+            raise InputError(f"the flight has no frame {index}")
+        return self.show_frame(self.flight.show(index))
 
     def replay(self, study: str, folder: str, trial: int) -> photo.Photo:
         """Repeat a study's trial; the page shows its frame."""
@@ -102,17 +104,14 @@ class Worker:
             return export.photo_files(self.other, self.image)
         return export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
 
-    def solve_file(self, name: str, data: bytes, fov_deg: float | None) -> photo.Photo:
-        """Solve an uploaded file by the algorithms that the page shows."""
-        return self.show_photo(photo.photo_from_file(name, data, fov_deg, self.workbench.stages))
+    def solve_file(self, name: str, data: bytes, fov_deg: float | None, stages: photo.Stages = ()) -> photo.Photo:
+        return self.show_photo(photo.photo_from_file(name, data, fov_deg, stages))
 
-    def solve_camera(self, source: str, fov_deg: float | None) -> photo.Photo:
+    def solve_camera(self, source: str, fov_deg: float | None, stages: photo.Stages = ()) -> photo.Photo:
         """Solve the next frame of a live camera, which stays open."""
         if self.camera is None:
             self.camera = images.LiveCamera(source)
-        return self.show_photo(
-            photo.solve_frame(images.monochrome(self.camera.frame()), fov_deg, self.workbench.stages)
-        )
+        return self.show_photo(photo.solve_frame(images.monochrome(self.camera.frame()), fov_deg, stages))
 
     def release(self) -> None:
         """Close the live camera."""

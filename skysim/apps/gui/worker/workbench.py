@@ -24,7 +24,7 @@ from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation import exposure
-from skysim.simulation.run import FrameResult
+from skysim.simulation.run import FrameResult, warm_up_tracker
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking import factory
 from skysim.tracking import settings as tracker_settings
@@ -61,11 +61,11 @@ class Workbench:
         scene = load(name, overrides)
         if before and before.scene.model_copy(update={"tracker": scene.tracker}) == scene:
             testbed = replace(before.testbed, scene=scene)
-            return replace(before, scene=scene, testbed=testbed, estimator=build_tracker(testbed))
+            return replace(before, scene=scene, testbed=testbed, estimator=warm_tracker(testbed))
         testbed = build_testbed(scene)
         lab_from_body = testbed.trajectory.lab_from_body[0]
-        tracker, lens = build_tracker(testbed), pixels.scene_lens(testbed)
-        return cls(scene, testbed, tracker, lab_from_body, lens, magnitude=magnitude_by_id(testbed))
+        lens = pixels.scene_lens(testbed)
+        return cls(scene, testbed, warm_tracker(testbed), lab_from_body, lens, magnitude=magnitude_by_id(testbed))
 
     @property
     def stages(self) -> dict[str, str]:
@@ -109,21 +109,32 @@ class Workbench:
         clock = Clock()
         self.frame, self.truth = exposure.render_frame(testbed, 0)
         self.report = factory.solve_frame(self.estimator, self.frame) if solve else None
-        height, width = self.frame.image_dn.shape
         clock.lap("all")
+        return self.frame_view(self.frame, self.truth, self.result, clock.seconds["all"])
+
+    def frame_view(self, frame: Frame, truth: Truth, result: TrackerResult | None, seconds: float) -> FrameView:
+        """The view of a frame of this scene for the page."""
+        height, width = frame.image_dn.shape
         return FrameView(
-            pixels.encoded(self.frame.image_dn),
-            pixels.scene_pose(testbed, self.lens, self.truth),
-            self.frame.saturation_dn,
+            pixels.encoded(frame.image_dn),
+            pixels.scene_pose(self.testbed, self.lens, truth),
+            frame.saturation_dn,
             (width, height),
-            scoring.angles_deg(self.truth.cam_from_lab, self.scene, self.testbed.mount),
-            tuple(quaternion.from_rotation(self.truth.lab_from_body).tolist()),
-            self.frame.exposure_s,
-            stretch.frame_statistics(self.frame.image_dn, self.frame.saturation_dn),
-            true_lights(self.truth, self.magnitude),
-            self.result,
-            1e3 * clock.seconds["all"],
+            scoring.angles_deg(truth.cam_from_lab, self.scene, self.testbed.mount),
+            tuple(quaternion.from_rotation(truth.lab_from_body).tolist()),
+            frame.exposure_s,
+            stretch.frame_statistics(frame.image_dn, frame.saturation_dn),
+            true_lights(truth, self.magnitude),
+            result,
+            1e3 * seconds,
         )
+
+
+def warm_tracker(testbed: Testbed) -> factory.Estimator:
+    """The scene's tracker, compiled, so that its first frame's time is that of solving it."""
+    tracker = build_tracker(testbed)
+    warm_up_tracker(testbed, tracker)
+    return tracker
 
 
 def id_prefix(testbed: Testbed) -> str:

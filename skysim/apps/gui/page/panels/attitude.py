@@ -78,7 +78,7 @@ class AttitudeCard:
         except (TypeError, ValueError):
             self.tab.show_message("an angle is not a number; allowed: degrees, e.g. 83.6")
             return
-        if await self.tab.show_frame(self.tab.session.run("point", angles, self.tab.solving)):
+        if await self.tab.show_live(self.tab.session.run("point", angles, self.tab.solving)):
             for field in self.inputs:
                 field.run_method("blur")  # so that the arrow keys move the camera again
 

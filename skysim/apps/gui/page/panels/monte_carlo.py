@@ -12,12 +12,22 @@ from urllib.parse import quote
 from nicegui import run, ui
 
 from skysim.apps.gui.page import keys
-from skysim.apps.gui.page.style import COLORS, TOOLTIP, format_number
-from skysim.apps.gui.worker.study_process import RESPONSES, StudyProcess, StudyResults, finished, monte_carlo
+from skysim.apps.gui.page.style import CURVE_COLORS, TOOLTIP, chart_color, format_number
+from skysim.apps.gui.worker.study_process import (
+    PAGE_STUDY,
+    RESPONSES,
+    StudyProcess,
+    StudyResults,
+    finished,
+    is_shown,
+    monte_carlo,
+)
 from skysim.core.errors import InputError
 from skysim.core.io import files
 from skysim.core.paths import STUDIES, title_of
 from skysim.experiments.study import loader
+from skysim.experiments.study.plan import Plan
+from skysim.experiments.study.store import STORE
 
 if TYPE_CHECKING:
     from skysim.apps.gui.page.page import Tab
@@ -102,6 +112,7 @@ class MonteCarloPanel:
         """Start the process of the chosen study; return whether it could be."""
         self.tab.show_message("")
         try:
+            StudyProcess.check_count()
             path = await run.io_bound(self.study_file)
             study = await run.io_bound(loader.load, path)
             if study.study.optimize is not None:
@@ -116,7 +127,8 @@ class MonteCarloPanel:
         self.stopped = False
         self.note.set_text("starting …")
         self.tab.log(f"study {path.stem}: {study.trials} trials")
-        resumable = (self.process.folder / "study.sqlite").is_file()
+        self.tab.set_state(study=self.process.folder.name)
+        resumable = (self.process.folder / STORE).is_file()
         await self.process.start(path, "resume" if resumable else "run")
         if not self.tab.is_open:  # closed meanwhile, when there was no process to end
             self.process.stop(signal.SIGTERM)
@@ -141,7 +153,7 @@ class MonteCarloPanel:
             return before
         self.run_number += 1
         text = monte_carlo(*settings, self.run_number)
-        folder = files.make_folder(self.tab.out / f"monte_carlo_{self.tab.id}_{self.run_number}")
+        folder = files.make_folder(self.tab.out / f"{PAGE_STUDY}{self.tab.user}_{self.tab.id}_{self.run_number}")
         files.write_text(folder / "monte_carlo.yaml", text)
         return folder / "monte_carlo.yaml"
 
@@ -153,12 +165,44 @@ class MonteCarloPanel:
         done = results.done if results else 0
         if fault:
             self.tab.show_message(fault)
-        complete = done >= self.process.total
-        self.note.set_text(
-            f"{done} of {self.process.total} trials" + ("" if complete else "; stopped, Start continues")
-        )
+        self.show_count(done)
         self.tab.log(f"study ended: {done} of {self.process.total} trials")
         self.list_reports()
+
+    async def show_study(self, name: str) -> None:
+        """Show the results of a study of the page's folder, as after a reload; a stopped one can be continued."""
+        if self.process.running or self.starting:
+            return
+        folder = self.tab.out / name
+        is_here = name and folder.parent == self.tab.out and is_shown(name, self.tab.user)
+        found = await run.io_bound(stored_study, folder) if is_here else None
+        if found is None:
+            self.tab.set_state(study="")
+            return
+        self.process, study = StudyProcess(folder), found
+        self.process.total, self.stopped = study.trials, True
+        self.study_select.set_value(name if (STUDIES / f"{name}.yaml").is_file() else "")
+        if not self.study_select.value:
+            self.set_fields(name, study)
+        results = await run.io_bound(self.process.results)
+        self.tab.set_state(study=name)
+        if results:
+            self.show(results)
+            self.show_count(results.done)
+
+    def set_fields(self, name: str, study: Plan) -> None:
+        """Fill in the fields with the settings of a Monte Carlo study of this page, so that Start continues it."""
+        number, trial = name.rpartition("_")[2], study.spec.trial
+        self.run_number = int(number) if number.isdigit() else 0
+        self.count.set_value(study.trials)
+        self.kind.set_value(trial["kind"])
+        self.noise.set_value(trial.get("noise_px", self.noise.value))
+        self.false_lights.set_value(trial.get("false_lights", self.false_lights.value))
+
+    def show_count(self, done: int) -> None:
+        """Say how many trials are done, and how to go on."""
+        rest = "" if done >= self.process.total else "; stopped, Start continues"
+        self.note.set_text(f"{done} of {self.process.total} trials{rest}")
 
     async def poll(self) -> None:
         """Read the store of a running study and display its results so far."""
@@ -199,14 +243,13 @@ class MonteCarloPanel:
             "replay", str(study), str(self.process.folder), number, activity=f"replaying trial {number} …"
         )
         if photo:
-            self.tab.sensor.show_photo(photo)
-            self.tab.attitude.show_photo(photo)
+            self.tab.display_photo(photo, kind="replay", study=self.process.folder.name, trial=number)
             self.tab.log(f"replayed trial {number}: {photo.result.status}")
 
     def list_reports(self) -> None:
         self.reports.clear()
         with self.reports:
-            folders = finished(self.tab.out)
+            folders = finished(self.tab.out, self.tab.user)
             for folder in folders[:12]:
                 done = time.strftime("%d %b %H:%M", time.localtime((folder / "report.html").stat().st_mtime))
                 with ui.row().classes("w-full no-wrap gap-3"):
@@ -215,6 +258,15 @@ class MonteCarloPanel:
                     link.classes("ellipsis").props["title"] = folder.name
             if not folders:
                 ui.label("none yet").classes("quiet")
+
+
+def stored_study(folder: Path) -> Plan | None:
+    """The plan of a study with a store in the folder; None if there is none."""
+    try:
+        file = next(iter(sorted(folder.glob("*.yaml"))), STUDIES / f"{folder.name}.yaml")
+        return loader.load(file) if (folder / STORE).is_file() else None
+    except (InputError, ValueError, OSError):  # a name with a null byte, or too long
+        return None
 
 
 def report_title(folder: Path) -> str:
@@ -232,7 +284,8 @@ def format_interval(value: float, low: float, high: float) -> str:
 
 def options() -> dict[str, Any]:
     """ECharts options of the histogram of the error angle."""
-    text = {"color": COLORS["quiet"], "fontSize": 10}
+    text = {":color": chart_color("quiet"), "fontSize": 10}
+    rule = {"lineStyle": {":color": chart_color("line")}}
     title = {"text": "no trials yet", "left": "center", "top": "middle"}
     axis = {"axisLabel": text, "nameTextStyle": text}
     x_name = {"name": "error angle, ″", "nameLocation": "middle", "nameGap": 24}
@@ -241,7 +294,7 @@ def options() -> dict[str, Any]:
         "title": title | {"textStyle": text | {"fontWeight": "normal", "fontSize": 11}},
         "grid": {"left": 42, "right": 10, "top": 22, "bottom": 36},
         "xAxis": axis | x_name | {"type": "category", "data": []},
-        "yAxis": axis | {"name": "trials", "type": "value", "splitLine": {"lineStyle": {"color": COLORS["line"]}}},
+        "yAxis": axis | {"name": "trials", "type": "value", "splitLine": rule},
         "tooltip": TOOLTIP,
-        "series": [{"type": "bar", "data": [], "barCategoryGap": "8%", "itemStyle": {"color": COLORS["accent"]}}],
+        "series": [{"type": "bar", "data": [], "barCategoryGap": "8%", "itemStyle": {"color": CURVE_COLORS[0]}}],
     }

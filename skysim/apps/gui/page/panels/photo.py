@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import weakref
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from skysim.apps.gui.worker.photo import SUFFIXES
+from skysim.apps.gui.page.shell.wording import for_page
+from skysim.apps.gui.worker.photo import SUFFIXES, Stages
 
 if TYPE_CHECKING:
     from skysim.apps.gui.page.page import Tab
     from skysim.apps.gui.worker.photo import Photo
 
 LIMIT_BYTES = 64 * 2**20
+
+
+def weak_handler(method: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """A handler that does not keep its panel alive: FastAPI keeps the route of an upload area in a cache for ever."""
+    reference = weakref.WeakMethod(method)
+
+    def handler(event: Any) -> Any:
+        alive = reference()
+        return alive(event) if alive else None
+
+    return handler
 
 
 class PhotoPanel:
@@ -27,8 +40,8 @@ class PhotoPanel:
             label="Drop a FITS, PNG, JPEG, TIFF or BMP here",
             auto_upload=True,
             max_file_size=LIMIT_BYTES,
-            on_upload=self.uploaded,
-            on_rejected=lambda: tab.show_message(f"refused; allowed: {', '.join(SUFFIXES)}, at most 64 MB"),
+            on_upload=weak_handler(self.uploaded),
+            on_rejected=weak_handler(self.rejected),
         )
         self.upload.props(f'flat bordered accept="{",".join(SUFFIXES)}"').classes("w-full").style("margin: 10px 0")
         self.upload.mark("upload")
@@ -39,12 +52,12 @@ class PhotoPanel:
             if not tab.cameras:
                 self.source.set_visibility(False)
                 self.button.set_visibility(False)
-                ui.label("To watch a live camera, start the page with skysim gui --camera 0.").classes("quiet")
-        self.result_text = ui.label(
-            "No image yet. Images are solved lost in space, by the algorithms chosen above; an identifier needs the"
-            " field of view, else quads of stars identify the image."
-        )
+                ui.label("No live camera is offered here. Cameras are named when the lab is started.").classes("quiet")
+        self.result_text = ui.label("No image yet. Images are solved lost in space; uncertain matches are rejected.")
         self.result_text.classes("mono quiet").style("margin-top: 10px; white-space: pre-wrap").mark("facts")
+
+    def rejected(self, _: Any) -> None:
+        self.tab.show_message(f"refused; allowed: {', '.join(SUFFIXES)}, at most 64 MB")
 
     async def uploaded(self, event: Any) -> None:
         data = await event.file.read()
@@ -55,7 +68,15 @@ class PhotoPanel:
             return
         self.tab.stop_playback()
         self.show_text(f"solving {name} …", "quiet")
-        self.show(name, await self.tab.run_task("solve_file", name, data, self.fov.value, activity=f"solving {name} …"))
+        settings = self.fov.value, self.stages
+        self.show(name, await self.tab.run_task("solve_file", name, data, *settings, activity=f"solving {name} …"))
+
+    @property
+    def stages(self) -> Stages:
+        """The algorithms that the user has chosen for stars; a dome's do not solve photographs."""
+        info = self.tab.scene_info
+        chosen = info.stages if info and info.under_stars else {}
+        return tuple((stage, name) for stage, name in chosen.items() if name != "default")
 
     def stop(self) -> None:
         """Stop the live camera after the current frame."""
@@ -70,13 +91,13 @@ class PhotoPanel:
             return
         # The value comes from the browser, which may send any: only what the command line named is opened.
         if self.source.value not in self.tab.cameras:
-            self.tab.show_message("live camera: allowed: one of those given by --camera")
+            self.tab.show_message("live camera: allowed: one of those in the list")
             return
         self.tab.stop_playback()
         self.live, solved_count, source = True, 0, str(self.source.value)
         self.button.set_text("Stop")
         while self.live:
-            photo = await self.tab.run_task("solve_camera", source, self.fov.value)
+            photo = await self.tab.run_task("solve_camera", source, self.fov.value, self.stages)
             if not self.tab.is_open:
                 return
             if photo or not solved_count:  # a camera that ends keeps its last result on the page
@@ -93,26 +114,21 @@ class PhotoPanel:
             message = self.tab.message_text
             self.show_text(message if message.startswith(name) else f"{name}: {message}", "warn")
             return
-        self.tab.sensor.show_photo(photo)
-        self.tab.attitude.show_photo(photo)
-        status_text = f"{name}: {photo.result.status}"
+        self.tab.display_photo(photo, kind="photo", photo=name)
+        stages = "".join(f"; {stage} {algorithm}" for stage, algorithm in self.stages)
+        status_text = f"{name}: {photo.result.status}{stages}"
         if status_text != self.logged:  # log the repeated status of a live camera once
             self.logged = status_text
             self.tab.log(status_text)
         solution = photo.solution
         if not solution:
             hint = photo.hint or "Rejected: the match is not significant."
-            self.show_text(f"{status_text}\n{hint}\n{stages_text(photo.stages)}", "warn")
+            self.show_text(f"{status_text}\n{hint}", "warn")
             return
         pointing = f"RA {solution['ra_deg']:.4f}°  Dec {solution['dec_deg']:+.4f}°  roll {solution['roll_deg']:.3f}°"
         quality = f"field {solution['fov_deg']:.3f}°  {solution['matches']} stars  rms {solution['rms_arcsec']:.1f}″"
-        self.show_text(f"{status_text}\n{pointing}\n{quality}\n{stages_text(photo.stages)}", "good")
+        self.show_text(f"{status_text}\n{pointing}\n{quality}", "good")
 
     def show_text(self, text: str, color: str) -> None:
-        self.result_text.set_text(text)
+        self.result_text.set_text(for_page(text))
         self.result_text.classes(remove="quiet good warn", add=color)
-
-
-def stages_text(stages: Mapping[str, str]) -> str:
-    """The algorithms that solved an image, in one line."""
-    return ", ".join(f"{stage} {name}" for stage, name in stages.items())

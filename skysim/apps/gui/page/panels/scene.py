@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from nicegui import run, ui
 
 from skysim.apps.gui.page import forms
+from skysim.apps.gui.page.shell.wording import for_page
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -110,7 +111,7 @@ class ScenePanel:
         try:
             await run.io_bound(forms.validated_scene, self.tab.scene, overrides)
         except InputError as error:
-            self.show_error(key, str(error).replace(" (--set)", "").removeprefix(f"{key}: "))
+            self.show_error(key, for_page(str(error)).removeprefix(f"{key}: "))
             return
         await self.tab.apply_overrides({key: value})
         if self.tab.overrides.get(key) != value:  # the scene could not be set up with it

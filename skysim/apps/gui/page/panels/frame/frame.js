@@ -221,6 +221,7 @@ export default {
       if (pen && this.cut) {
         const found = profile(this.drawn.pixels, ...this.cut);
         drawProfile(pen, found, [plot.clientWidth, plot.clientHeight], CUT);
+        plot.dataset.cut = this.cut.flat().map((value) => value.toFixed(4)).join(" ");
         plot.dataset.profile = found.values.map((dn) => dn.toFixed(1)).join(" ");
         plot.ariaLabel = `profile of the cut, ${found.values.length} values`;
       } else if (pen) {

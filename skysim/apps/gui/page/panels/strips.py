@@ -1,0 +1,220 @@
+"""Strip charts of a flight: curves against a common time axis, one chart above the other, with a shared cursor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from nicegui import ui
+
+from skysim.apps.gui.messages import FrameRow, MotionLog
+from skysim.apps.gui.page.style import CURVE_COLORS, TOOLTIP, chart_color
+
+BAND_COLOR = "#8b95a5"
+STRIP_PX, HEAD_PX, AXIS_PX = 118, 22, 24  # height of a strip, of its title and legend, of the time axis
+Points = list[list[float]]
+CLICK_JS = """() => {
+  const chart = getElement(%d).chart;
+  if (chart.skysimClicks) return;
+  chart.skysimClicks = true;
+  chart.getZr().on("click", event => {
+    const at = [event.offsetX, event.offsetY];
+    chart.getOption().grid.forEach((_, gridIndex) => {
+      if (!chart.containPixel({ gridIndex }, at)) return;
+      emitEvent("moment", chart.convertFromPixel({ gridIndex }, at)[0]);
+    });
+  });
+}"""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One curve of a strip. kind : line, dots (a value per frame), or band (an area of 3 standard errors)."""
+
+    name: str
+    points: Points
+    kind: str = "line"
+
+
+@dataclass(frozen=True)
+class Strip:
+    """One chart with its unit in the title."""
+
+    title: str
+    curves: tuple[Curve, ...]
+    logarithmic: bool = False
+
+    @property
+    def drawn(self) -> tuple[Curve, ...]:
+        return tuple(curve for curve in self.curves if curve.points)
+
+
+def strips(rows: Sequence[FrameRow], log: MotionLog) -> list[Strip]:
+    """The strips of a flight that have a curve."""
+
+    def of_frames(value: Callable[[FrameRow], float]) -> Points:
+        pairs = ((row.t_s, value(row)) for row in rows)
+        return [[round(t, 4), float(f"{y:.5g}")] for t, y in pairs if not math.isnan(y)]
+
+    def of_motion(name: str) -> Curve:
+        values = log.curves.get(name, ())
+        return Curve(name, [[round(t, 4), float(f"{y:.5g}")] for t, y in zip(log.t_s, values, strict=False)])
+
+    found = [
+        Strip(
+            "cross-boresight error, ″",
+            (
+                Curve("tracker", of_frames(lambda row: max(row.cross_arcsec, 1e-3)), "dots"),
+                Curve("3σ", of_frames(lambda row: 3 * row.cross_sigma_arcsec), "band"),
+            ),
+            logarithmic=True,
+        ),
+        Strip(
+            "roll error, ″",
+            (
+                Curve("tracker", of_frames(lambda row: row.roll_arcsec), "dots"),
+                Curve("−3σ", of_frames(lambda row: -3 * row.roll_sigma_arcsec), "band"),
+                Curve("+3σ", of_frames(lambda row: 3 * row.roll_sigma_arcsec), "band"),
+            ),
+        ),
+        Strip(
+            "attitude error, ″",
+            (
+                *map(of_motion, ("pointing", "IMU alone", "filter")),
+                Curve("innovation", of_frames(lambda row: row.innovation_arcsec), "dots"),
+            ),
+            logarithmic=True,
+        ),
+        Strip(
+            "lights",
+            (
+                Curve("in the field", of_frames(lambda row: row.lights)),
+                Curve("identified", of_frames(lambda row: row.identified)),
+            ),
+        ),
+        Strip("rate, °/s", (of_motion("rate"),)),
+        Strip("momentum, N m s", (of_motion("momentum"),)),
+    ]
+    return [strip for strip in found if strip.drawn]
+
+
+class StripChart:
+    """The chart; a click on a strip emits the page's event `moment` with the time there.
+
+    strips : that are drawn
+    """
+
+    def __init__(self) -> None:
+        self.strips: list[Strip] = []
+        self.chart = ui.echart({"series": []}).classes("w-full").mark("strips")
+        self.chart.on("chart:finished", js_handler=CLICK_JS % self.chart.id)
+        self.chart.set_visibility(False)
+
+    def draw(self, drawn: list[Strip], end_s: float) -> None:
+        """Draw strips up to a time."""
+        self.strips = drawn
+        self.chart.set_visibility(bool(drawn))
+        self.chart.style(f"height: {len(drawn) * STRIP_PX + AXIS_PX}px")
+        self.chart.options.clear()
+        self.chart.options.update(options(drawn, end_s) if drawn else {"series": []})
+        self.chart.update()
+
+    def set_cursor(self, t_s: float) -> None:
+        """Move the line of the shown moment in all strips, without sending their curves again."""
+        cursors = [cursor(n, t_s) for n in range(len(self.strips))]
+        if cursors:
+            self.chart.options["series"][-len(cursors) :] = cursors  # for the next time that all is sent
+            self.chart.run_chart_method("setOption", {"series": cursors})
+
+
+def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
+    """ECharts options of stacked strips; each has a title with its unit and a legend."""
+    text, rule = {":color": chart_color("quiet"), "fontSize": 11}, {"lineStyle": {":color": chart_color("line")}}
+    title_text = {":color": chart_color("text"), "fontWeight": "normal", "fontSize": 12}
+    title = {"padding": 0, "left": 0, "textStyle": title_text}
+    legend = {"textStyle": text, "itemWidth": 14, "itemHeight": 7, "itemGap": 10, "right": 10, "padding": 0}
+    tops = [n * STRIP_PX for n in range(len(drawn))]
+    grid = {"left": 52, "right": 12, "height": STRIP_PX - HEAD_PX - 8}
+    x_axis = {"type": "value", "min": 0, "max": round(end_s, 3), "splitLine": {"show": False}}
+    last = len(drawn) - 1
+    return {
+        "animation": False,
+        "title": [title | {"text": one.title, "top": top + 3} for one, top in zip(drawn, tops, strict=True)],
+        "legend": [
+            legend | {"top": top + 3, "data": [curve.name for curve in one.drawn]}
+            for one, top in zip(drawn, tops, strict=True)
+        ],
+        "tooltip": TOOLTIP,
+        "axisPointer": {"link": [{"xAxisIndex": "all"}], "lineStyle": {":color": chart_color("text")}},
+        "dataZoom": [
+            {"type": "inside", "xAxisIndex": "all", "zoomOnMouseWheel": "ctrl", "moveOnMouseMove": "shift"}
+            | {"moveOnMouseWheel": False, "filterMode": "none"}
+        ],
+        "grid": [grid | {"top": top + HEAD_PX} for top in tops],
+        "xAxis": [
+            x_axis
+            | {"gridIndex": n, "axisLabel": text | {"show": n == last, "formatter": "{value} s"}, "axisTick": rule}
+            for n in range(len(drawn))
+        ],
+        "yAxis": [y_axis(one, n) | {"axisLabel": text, "splitLine": rule} for n, one in enumerate(drawn)],
+        "series": [
+            *(series(curve, n, k) for n, one in enumerate(drawn) for k, curve in enumerate(one.drawn)),
+            *(cursor(n, 0.0) for n in range(len(drawn))),
+        ],
+    }
+
+
+def y_axis(strip: Strip, n: int) -> dict[str, Any]:
+    axis = {"gridIndex": n, "splitNumber": 3, "type": "log" if strip.logarithmic else "value"}
+    return axis | (decades([y for curve in strip.drawn for _, y in curve.points]) if strip.logarithmic else {})
+
+
+def decades(values: list[float]) -> dict[str, float]:
+    """Axis limits: whole decades that contain the values, the uppermost four at most."""
+    positive = [value for value in values if value > 0] or [1.0]
+    low, high = math.floor(math.log10(min(positive))), math.ceil(math.log10(max(positive)))
+    return {"min": 10.0 ** max(low, high - 4), "max": 10.0 ** max(high, low + 1)}
+
+
+def series(curve: Curve, n: int, k: int) -> dict[str, Any]:
+    """ECharts series of a curve in strip n. A band's area reaches to the axis, so that two make one around zero."""
+    color = CURVE_COLORS[k % len(CURVE_COLORS)]
+    look: dict[str, Any] = {"itemStyle": {"color": color}, "symbolSize": 5, "showSymbol": curve.kind == "dots"}
+    if curve.kind == "band":
+        color = BAND_COLOR
+        look = {"areaStyle": {"color": color, "opacity": 0.22}, "showSymbol": False, "itemStyle": {"color": color}}
+    line = {"lineStyle": {"width": 0.8 if curve.kind == "band" else 1.5, "color": color}}
+    kind = "scatter" if curve.kind == "dots" else "line"
+    return {"name": curve.name, "type": kind, "data": curve.points, "animation": False} | look | line | in_strip(n)
+
+
+def cursor(n: int, t_s: float) -> dict[str, Any]:
+    """ECharts series of a vertical line in a strip at a time."""
+    style = {"color": CURVE_COLORS[0], "width": 1.5, "type": "solid"}
+    mark = {"silent": True, "symbol": "none", "animation": False, "label": {"show": False}, "lineStyle": style}
+    line = {"id": f"cursor{n}", "type": "line", "data": [], "animation": False}
+    return line | {"markLine": mark | {"data": [{"xAxis": t_s}]}} | in_strip(n)
+
+
+def in_strip(n: int) -> dict[str, int]:
+    return {"xAxisIndex": n, "yAxisIndex": n}
+
+
+def rms_line(rows: Sequence[FrameRow]) -> str:
+    """Root mean squares over the flight's solved frames, and how many were solved."""
+    solved = [row for row in rows if not math.isnan(row.cross_arcsec)]
+    if not solved:
+        return f"{len(rows)} frames, none solved" if rows else ""
+    cross, roll = (
+        math.sqrt(sum(value**2 for value in values) / len(solved))
+        for values in ([row.cross_arcsec for row in solved], [row.roll_arcsec for row in solved])
+    )
+    return f"{len(solved)} of {len(rows)} frames solved; rms: cross {cross:.3g}″, roll {roll:.3g}″"
+
+
+def csv(rows: Sequence[FrameRow]) -> bytes:
+    """The frames' numbers as a table; an empty cell is an unknown value."""
+    lines = (",".join("" if value != value else f"{value:.9g}" for value in row) for row in rows)
+    return ("\n".join([",".join(FrameRow._fields), *lines]) + "\n").encode()

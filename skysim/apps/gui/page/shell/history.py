@@ -1,0 +1,106 @@
+"""The page's view in the browser: in the address, in its history and in its storage.
+
+The browser's history is the list of undone and redone views: Ctrl-Z goes back, Ctrl-Shift-Z forward. So a reload, the
+back button and a shared link read a view from the address in the same way as undo does.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+from nicegui import ui
+
+if TYPE_CHECKING:
+    from skysim.apps.gui.page.page import Tab
+    from skysim.apps.gui.state import View
+
+SETTLED = 3  # times of the timer without a change after which the next one is a new step
+WRITE_S = 0.4  # browsers refuse more than about 200 entries in 30 s
+JS = """
+window.skysimHistory = {
+  index: () => (history.state && history.state.skysim) || 0,
+  write(query, push, home) {
+    const at = this.index() + (push ? 1 : 0);
+    history[push ? "pushState" : "replaceState"]({ skysim: at }, "", query);
+    try { localStorage.setItem("skysim.view", JSON.stringify({ home, query })); } catch { /* storage is off */ }
+  },
+  read(home) {
+    if (/[?&]scene=/.test(location.search)) return location.search;
+    try {
+      const kept = JSON.parse(localStorage.getItem("skysim.view") || "{}");
+      return kept.home === home ? kept.query : "";
+    } catch { return ""; }
+  },
+  undo() { if (this.index() > 0) history.back(); },
+  redo() { history.forward(); },
+};
+window.addEventListener("popstate", () => emitEvent("view", location.search));
+document.addEventListener("keydown", event => {
+  const typing = event.target.closest && event.target.closest("input, textarea, [contenteditable]");
+  if (typing || !(event.ctrlKey || event.metaKey)) return;
+  const key = event.key.toLowerCase(), redo = key === "y" || (key === "z" && event.shiftKey);
+  if (key !== "z" && key !== "y") return;
+  event.preventDefault();
+  skysimHistory[redo ? "redo" : "undo"]();
+}, true);
+"""
+
+
+class History:
+    """Writes a tab's view to the browser, and shows the view of an address.
+
+    home : the server's scene; a stored view is that of a server for the same one
+    written : the view in the address;  pending : the newest query that is asked for while another is being shown
+    unchanged : times of the timer since the last change
+    """
+
+    def __init__(self, tab: Tab, home: str) -> None:
+        self.tab, self.home = tab, home
+        self.written: View | None = None
+        self.showing, self.unchanged = False, 0
+        self.pending: str | None = None
+        ui.add_body_html(f"<script>{JS}</script>")
+        ui.on("view", self.asked)
+        ui.timer(WRITE_S, self.write)
+
+    async def read(self) -> str:
+        """The query of the page's address, or else of the stored view."""
+        return str(await ui.run_javascript(f"skysimHistory.read({json.dumps(self.home)})", timeout=10) or "")
+
+    def write(self) -> None:
+        """Timer: write a changed view; continuous changes replace the address, others add a step."""
+        view = self.tab.state
+        waits = self.showing or self.tab.view is None or self.tab.run_panel.wanted_s is not None
+        if view is self.written or waits:
+            self.unchanged += 1
+            return
+        before, self.written = self.written, view
+        push = before is not None and before != view and (self.unchanged >= SETTLED or not view.same_step(before))
+        self.unchanged = 0
+        arguments = ", ".join(json.dumps(value) for value in (view.query(), push, self.home))
+        ui.run_javascript(f"skysimHistory.write({arguments})")
+
+    def undo(self) -> None:
+        ui.run_javascript("skysimHistory.undo()")
+
+    def redo(self) -> None:
+        ui.run_javascript("skysimHistory.redo()")
+
+    def adopt(self) -> None:
+        """The address names the page's view already."""
+        self.written = self.tab.state
+
+    async def asked(self, event: Any) -> None:
+        """The browser has gone to another address of this page: show its view; of several, the newest."""
+        self.pending = str(event.args)
+        if self.showing:
+            return
+        self.showing = True
+        try:
+            while self.pending is not None:
+                query, self.pending = self.pending, None
+                await self.tab.show_query(query)
+                self.adopt()
+        finally:
+            self.showing = False

@@ -1,0 +1,159 @@
+"""What surrounds the lab's panels: the list of actions, theme, splitter, narrow windows, wording."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from labpage import CHROMIUM, NARROW, Server, changed, come, onto_the_page, opened, panel, pictured, source
+
+pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
+
+from skysim.apps.gui.page.shell.palette import Command, matching
+from skysim.apps.gui.page.shell.wording import for_page
+from skysim.apps.gui.worker.study_process import MAX_STUDIES, StudyProcess
+from skysim.apps.gui.worker.workbench import Workbench
+from skysim.core.errors import InputError
+
+pytest_plugins = ["labpage"]
+in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+
+
+@pytest.mark.parametrize(
+    ("told", "shown"),
+    [
+        ("camera.f_number: allowed: above 0 (--set)", "camera.f_number: allowed: above 0"),
+        ("out: contains another study; allowed: another --out", "out: contains another study; allowed: a study of "),
+        ("--fov 200: allowed: 2 to 120", "the field of view 200: allowed: 2 to 120"),
+        ("the camera's 12 bits, as --camera has them", "the camera's 12 bits, as camera has them"),
+    ],
+)
+def test_a_message_names_no_option_of_the_command_line(told: str, shown: str) -> None:
+    assert for_page(told).startswith(shown)
+    assert "--" not in for_page(told)
+
+
+def test_actions_are_found_by_their_words_in_any_order() -> None:
+    commands = [Command("show the log", "F10", lambda: None), Command("show the next frame", ".", lambda: None)]
+    assert matching(commands, "FRAME show") == commands[1:]
+    assert matching(commands, "") == commands
+    assert matching(commands, "none") == []
+
+
+def test_a_study_beyond_the_number_allowed_is_refused(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    running = {StudyProcess(tmp_path) for _ in range(MAX_STUDIES)}
+    monkeypatch.setattr(StudyProcess, "begun", running)
+    StudyProcess.check_count()  # none of them runs
+    monkeypatch.setattr(StudyProcess, "begun", running)
+    monkeypatch.setattr(StudyProcess, "running", property(lambda _: True))
+    with pytest.raises(InputError, match=f"{MAX_STUDIES} of {MAX_STUDIES} studies are running"):
+        StudyProcess.check_count()
+
+
+@pytest.mark.slow
+def test_the_time_of_a_first_frame_is_not_that_of_compiling() -> None:
+    """Also of a tracker that was chosen later: its first frame takes about as long as its second."""
+    bench = Workbench.open("shefex2", {})
+    for overrides in ({}, {"tracker.identifier": "pyramid"}):
+        bench = Workbench.open("shefex2", overrides, bench)
+        first, second = (bench.render_at_rest(solve=True).result for _ in range(2))
+        assert first is not None
+        assert second is not None
+        assert first.ms < 10 * second.ms + 50
+
+
+# In the browser.
+
+
+@pytest.fixture(scope="module")
+def tab_of_own(browser: Any, server: Server) -> Any:
+    with opened(browser, server.login, NARROW) as found:
+        yield found
+
+
+@pytest.mark.browser
+@in_browser
+def test_every_action_is_found_by_ctrl_k(tab_of_own: Any) -> None:
+    page = tab_of_own
+    page.keyboard.press("Control+k")
+    field = page.get_by_label("Action")
+    field.wait_for()
+    listed = page.get_by_role("dialog").inner_text()
+    for name in ("F5", "F10", "Ctrl Z", "panel: Monte Carlo", "export: truth", "light theme"):
+        assert name in listed
+    pictured(page, "palette")
+    field.fill("log session")
+    page.get_by_role("option").filter(has_text="F10").wait_for()
+    assert come(lambda: page.get_by_role("option").count() == 1)
+    field.press("Enter")
+    page.locator(".lab-log").wait_for()
+    page.get_by_role("dialog").wait_for(state="detached")
+    frame = source(page)
+    page.keyboard.press("ArrowRight")  # the camera's again
+    changed(page, frame)
+
+
+@pytest.mark.browser
+@in_browser
+def test_the_theme_and_the_splitter_are_remembered(tab_of_own: Any) -> None:
+    page = tab_of_own
+
+    def ground() -> str:
+        return str(page.evaluate("getComputedStyle(document.body).backgroundColor"))
+
+    def wide() -> float:
+        return float(page.locator(".lab-side").bounding_box()["width"])
+
+    def toggle() -> None:
+        page.keyboard.press("Control+k")
+        page.get_by_label("Action").fill("theme")
+        page.get_by_role("option").first.click()
+        page.get_by_role("dialog").wait_for(state="detached")
+
+    dark, before = ground(), wide()
+    toggle()
+    assert come(lambda: ground() != dark)
+    light = ground()
+    page.mouse.move(1280 - before, 400)
+    page.mouse.down()
+    page.mouse.move(1280 - before - 80, 400, steps=4)
+    page.mouse.up()
+    assert come(lambda: abs(wide() - before - 80) < 8)
+    page.get_by_role("separator", name="Width of the panels").focus()
+    frame, dragged = source(page), wide()
+    page.keyboard.press("ArrowRight")
+    assert come(lambda: abs(wide() - dragged + 24) < 1)
+    assert source(page) == frame
+    kept = wide()
+    page.reload()
+    page.locator(".lab-frame canvas[data-frame]").wait_for()
+    assert come(lambda: ground() == light)
+    assert wide() == kept
+    pictured(page, "light")
+    toggle()
+    assert come(lambda: ground() == dark)
+
+
+@pytest.mark.browser
+@in_browser
+@pytest.mark.parametrize("width", [900, 420])
+def test_a_narrow_window_cuts_no_control(tab_of_own: Any, width: int) -> None:
+    page = tab_of_own
+    kinds = "button, input, .q-checkbox, .q-slider, canvas"
+    cut = f"""() => [...document.querySelector(".lab").querySelectorAll("{kinds}")]
+      .filter(one => one.checkVisibility() && one.getBoundingClientRect().width > 2)
+      .map(one => [one.ariaLabel || one.innerText || one.className, one.getBoundingClientRect()])
+      .filter(([_, box]) => box.left < 0 || box.right > innerWidth + 1).map(([name]) => name)"""
+    panel(page, "Log")
+    page.set_viewport_size({"width": width, "height": 800})
+    for name in ("Lab", "Run", "Monte Carlo"):
+        panel(page, name)
+        page.wait_for_timeout(500)
+        assert page.evaluate(cut) == []
+        if name == "Lab":  # hidden while the window changed
+            space = page.locator(".lab-space canvas").first
+            assert come(lambda: space.bounding_box()["width"] > 0.8 * width)  # noqa: B023
+        assert page.locator(".lab-frame canvas").bounding_box()["width"] > 0.5 * width
+        pictured(page, f"narrow_{width}_{name.replace(' ', '_')}")
+    page.set_viewport_size(NARROW)
+    onto_the_page(page)
