@@ -22,6 +22,7 @@ from skysim.apps.gui.page import forms, keys, style
 from skysim.apps.gui.page.panels.attitude import AttitudeCard
 from skysim.apps.gui.page.panels.monte_carlo import MonteCarloPanel
 from skysim.apps.gui.page.panels.photo import PhotoPanel
+from skysim.apps.gui.page.panels.plan import PlanPanel
 from skysim.apps.gui.page.panels.run import RunPanel
 from skysim.apps.gui.page.panels.scene import ScenePanel
 from skysim.apps.gui.page.panels.sensor import FRAMES, Sensor
@@ -31,14 +32,15 @@ from skysim.apps.gui.page.shell.history import History
 from skysim.apps.gui.page.shell.palette import Command, Palette
 from skysim.apps.gui.page.shell.wording import for_page
 from skysim.apps.gui.state import View
-from skysim.apps.gui.worker import export, pointing
+from skysim.apps.gui.worker import export
 from skysim.apps.gui.worker.photo import Photo
+from skysim.apps.gui.worker.scene import pointing
 from skysim.apps.gui.worker.session import MAX_WORKERS, Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.scene.loader import find, load
 
-PANELS = ("Lab", "Scene", "Run", "Monte Carlo", "Image", "Log")
+PANELS = ("Lab", "Scene", "Plan", "Run", "Monte Carlo", "Image", "Log")
 MAX_LOG_LINES = 500
 
 
@@ -168,6 +170,8 @@ class Tab:
                     ui.label("drag: rotate · right drag: pan · wheel: zoom").classes("lab-turn quiet")
                 with ui.tab_panel("Scene"):
                     self.scene_panel = ScenePanel(self)
+                with ui.tab_panel("Plan"):
+                    self.plan_panel = PlanPanel(self)
                 with ui.tab_panel("Run").classes("lab-run"):
                     self.run_panel = RunPanel(self)
                 with ui.tab_panel("Monte Carlo"):
@@ -288,6 +292,7 @@ class Tab:
         self.scene_3d.set_scene(self.scene_info)
         self.sensor.clear_zoom()
         self.run_panel.set_scene()
+        self.plan_panel.clear()
         self.study_panel.set_scene()
         self.display_live(view)
         await self.scene_panel.set_scene()

@@ -6,15 +6,17 @@ from typing import Any
 
 import numpy as np
 from nicegui import ui
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo, Triple
-from skysim.apps.gui.page.style import DARK
+from skysim.apps.gui.page.style import DARK, color_scale
 from skysim.core.types import Floats
 
 BRIGHTNESS_CLASSES = 3  # each with its own point size
 POINT_M = (0.008, 0.013, 0.02)
 DIM_RGB, HIGHLIGHT_RGB = (0.75, 0.72, 0.62), (1.0, 0.85, 0.25)
+SRGB_GAMMA = 2.2  # the colors of points are linear
 DOME_RGB = (0.25, 0.30, 0.38)
 # Without a GPU the browser draws on the CPU cores that also render frames: draw rarely then, except under the mouse.
 FPS, FPS_SLOW, UPDATE_S, UPDATE_SLOW_S = 30, 2, 0.1, 0.5
@@ -36,6 +38,7 @@ class Scene3D:
         self.scene.on("pointerleave", lambda: self.scene.props(f"fps={self.fps}"), args=[])
         self.vehicle: Any = None
         self.highlighted: Any = None
+        self.colored: Any = None
         self.geometry: LabGeometry | None = None
         self.newest_view: FrameView | None = None
         self.timer = ui.timer(UPDATE_SLOW_S, self.update)
@@ -52,6 +55,7 @@ class Scene3D:
         with self.scene:
             self.draw_points(geometry.dome_m, DOME_RGB, POINT_M[0] / 2)
             self.draw_lights(geometry)
+            self.colored = self.scene.point_cloud([], [], 1.3 * POINT_M[-1])
             self.highlighted = self.scene.point_cloud([], [], 1.6 * POINT_M[-1])
             with self.scene.group() as self.vehicle:
                 self.draw_vehicle(geometry)
@@ -65,6 +69,15 @@ class Scene3D:
         for n in range(BRIGHTNESS_CLASSES):
             if (kind == n).any():
                 self.draw_points(geometry.lights_m[kind == n], DIM_RGB, POINT_M[n])
+
+    def color_lights(self, ids: NDArray[np.int64], values: Floats) -> None:
+        """Color some lights by values from 0 to 1, until the scene changes."""
+        assert self.geometry is not None
+        known = np.isin(ids, self.geometry.ids)
+        order = np.argsort(self.geometry.ids)
+        rows = order[np.searchsorted(self.geometry.ids, ids[known], sorter=order)]
+        linear_rgb = color_scale(values[known]) ** SRGB_GAMMA
+        self.colored.set_points(self.geometry.lights_m[rows].tolist(), linear_rgb.tolist())
 
     def draw_points(self, points_m: Floats, rgb: Triple, size_m: float) -> None:
         self.scene.point_cloud(points_m.tolist(), [list(rgb)] * len(points_m), size_m)
