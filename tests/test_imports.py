@@ -79,7 +79,6 @@ def test_no_folder_holds_more_than_a_reader_takes_in(package: str) -> None:
 MOST = {
     **{
         "skysim": 10,
-        "skysim/apps/gui/worker": 10,
         "skysim/dynamics": 10,
         "skysim/dynamics/profiles": 10,
         "skysim/simulation/checks": 10,
