@@ -23,7 +23,8 @@ from typing import Any
 
 import numpy as np
 
-SCENE = """base: shefex2
+SCENE = """schema: 1
+base: shefex2
 title: SHEFEX-2 with a square megapixel
 camera: {width_px: 1024, height_px: 1024}
 """
@@ -53,9 +54,10 @@ def served(name: str) -> Iterator[str]:
 
 def reached(url: str) -> str:
     """Wait until a server responds at the address, and return it. Raises TimeoutError."""
+    opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())  # the token is passed on as a cookie
     for _ in range(600):
         try:
-            urllib.request.urlopen(url, timeout=2).read()
+            opener.open(url, timeout=2).read()
             return url
         except OSError:
             time.sleep(0.1)

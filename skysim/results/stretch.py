@@ -34,18 +34,15 @@ def display_levels(image: NDArray) -> tuple[float, float]:
     return float(low), max(float(high), float(low + 0.25 * (image.max() - low)))
 
 
-def to_8bit(
-    image: NDArray, curve: str, gain: float = 1.0, levels_dn: tuple[float, float] | None = None
-) -> NDArray[np.uint8]:
+def to_8bit(image: NDArray, curve: str, levels_dn: tuple[float, float] | None = None) -> NDArray[np.uint8]:
     """(H, W) uint8 image, stretched from the black level to the white level by one of CURVES.
 
-    gain      : the white level is lowered by this factor so that faint sources appear brighter
     levels_dn : black and white levels, for example of another frame; by default those of `display_levels`
 
     A uint16 frame is mapped through a lookup table, which is faster than evaluating the curve at each pixel.
     """
     low, high = levels_dn or display_levels(image)
-    top = low + max((high - low) / gain, 1.0)  # at least 1 DN, to avoid division by zero in a flat frame
+    top = low + max(high - low, 1.0)  # at least 1 DN, to avoid division by zero in a flat frame
     if image.dtype != np.uint16:
         return (255 * CURVES[curve](np.clip((image - low) / (top - low), 0, 1))).astype(np.uint8)
     levels = np.arange(int(image.max()) + 1)

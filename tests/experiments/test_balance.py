@@ -28,13 +28,14 @@ UNCERTAINTY = assumptions.parse_uncertainty("10%", "500 um", "0.1%", "0.03 deg",
 BALANCE = Plan("wheels", 8.0, 5e-5, 4, True)
 
 
-def noisy_truth(testbed: Testbed, watch: object) -> list[tuple[float, Rotation, Floats]]:
-    """The attitudes of a tracker of 10 arcsec, in place of rendered and solved frames: two a second."""
+def noisy_truth(testbed: Testbed, watch: object) -> list[tuple[float, Rotation, Floats, Floats]]:
+    """The attitudes of a tracker of 10 arcsec, in place of rendered and solved frames: two a second, none shared."""
     log, rng = testbed.log, random_stream(testbed.scene.seed, 999)
     every = round(0.5 / log.period_s)
     turned = Rotation.from_rotvec(SIGMA_RAD * rng.standard_normal((len(log.t_s[::every]), 3)))
     attitudes = log.lab_from_body[::every] * turned
-    return [(float(t), one, SIGMA_RAD**2 * np.eye(3)) for t, one in zip(log.t_s[::every], attitudes, strict=True)]
+    noise, shared = SIGMA_RAD**2 * np.eye(3), np.zeros((3, 3))
+    return [(float(t), one, noise, shared) for t, one in zip(log.t_s[::every], attitudes, strict=True)]
 
 
 def scene_of(name: str, **overrides: str) -> Scene:

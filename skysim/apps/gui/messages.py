@@ -67,15 +67,42 @@ class TrackerResult:
 
 
 @dataclass(frozen=True, slots=True)
+class Lens:
+    """Where a camera's pixels point, in camera axes: tangents x / z and y / z at n x n points, row by row from the
+    frame's upper left corner to its lower right one. The browser interpolates between them."""
+
+    n: int
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Attitude of a frame's camera: reference_from_cam by rows, the reference being ICRS or the lab.
+
+    place_m, depth_m : under a dome the camera's place, lab frame, and for each point of the lens's tables the depth
+        along the boresight at which its ray meets the surface; None if it does not
+    """
+
+    rotation: tuple[float, ...]
+    place_m: tuple[float, ...] = ()
+    depth_m: tuple[float | None, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class FrameView:
     """One rendered frame: image, true attitude, true lights, and the tracker's solution if the frame was solved.
 
+    pixels : see `worker.pixels.encoded`;  pose : where they point, with the scene's lens
+    saturation_dn : from which a pixel is saturated
     body_wxyz : lab_from_body;  t_s : time in the motion that is played, else 0
     filter_arcsec : error of the filter during the motion
     innovation_arcsec : angle between the star tracker's attitude and the filter's
     """
 
-    jpeg: bytes
+    pixels: bytes
+    pose: Pose
+    saturation_dn: float
     size_px: tuple[int, int]
     angles_deg: Triple
     body_wxyz: tuple[float, ...]
@@ -87,15 +114,6 @@ class FrameView:
     t_s: float = 0.0
     filter_arcsec: float = NAN
     innovation_arcsec: float = NAN
-
-
-@dataclass(frozen=True, slots=True)
-class PixelWindow:
-    """A small window of pixels: x, y of its first pixel and the digital numbers row by row."""
-
-    x: int
-    y: int
-    dn: tuple[tuple[int, ...], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +135,7 @@ class SceneInfo:
     choices: dict[str, tuple[str, ...]]
     duration_s: float
     geometry: LabGeometry
+    lens: Lens
 
 
 @dataclass(frozen=True, slots=True)

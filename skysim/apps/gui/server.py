@@ -165,7 +165,7 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str]) -> None:
         data = FRAMES.get(tab, {}).get(number)
         if data is None:
             return Response(status_code=404)
-        return Response(data, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
+        return Response(data, media_type="application/octet-stream", headers={"Cache-Control": "no-store"})
 
     @app.get("/report/{name}")
     def report(name: str, request: Request) -> Response:

@@ -114,6 +114,7 @@ def tab(browser: Any, server: Server) -> Iterator[Any]:
 def page(tab: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
     """The tab, with its first panel before it; a picture of how the test left it."""
     tab.get_by_role("tab", name="Lab").click()
+    tab.get_by_role("button", name="fit", exact=True).click()
     yield tab
     pictured(tab, request.node.name)
 
@@ -222,10 +223,17 @@ def brightness(page: Any) -> float:
     return float(cv2.imdecode(np.frombuffer(told, np.uint8), cv2.IMREAD_GRAYSCALE).mean())
 
 
-def screen(page: Any, size_px: tuple[int, int], x: float, y: float) -> tuple[float, float]:
+def screen(page: Any, x: float, y: float) -> tuple[float, float]:
     """Where a pixel of a frame is on the screen."""
     box = page.locator(".lab-frame canvas").bounding_box()
-    return box["x"] + (x + 0.5) * box["width"] / size_px[0], box["y"] + (y + 0.5) * box["height"] / size_px[1]
+    left, top, scale = map(float, page.locator(".lab-frame canvas").get_attribute("data-placement").split())
+    return box["x"] + left + (x + 0.5) * scale, box["y"] + top + (y + 0.5) * scale
+
+
+def frame_pixel(page: Any, x: float, y: float) -> tuple[float, float]:
+    """Which pixel of a frame is at a place on the screen."""
+    (left, top), (right, below) = screen(page, 0, 0), screen(page, 1, 1)
+    return (x - left) / (right - left), (y - top) / (below - top)
 
 
 def picture(page: Any, **how: Any) -> np.ndarray:
@@ -234,11 +242,11 @@ def picture(page: Any, **how: Any) -> np.ndarray:
 
 
 def pixels(page: Any) -> list[tuple[int, int, int]]:
-    """(x, y, DN) of the pixels that are enlarged, once they are the shown frame's."""
-    told = page.locator(".lab-under .quiet:not(.stale) svg title")
-    told.first.wait_for(state="attached")
-    numbers = (re.findall(r"\d+", text) for text in told.all_text_contents())
-    return [(int(x), int(y), int(dn)) for x, y, dn in numbers]
+    """(x, y, DN) of the pixels that are enlarged."""
+    told = page.locator(".lab-loupe[aria-label^=pixels]").get_attribute("aria-label")
+    x, y, across, down, *values = map(int, re.findall(r"\d+", told))
+    assert len(values) == across * down
+    return [(x + n % across, y + n // across, dn) for n, dn in enumerate(values)]
 
 
 def differs(page: Any, before: np.ndarray, box: tuple[int, int, int, int]) -> bool:

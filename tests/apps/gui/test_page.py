@@ -12,8 +12,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from astropy.coordinates import Angle
 from astropy.io import fits
 from astropy.table import Table
+from astropy.visualization import ZScaleInterval
+from astropy.wcs import WCS
 from labpage import (
     CHROMIUM,
     NARROW,
@@ -27,6 +30,7 @@ from labpage import (
     come,
     differs,
     exported,
+    frame_pixel,
     onto_the_page,
     opened,
     panel,
@@ -38,6 +42,7 @@ from labpage import (
     source,
     status,
 )
+from scipy.interpolate import RegularGridInterpolator
 
 from skysim.core.paths import ROOT
 from skysim.scene import loader
@@ -151,40 +156,162 @@ def test_the_mouse_tells_of_a_star_and_a_click_enlarges_it(page: Any, tmp_path: 
     spots = json.loads(exported(page, "solution", tmp_path).read_text())["spots"]
     frame = fits.getdata(exported(page, "frame, FITS", tmp_path))
     spot = max((one for one in spots if one["id"] >= 0), key=lambda one: one["flux"])
-    page.mouse.click(*screen(page, frame.shape[::-1], spot["x"], spot["y"]))
+    page.mouse.click(*screen(page, spot["x"], spot["y"]))
     enlarged = pixels(page)
     assert [dn for *_, dn in enlarged] == [int(frame[y, x]) for x, y, _ in enlarged]
     assert len(enlarged) == 7 * 11
     assert (round(spot["x"]), round(spot["y"])) == enlarged[3 * 11 + 5][:2]
-    shown = page.locator(".lab-under svg text").all_text_contents()
-    assert shown == [str(dn) for *_, dn in enlarged]
+    page.locator(".lab-under .mono", has_text="residual").wait_for()
     told = page.locator(".lab-under .mono").inner_text()
     assert float(re.search(r"residual ([\d.]+) px", told)[1]) == pytest.approx(spot["residual_px"], abs=6e-4)
     assert re.search(rf"centroid +{spot['x']:.2f} +{spot['y']:.2f} ", told)
     assert float(re.search(r"V (-?[\d.]+)", told)[1]) < 5
 
 
-def test_stretch_and_brightness_make_faint_light_brighter_and_arrows_stay_the_slider_s(page: Any) -> None:
-    dark, before = brightness(page), angles(page)
-    frame = source(page)
-    page.get_by_label("Brightness").locator("[tabindex]").focus()
-    page.keyboard.press("ArrowRight")
-    changed(page, frame)
-    brighter = brightness(page)
-    assert brighter > 1.05 * dark
+def limits(page: Any) -> list[float]:
+    """The display's black and white levels, DN."""
+    return [float(level) for level in page.locator(".lab-plot").get_attribute("data-limits").split()]
+
+
+def test_limits_are_zscale_s_or_dragged_and_curves_brighten_what_is_faint(page: Any, tmp_path: Path) -> None:
+    frame = fits.getdata(exported(page, "frame, FITS", tmp_path))
+    dark, automatic = brightness(page), limits(page)
+    chosen(page, "Limits", "zscale")
+    wanted = ZScaleInterval().get_limits(frame)
+    assert come(lambda: np.allclose(limits(page), wanted, rtol=1e-6, atol=0))
+    chosen(page, "Limits", "min to max")
+    assert come(lambda: limits(page) == [frame.min(), frame.max()])
+    chosen(page, "Limits", "automatic")
     chosen(page, "Stretch", "logarithm")
-    assert come(lambda: brightness(page) > 1.05 * brighter)
+    assert come(lambda: brightness(page) > 1.05 * dark)
     chosen(page, "Stretch", "square root")
-    page.get_by_label("Brightness").locator("[tabindex]").focus()
-    page.keyboard.press("ArrowLeft")
-    assert come(lambda: abs(brightness(page) - dark) < 0.02 * dark)
-    np.testing.assert_array_equal(angles(page), before)
+    box = page.locator(".lab-plot").bounding_box()
+    page.mouse.move(box["x"] + box["width"] - 2, box["y"] + 80)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 80)
+    page.mouse.up()
+    assert limits(page)[1] != automatic[1]
+    assert limits(page)[0] == automatic[0]
+    assert page.get_by_role("combobox", name="Limits").input_value() == "manual"
+    chosen(page, "Limits", "automatic")
+    assert come(lambda: limits(page) == automatic)
+
+
+def test_the_wheel_zooms_about_the_cursor_a_drag_pans_and_fit_shows_the_whole_frame(page: Any) -> None:
+    canvas = page.locator(".lab-frame canvas")
+    whole, at = canvas.get_attribute("data-placement"), np.round(screen(page, 200, 300))  # a mouse counts whole pixels
+    spot = frame_pixel(page, *at)
+    page.mouse.move(*at)
+    page.mouse.wheel(0, -500)
+    assert come(lambda: canvas.get_attribute("data-placement") != whole)
+    assert float(canvas.get_attribute("data-placement").split()[2]) > 2 * float(whole.split()[2])
+    np.testing.assert_allclose(screen(page, *spot), at, rtol=0, atol=0.01)
+    page.mouse.down()
+    page.mouse.move(at[0] + 40, at[1] - 25)
+    page.mouse.up()
+    np.testing.assert_allclose(screen(page, *spot), (at[0] + 40, at[1] - 25), rtol=0, atol=0.01)
+    page.get_by_role("button", name="fit", exact=True).click()
+    assert canvas.get_attribute("data-placement") == whole
+
+
+def test_the_readout_has_the_pixel_s_value_and_where_it_points(page: Any, tmp_path: Path) -> None:
+    """Right ascension and declination as the exported frame's WCS, by astropy."""
+    path = exported(page, "frame, FITS", tmp_path)
+    frame, sky = fits.getdata(path), WCS(fits.getheader(path))
+    for x, y in ((100, 80), (500, 400)):
+        page.mouse.move(*screen(page, x, y))
+        told = page.locator(".lab-readout .mono").inner_text()
+        place = [float(value) for value in re.match(r"x ([\d.]+) +y ([\d.]+)", told).groups()]
+        assert int(re.search(r"(\d+) DN", told)[1]) == frame[y, x]
+        ra_deg, dec_deg = sky.pixel_to_world_values(*place)
+        assert float(re.search(r"RA ([\d.]+)°", told)[1]) == pytest.approx(float(ra_deg), abs=6e-3)  # a place's 0.05 px
+        shown_dec = float(re.search(r"Dec ([+−][\d.]+)°", told)[1].replace("−", "-"))
+        assert shown_dec == pytest.approx(float(dec_deg), abs=6e-3)
+        hours = Angle(re.search(r"\d+h\d+m[\d.]+s", told)[0]).degree
+        assert hours == pytest.approx(float(ra_deg), abs=6e-3)
+
+
+def test_a_cut_shows_its_profile(page: Any, tmp_path: Path) -> None:
+    frame = fits.getdata(exported(page, "frame, FITS", tmp_path))
+    plot = page.locator(".lab-plot")
+    page.mouse.move(*screen(page, 100, 200))
+    page.keyboard.down("Shift")
+    page.mouse.down()
+    page.mouse.move(*screen(page, 160, 200), steps=4)
+    page.mouse.up()
+    page.keyboard.up("Shift")
+    values, ends = (np.array(plot.get_attribute(f"data-{name}").split(), float) for name in ("profile", "cut"))
+    np.testing.assert_allclose(ends, [100, 200, 160, 200], rtol=0, atol=2)  # to a pixel of the screen
+    x, y = np.linspace(ends[:2], ends[2:], len(values)).T
+    expected = RegularGridInterpolator(tuple(map(np.arange, frame.shape)), frame)((y, x))
+    np.testing.assert_allclose(values, expected, rtol=0, atol=0.06)
+    page.keyboard.down("Shift")
+    page.mouse.click(*screen(page, 300, 100))
+    page.keyboard.up("Shift")
+    assert "histogram" in plot.get_attribute("aria-label")
+
+
+def test_colors_and_the_grid_are_drawn(page: Any) -> None:
+    def share(color: str) -> float:
+        return page.evaluate(
+            """color => { const canvas = document.querySelector('.lab-frame canvas');
+      const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+      const is = { red: (r, g, b) => r > g + 15 && b > g, gray: (r, g, b) => r === g && g === b }[color];
+      let count = 0;
+      for (let n = 0; n < data.length; n += 4) count += is(data[n], data[n + 1], data[n + 2]);
+      return count * 4 / data.length; }""",
+            color,
+        )
+
+    assert share("gray") > 0.9
+    chosen(page, "Colors", "inferno")
+    assert come(lambda: share("red") > 0.3)
+    chosen(page, "Colors", "gray")
+    assert come(lambda: (plain := share("gray")) > 0.9 and plain < 1)
+    plain = share("gray")
+    page.get_by_role("checkbox", name="grid").click()
+    assert come(lambda: share("gray") < plain - 0.002)
+    page.get_by_role("checkbox", name="grid").click()
+
+
+ZSCALE = """async ([values, width]) => { const { zscale } = await import("skysim-frame/pixels.js");
+  return zscale({ data: Uint16Array.from(values), width, height: values.length / width }); }"""
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_zscale_is_astropy_s(page: Any, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    image = random.poisson(100 + 30 * seed, (70, 90 + seed)).astype(np.uint16)
+    image.ravel()[random.integers(0, image.size, 60 * seed)] += 2000
+    limits = page.evaluate(ZSCALE, [image.ravel().tolist(), image.shape[1]])
+    np.testing.assert_allclose(limits, ZScaleInterval().get_limits(image), rtol=1e-9, atol=1e-9)
+
+
+NAMES = """async ([names, size]) => { const { drawNames } = await import("skysim-frame/marks.js");
+  const boxes = [], pen = { fillRect: (...box) => boxes.push(box), fillText() {} };
+  drawNames(pen, names, (x, y) => [x, y], size, "#fff");
+  return boxes; }"""
+
+
+def test_names_are_beside_their_stars_within_the_frame_and_cover_no_other(page: Any) -> None:
+    size, random = (659, 493), np.random.default_rng(4)
+    places = np.vstack([random.uniform(0, size, (20, 2)), [[size[0] - 1, 5], [3, size[1] - 2]]])
+    names = [(*place, f"HIP {n}") for n, place in enumerate(places.tolist())]
+    boxes = np.array(page.evaluate(NAMES, [names, list(size)]))
+    assert 15 <= len(boxes) <= len(names)
+    low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
+    assert (low >= -1.01).all()
+    assert (high <= np.array(size) + 1.01).all()
+    separate = (low[:, None] >= high[None] - 2.01).any(axis=2)
+    np.testing.assert_array_equal(separate | separate.T, ~np.eye(len(boxes), dtype=bool))
+    gap = np.maximum(np.maximum(low[:, None] - places, places - high[:, None]), 0).max(axis=2).min(axis=1)
+    assert (gap < 25).all()
 
 
 def test_tab_reaches_every_control_and_shows_where_it_is(page: Any) -> None:
     onto_the_page(page)
     unseen, reached = picture(page), []
-    for _ in range(18):
+    for _ in range(22):
         page.keyboard.press("Tab")
         name, *box = page.evaluate(FOCUSED)
         assert come(partial(differs, page, unseen, box)), name
@@ -195,7 +322,8 @@ def test_tab_reaches_every_control_and_shows_where_it_is(page: Any) -> None:
         "Export",
         "truth",
         "Stretch",
-        "Brightness",
+        "Limits",
+        "Colors",
         "angle 1",
         "detector F6",
         "solver",
@@ -269,16 +397,17 @@ def test_monte_carlo_of_200_by_2_whose_report_is_its_user_s(page: Any, server: S
 
 
 def test_a_dropped_picture_is_solved_shown_or_refused(page: Any, tmp_path: Path) -> None:
-    before = angles(page)
+    before, frame = angles(page), source(page)
     panel(page, "Image")
     photo = cv2.imread(str(ROOT / "docs" / "images" / "sky.jpg"), cv2.IMREAD_GRAYSCALE)
     page.set_input_files("input[type=file]", ROOT / "docs" / "images" / "sky.jpg")
     page.get_by_text("sky.jpg: solved").wait_for()
+    changed(page, frame)
     identifier = page.get_by_role("combobox", name="identifier F7").input_value()
     stage = "" if identifier == "default" else f"; identifier {identifier}"
     assert page.get_by_text(f"sky.jpg: solved{stage}\n").count() == 1
     assert page.get_by_label("angle 1").input_value() == ""  # nobody knows where it was taken
-    page.mouse.click(*screen(page, photo.shape[::-1], 600, 400))
+    page.mouse.click(*screen(page, 600, 400))
     for x, y, dn in pixels(page):  # the picture's, not the scene's
         assert abs(dn - int(photo[y, x])) <= 2
     noise, broken, program, large = (tmp_path / f"{name}" for name in ("noise.png", "broken.png", "a.exe", "large.png"))
@@ -307,6 +436,21 @@ def identified(page: Any) -> None:
     frame = source(page)
     page.keyboard.press("1")
     changed(page, frame)
+
+
+def test_a_picture_is_solved_by_the_chosen_detector_and_identifier(page: Any) -> None:
+    panel(page, "Image")
+    sky = ROOT / "docs" / "images" / "sky.jpg"
+    page.set_input_files("input[type=file]", sky)
+    page.get_by_text(re.compile(r"sky\.jpg: solved\n")).wait_for()
+    field = float(re.search(r"field ([\d.]+)°", page.locator(".lab-panels .mono").last.inner_text())[1])
+    chosen(page, "identifier F7", "pyramid")
+    page.get_by_label("field of view, deg").fill(str(field))
+    page.set_input_files("input[type=file]", sky)
+    page.get_by_text("sky.jpg: solved; identifier pyramid").wait_for()
+    page.get_by_label("field of view, deg").fill("")
+    chosen(page, "identifier F7", "default")
+    identified(page)
 
 
 def rolled(page: Any, name: str) -> float:

@@ -76,16 +76,29 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   white-space: nowrap; color: {COLORS["quiet"]}; font-size: 12px }}
 .lab-keys kbd, .lab-command kbd {{ background: {COLORS["line"]}; color: {COLORS["text"]}; border-radius: 3px;
   padding: 1px 5px; font: 11px ui-monospace, monospace; margin-right: 5px }}
-.lab-sensor {{ display: grid; grid-template-rows: 40px minmax(0, 1fr) 176px; min-width: 0; min-height: 0 }}
-.lab-bar {{ display: flex; align-items: center; gap: 14px; padding: 0 14px; min-width: 0; overflow: hidden }}
-.lab-frame {{ display: flex; align-items: center; justify-content: center; min-height: 0; min-width: 0; padding: 0 14px;
-  container-type: size }}
-.lab-frame > canvas {{ background: #000; outline: 1px solid {COLORS["line"]} }}
-.lab-wait {{ display: flex; flex-direction: column; align-items: center; gap: 16px; white-space: pre-line;
-  text-align: center; line-height: 1.8; color: {COLORS["quiet"]} }}
-.lab-under {{ display: grid; grid-template-columns: 252px minmax(0, 1fr); gap: 14px; padding: 8px 14px; min-height: 0 }}
-.lab-zoom {{ width: 252px; height: 160px; border: 1px dashed {COLORS["line"]}; display: flex; align-items: center;
-  justify-content: center }}
+.lab-sensor {{ display: grid; grid-template-rows: auto minmax(0, 1fr); min-width: 0; min-height: 0 }}
+.lab-bar {{ display: flex; flex-wrap: wrap; align-items: center; gap: 0 8px; padding: 2px 14px; min-width: 0 }}
+.lab-view {{ display: grid; grid-template: minmax(0, 1fr) 24px 176px / minmax(0, 1fr); min-width: 0; min-height: 0 }}
+.lab-frame {{ position: relative; min-height: 0; min-width: 0; margin: 0 14px; overflow: hidden }}
+.lab-frame > canvas {{ position: absolute; inset: 0; width: 100%; height: 100%; touch-action: none; cursor: crosshair }}
+.lab-wait {{ position: absolute; inset: 0; display: flex; flex-direction: column; align-items: center; gap: 16px;
+  justify-content: center; white-space: pre-line; text-align: center; line-height: 1.8; color: {COLORS["quiet"]};
+  background: {COLORS["ground"]} }}
+.lab-view {{ container-type: inline-size }}
+.lab-readout {{ display: flex; align-items: center; gap: 6px; padding: 2px 14px; color: {COLORS["quiet"]} }}
+.lab-readout > span {{ flex: 1 1 0; min-width: 0; overflow: hidden; text-overflow: ellipsis }}
+.lab-readout > button {{ background: {COLORS["line"]}; color: {COLORS["text"]}; border: 0; border-radius: 3px;
+  padding: 0 7px; font: 11px/18px ui-monospace, monospace; cursor: pointer }}
+.lab-under {{ display: grid; grid-template: minmax(0, 1fr) / 252px minmax(0, 1fr) minmax(120px, 22%); gap: 14px;
+  padding: 4px 14px 8px; min-height: 0 }}
+.lab-under .mono {{ font-size: 11.5px }}
+@container (max-width: 700px) {{
+  .lab-under {{ grid-template: minmax(0, 1fr) 60px / 176px minmax(0, 1fr); gap: 4px 14px }}
+  .lab-under > .lab-loupe {{ grid-row: span 2; width: 176px; height: 112px }} .lab-under > .lab-plot {{ height: 60px }}
+  .lab-under .mono {{ white-space: pre-wrap; font-size: 11px; line-height: 1.35 }} }}
+.lab-under > * {{ min-width: 0; overflow: hidden }}
+.lab-loupe {{ width: 252px; height: 160px; outline: 1px dashed {COLORS["line"]} }}
+.lab-plot {{ width: 100%; height: 160px; touch-action: none; cursor: ew-resize }}
 .lab-facts {{ display: grid; grid-template-columns: 128px minmax(0, 1fr); gap: 4px 12px }}
 .lab-stops {{ display: grid; grid-template-columns: 40px repeat(4, minmax(0, 1fr)); gap: 0 10px; align-items: center }}
 .lab-stops .num {{ text-align: right }}

@@ -15,7 +15,8 @@ from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps import plate_solver
-from skysim.apps.gui.messages import Light, TrackerResult, Triple
+from skysim.apps.gui.messages import Lens, Light, Pose, TrackerResult, Triple
+from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.workbench import (
     detection_views,
     id_prefix,
@@ -37,8 +38,9 @@ from skysim.simulation.run import FrameResult
 
 @dataclass(frozen=True, slots=True)
 class Photo:
-    """An image that is not of the current scene, and its solution; size_px is the image's, jpeg what the page shows.
+    """An image that is not of the current scene, and its solution.
 
+    pixels, saturation_dn, pose : see `FrameView`;  lens : of the pose; both are None if the image was not solved
     names, true_deg : of its three angles, and their true values if known
     lights, prefix : true lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
     hint : of a refused file the likely cause, of a solved one what was assumed
@@ -48,7 +50,10 @@ class Photo:
     result: TrackerResult
     solution: dict[str, Any]
     statistics: stretch.FrameStatistics
-    jpeg: bytes = b""
+    pixels: bytes = b""
+    saturation_dn: float = math.inf
+    lens: Lens | None = None
+    pose: Pose | None = None
     names: tuple[str, str, str] = ("RA", "Dec", "roll")
     true_deg: Triple | None = None
     lights: tuple[Light, ...] = ()
@@ -105,6 +110,10 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
         true_deg=scoring.angles_deg(truth.cam_from_lab, scene, setup.testbed.mount),
         lights=true_lights(truth, magnitude_by_id(setup.testbed)),
         prefix=id_prefix(setup.testbed),
+        pixels=pixels.encoded(frame.image_dn),
+        saturation_dn=frame.saturation_dn,
+        lens=(lens := pixels.scene_lens(setup.testbed)),
+        pose=pixels.scene_pose(setup.testbed, lens, truth),
     )
     return photo, frame.image_dn
 
@@ -124,4 +133,9 @@ def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoP
     result = TrackerResult(attitude.status, detections, 1e3 * sum(report.seconds.values()), angles)
     height, width = image.shape
     saturation_dn = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
-    return Photo((width, height), result, solution, stretch.frame_statistics(image, saturation_dn)), image
+    statistics = stretch.frame_statistics(image, saturation_dn)
+    photo = Photo((width, height), result, solution, statistics, pixels=pixels.encoded(image))
+    if attitude.solved:
+        camera = attitude.camera or tracker.camera
+        photo = replace(photo, lens=pixels.lens_of(camera), pose=pixels.solved_pose(attitude))
+    return replace(photo, saturation_dn=saturation_dn), image

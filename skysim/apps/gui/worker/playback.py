@@ -11,8 +11,8 @@ import numpy as np
 
 from estimator.trackers.pipeline import Report
 from skysim.apps.gui.messages import NAN, FlightStep, FrameRow, FrameView, MotionLog
+from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.workbench import Workbench, tracker_result
-from skysim.core import quaternion
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Telemetry
 from skysim.results import telemetry_report
@@ -26,14 +26,10 @@ FLOOR = 1e-3  # arcsec; lower limit of values on a logarithmic axis
 
 @dataclass
 class KeptFrame:
-    """A frame of a flight without its pixels, which are rendered again, bit for bit, when they are needed.
-
-    style : with which the view's JPEG was made
-    """
+    """A frame of a flight without its pixels, which are rendered again, bit for bit, when it is shown."""
 
     view: FrameView
     report: Report
-    style: tuple[str, float, int]
 
 
 class Flight:
@@ -62,8 +58,8 @@ class Flight:
             view = self.bench.frame_view(result.frame, result.truth, solved, sum(result.seconds.values()))
             t_s = exposure_window(self.moved.scene, result.frame.index, result.frame.exposure_s).open_s
             error, innovation = filter_errors(self.moved, result, t_s)
-            view = replace(view, t_s=t_s, filter_arcsec=error, innovation_arcsec=innovation)
-            self.frames.append(KeptFrame(view, result.report, self.bench.style))
+            view = replace(view, pixels=b"", t_s=t_s, filter_arcsec=error, innovation_arcsec=innovation)
+            self.frames.append(KeptFrame(view, result.report))
             yield len(self.frames), count
 
     def advance(self, budget_s: float) -> FlightStep:
@@ -79,22 +75,13 @@ class Flight:
         return FlightStep("done" if is_done else "frames" if self.moved else "motion", *self.progress, rows, log)
 
     def show(self, index: int) -> FrameView:
-        """The view of a kept frame, with the stretch that is chosen now; the scene is seen from there from now on."""
-        kept = self.frames[index]
-        self.bench.lab_from_body = quaternion.to_rotation(np.array(kept.view.body_wxyz))
-        if kept.style != self.bench.style:
-            self.load(index)
-            assert self.bench.frame is not None
-            kept.view = replace(kept.view, jpeg=self.bench.to_jpeg(self.bench.frame.image_dn))
-            kept.style = self.bench.style
-        return kept.view
-
-    def load(self, index: int) -> None:
-        """Render a kept frame's pixels again, for zoom and export."""
+        """The view of a kept frame with its pixels; the scene is seen from there from now on."""
         assert self.moved is not None
-        kept = self.frames[index]
+        kept, bench = self.frames[index], self.bench
         frame, truth = exposure.render_frame(self.moved, index, exposure_s=kept.view.exposure_s)
-        self.bench.frame, self.bench.truth, self.bench.report = frame, truth, kept.report
+        bench.frame, bench.truth, bench.report = frame, truth, kept.report
+        bench.lab_from_body = truth.lab_from_body
+        return replace(kept.view, pixels=pixels.encoded(frame.image_dn))
 
 
 def frame_row(view: FrameView) -> FrameRow:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ from skysim.apps.gui.messages import (
     AmbiguityMap,
     FlightStep,
     FrameView,
-    PixelWindow,
     PlanCheck,
     SceneInfo,
     SurveyPlan,
@@ -20,7 +19,7 @@ from skysim.apps.gui.messages import (
 )
 from skysim.apps.gui.worker import export, photo, playback
 from skysim.apps.gui.worker.scene import planning, pointing
-from skysim.apps.gui.worker.workbench import Workbench, pixel_window
+from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core.errors import InputError
 from skysim.core.io import images
 
@@ -29,13 +28,11 @@ from skysim.core.io import images
 class Worker:
     """State between tasks: the workbench, its flight, and the other image if the page shows one.
 
-    unloaded : the flight's frame on the page, while its pixels are not rendered again
     other, image : an image that is not of the scene, and its (H, W) pixels;  camera : an open live camera
     """
 
     current: Workbench | None = None
     flight: playback.Flight | None = None
-    unloaded: int | None = None
     other: photo.Photo | None = None
     image: NDArray | None = None
     scene: str = ""
@@ -51,30 +48,13 @@ class Worker:
 
     def show_frame(self, view: FrameView) -> FrameView:
         """Return the view, and forget the other image, because the page now shows the scene."""
-        self.other = self.image = self.unloaded = None
+        self.other = self.image = None
         return view
 
     def show_photo(self, photo_pixels: photo.PhotoPixels) -> photo.Photo:
-        """Keep an image that is not of the scene, and return it with its JPEG."""
+        """Keep an image that is not of the scene, and return its view."""
         self.other, self.image = photo_pixels
-        return replace(self.other, jpeg=self.jpeg())
-
-    def shown_image(self) -> NDArray:
-        """(H, W) pixels of the image on the page."""
-        if self.image is not None:
-            return self.image
-        self.load_pixels()
-        assert self.workbench.frame is not None
-        return self.workbench.frame.image_dn
-
-    def load_pixels(self) -> None:
-        """Render the pixels of the flight's frame on the page."""
-        if self.flight and self.unloaded is not None:
-            self.flight.load(self.unloaded)
-            self.unloaded = None
-
-    def jpeg(self) -> bytes:
-        return self.workbench.to_jpeg(self.shown_image())
+        return self.other
 
     # Tasks.
 
@@ -91,7 +71,6 @@ class Worker:
             bench.lab_from_body = pointing.from_angles(bench.scene, bench.testbed.mount, angles_deg)
         self.current = bench
         self.scene, self.overrides, self.flight = scene, dict(overrides), None
-        self.unloaded = None
         return bench.scene_info, self.render(solve)
 
     def render(self, solve: bool) -> FrameView:
@@ -107,19 +86,6 @@ class Worker:
         bench.lab_from_body = pointing.moved(bench.scene, bench.testbed.mount, bench.lab_from_body, right, up, roll_deg)
         return self.render(solve)
 
-    def show(self, stretch: str, brightness: float) -> bytes:
-        """Change stretch and brightness; return the shown image as JPEG."""
-        self.workbench.stretch, self.workbench.brightness = stretch, brightness
-        return self.jpeg()
-
-    def fit(self, widest_px: int) -> bytes:
-        """Limit the image's width to the pixels that the screen has for it; return the shown image as JPEG."""
-        self.workbench.widest_px = widest_px
-        return self.jpeg()
-
-    def zoom(self, x: float, y: float) -> PixelWindow:
-        return pixel_window(self.shown_image(), x, y)
-
     def check(self) -> PlanCheck:
         return planning.check(self.workbench.testbed)
 
@@ -131,7 +97,6 @@ class Worker:
 
     def begin_flight(self) -> FlightStep:
         """Begin to compute the scene's flight; `advance_flight` does the work."""
-        self.load_pixels()
         self.flight = playback.Flight(self.workbench)
         return self.flight.advance(0.0)
 
@@ -145,9 +110,7 @@ class Worker:
         """A kept frame of the flight. Raises InputError if it has not been computed."""
         if self.flight is None or not 0 <= index < len(self.flight.frames):
             raise InputError(f"the flight has no frame {index}")
-        view = self.show_frame(self.flight.show(index))
-        self.unloaded = index
-        return view
+        return self.show_frame(self.flight.show(index))
 
     def replay(self, study: str, folder: str, trial: int) -> photo.Photo:
         """Repeat a study's trial; the page shows its frame."""
@@ -157,7 +120,6 @@ class Worker:
         """The files of the image on the page."""
         if self.other is not None and self.image is not None:
             return export.photo_files(self.other, self.image)
-        self.load_pixels()
         return export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
 
     def solve_file(self, name: str, data: bytes, fov_deg: float | None, stages: photo.Stages = ()) -> photo.Photo:

@@ -15,12 +15,12 @@ from estimator.core.types import Attitude
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.gui.messages import Detection, FrameView, Light, PixelWindow, SceneInfo, TrackerResult
+from skysim.apps.gui.messages import Detection, FrameView, Lens, Light, SceneInfo, TrackerResult
+from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.scene import geometry
 from skysim.core import quaternion
 from skysim.core.types import Floats, Frame, Truth
-from skysim.results import scoring
-from skysim.results import stretch as contrast
+from skysim.results import scoring, stretch
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
@@ -30,7 +30,6 @@ from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking import factory
 from skysim.tracking import settings as tracker_settings
 
-WINDOW_PX = (11, 7)  # enlarged pixels across and down; their values remain readable
 STAGES = ("detector", "centroider", "identifier", "solver")
 
 
@@ -38,7 +37,7 @@ STAGES = ("detector", "centroider", "identifier", "solver")
 class Workbench:
     """A scene that is set up, with the current attitude and the newest frame.
 
-    stretch, brightness, widest_px : how frames are displayed
+    lens : where its camera's pixels point
     rendered_count : number of frames rendered; it changes the seed, so that each frame has independent noise
     magnitude : V magnitude by a light's number
     """
@@ -47,9 +46,7 @@ class Workbench:
     testbed: Testbed
     estimator: factory.Estimator
     lab_from_body: Rotation
-    stretch: str = "square root"
-    brightness: float = 1.0
-    widest_px: int = 1400
+    lens: Lens
     rendered_count: int = 0
     frame: Frame | None = None
     truth: Truth | None = None
@@ -68,22 +65,19 @@ class Workbench:
             return replace(before, scene=scene, testbed=testbed, estimator=warm_tracker(testbed))
         testbed = build_testbed(scene)
         lab_from_body = testbed.trajectory.lab_from_body[0]
-        workbench = cls(scene, testbed, warm_tracker(testbed), lab_from_body, magnitude=magnitude_by_id(testbed))
-        if before:
-            return replace(workbench, stretch=before.stretch, brightness=before.brightness, widest_px=before.widest_px)
-        return workbench
+        lens = pixels.scene_lens(testbed)
+        return cls(scene, testbed, warm_tracker(testbed), lab_from_body, lens, magnitude=magnitude_by_id(testbed))
 
-    def to_jpeg(self, image: NDArray) -> bytes:
-        """JPEG of an image: stretched, and reduced to the width on the screen."""
-        return contrast.jpeg(
-            contrast.reduce_width(contrast.to_8bit(image, self.stretch, self.brightness), self.widest_px)
-        )
+    @property
+    def stages(self) -> dict[str, str]:
+        """The tracker's algorithms by stage."""
+        settings = tracker_settings.assumed_settings(self.scene)
+        return {name: getattr(settings, name) for name in STAGES}
 
     @property
     def scene_info(self) -> SceneInfo:
         """Properties of the scene for the page."""
-        scene, settings = self.scene, tracker_settings.assumed_settings(self.scene)
-        camera = scene.camera
+        scene, camera = self.scene, self.scene.camera
         return SceneInfo(
             scene.name,
             scene.title,
@@ -91,10 +85,11 @@ class Workbench:
             scoring.angle_names(scene),
             id_prefix(self.testbed),
             2 * math.degrees(math.atan(camera.width_px / 2 / camera.focal_px)),
-            {name: getattr(settings, name) for name in STAGES},
+            self.stages,
             tracker_settings.algorithm_names(scene),
             self.testbed.duration_s,
             geometry.lab_geometry(self.testbed),
+            self.lens,
         )
 
     def render_at_rest(self, solve: bool = False) -> FrameView:
@@ -122,21 +117,18 @@ class Workbench:
         """The view of a frame of this scene for the page."""
         height, width = frame.image_dn.shape
         return FrameView(
-            self.to_jpeg(frame.image_dn),
+            pixels.encoded(frame.image_dn),
+            pixels.scene_pose(self.testbed, self.lens, truth),
+            frame.saturation_dn,
             (width, height),
             scoring.angles_deg(truth.cam_from_lab, self.scene, self.testbed.mount),
             tuple(quaternion.from_rotation(truth.lab_from_body).tolist()),
             frame.exposure_s,
-            contrast.frame_statistics(frame.image_dn, frame.saturation_dn),
+            stretch.frame_statistics(frame.image_dn, frame.saturation_dn),
             true_lights(truth, self.magnitude),
             result,
             1e3 * seconds,
         )
-
-    @property
-    def style(self) -> tuple[str, float, int]:
-        """What a frame's JPEG depends on besides its pixels."""
-        return self.stretch, self.brightness, self.widest_px
 
 
 def warm_tracker(testbed: Testbed) -> factory.Estimator:
@@ -190,15 +182,6 @@ def detection_views(report: Report, names: Mapping[int, tuple[int, float]]) -> t
     return tuple(
         Detection(x, y, sigma, flux, *names.get(n, (-1, math.nan))) for n, ((x, y), sigma, flux) in enumerate(rows)
     )
-
-
-def pixel_window(image: NDArray, x: float, y: float) -> PixelWindow:
-    """The window of WINDOW_PX pixels around (x, y), moved inside the image at its border."""
-    (height, width), (across, down) = image.shape, WINDOW_PX
-    x0 = min(max(round(x) - across // 2, 0), max(width - across, 0))
-    y0 = min(max(round(y) - down // 2, 0), max(height - down, 0))
-    values = np.rint(image[y0 : y0 + down, x0 : x0 + across]).astype(int)
-    return PixelWindow(x0, y0, tuple(map(tuple, values.tolist())))
 
 
 def predicted_lights(estimator: DomeTracker | StarTracker, attitude: Attitude) -> tuple[NDArray[np.int64], Floats]:

@@ -1,16 +1,22 @@
-"""Sensor view: the newest frame with its marks, enlarged pixels of a star, and data on what is under the mouse."""
+"""Sensor view: the newest frame with its marks, its display settings, and data on the light under the mouse."""
 
 from __future__ import annotations
 
 import asyncio
+import base64
+import functools
 import itertools
 import math
+from collections.abc import Collection
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
+import numpy as np
 from nicegui import ui
 
-from skysim.apps.gui.messages import Detection, FrameView, Light, SceneInfo, TrackerResult
+from skysim.apps.gui.messages import Detection, FrameView, Lens, Light, Pose, SceneInfo, TrackerResult
 from skysim.apps.gui.page import keys, overlay
 from skysim.apps.gui.page.star_names import NAMES
 from skysim.results import stretch
@@ -20,24 +26,28 @@ if TYPE_CHECKING:
     from skysim.apps.gui.page.page import Tab
     from skysim.apps.gui.worker.photo import Photo
 
-ZOOM_PX = 160  # height of the enlarged pixels on the screen
 FIRST_START = "The first frame on a machine takes up to a minute, because the code is compiled."
 LABELS = NAMES | BODIES  # by number
 STRETCHES = list(stretch.CURVES)
+LIMITS = ("automatic", "zscale", "min to max", "manual")  # of the display; the first three are functions of pixels.js
+COLOR_MAPS = {
+    **{"gray": None, "gray, inverted": None, "viridis": cv2.COLORMAP_VIRIDIS, "cividis": cv2.COLORMAP_CIVIDIS},
+    **{"inferno": cv2.COLORMAP_INFERNO, "hot": cv2.COLORMAP_HOT},
+}
 FRAME_NUMBERS = itertools.count(1)  # of frames, so that each has its own address
-FRAMES: dict[str, dict[int, bytes]] = {}  # JPEG by tab and number, the newest KEPT
+FRAMES: dict[str, dict[int, bytes]] = {}  # encoded pixels by tab and number, the newest KEPT
 KEPT_FRAMES = 3
 DRAW_TIMEOUT_S = 1.0  # for the browser to report a drawn frame
 
 
-class Canvas(ui.element, component="frame.js"):  # type: ignore[call-arg]
-    """Canvas with a frame and its marks, implemented in frame.js."""
+class Canvas(ui.element, component="frame/frame.js", esm={"skysim-frame": "frame"}):  # type: ignore[call-arg]
+    """The frame with its loupe and plot, implemented in frame.js."""
 
 
 class Sensor:
     """The view and its controls. It shows a frame of the scene, or another image such as a user's.
 
-    mouse_px : pixel under the mouse, or None;  zoom_is_current : whether the enlarged pixels are of the current frame
+    hover_px : place of the light under the mouse, or None
     sent_number, drawn_number : number of the last frame sent to the browser, and of the last it reported as drawn
     """
 
@@ -46,28 +56,26 @@ class Sensor:
         self.shown = {"truth", "identified", "false"}
         self.lights: tuple[Light, ...] = ()
         self.result: TrackerResult | None = None
-        self.size_px, self.prefix = (4, 3), "HIP"
-        self.statistics = ""  # numbers of the frame, shown while the mouse is outside
-        self.mouse_px: tuple[float, float] | None = None
-        self.zoom_is_current = False
+        self.size_px, self.prefix, self.saturation_dn = (4, 3), "HIP", math.inf
+        self.lens: Lens | None = None
+        self.pose: Pose | None = None
+        self.statistics = ""  # numbers of the frame, shown while the mouse is on no light
+        self.hover_px: tuple[float, float] | None = None
         self.sent_number = self.drawn_number = 0
         self.frame_drawn = asyncio.Event()
         with ui.element("div").classes("lab-sensor"):
             self.build_controls()
-            with ui.element("div").classes("lab-frame"):
-                self.canvas = Canvas().mark("sensor")
-                self.canvas.on("mouse", self.mouse, throttle=0.06)
-                self.canvas.on("drawn", self.drawn)
-                self.canvas.on("sized", self.sized, throttle=0.5)
-                with ui.element("div").classes("lab-wait") as self.wait:
-                    ui.spinner(size="28px")
-                    self.wait_label = ui.label().mark("wait")
-            with ui.element("div").classes("lab-under"):
-                self.magnified = ui.html(sanitize=False).classes("quiet").mark("zoom")
+            with Canvas().mark("sensor") as self.canvas:
                 self.hover = ui.label().classes("mono").mark("hover")
-        self.canvas.set_visibility(False)
+            with self.canvas.add_slot("wait"), ui.element("div").classes("lab-wait") as self.wait:
+                ui.spinner(size="28px")
+                self.wait_label = ui.label().mark("wait")
+        self.canvas.on("hover", self.hover_changed)
+        self.canvas.on("choose", self.light_chosen)
+        self.canvas.on("manual", lambda: self.limits.set_value("manual"))
+        self.canvas.on("drawn", self.drawn)
+        self.update_display()
         self.show_waiting(f"Setting up {Path(tab.scene).name} …", FIRST_START)
-        self.clear_zoom()
 
     def show_waiting(self, *lines: str) -> None:
         """Show what the first frame waits for, or the reason for none."""
@@ -79,37 +87,41 @@ class Sensor:
                 box = ui.checkbox(kind, value=kind in self.shown).props("dense size=xs")
                 box.style(f"color: {overlay.COLORS[kind]}").mark(f"overlay-{kind}")
                 box.on_value_change(lambda event, kind=kind: self.toggle(kind, event.value))
+            self.grid = ui.checkbox("grid", value=False, on_change=self.update_display).props("dense size=xs")
+            self.grid.mark("grid")
             ui.space()
-            self.stretch = ui.select(STRETCHES, value=STRETCHES[0], on_change=self.restretch)
-            self.stretch.props('dense borderless options-dense aria-label="Stretch"').classes("w-28")
-            self.stretch.on("popup-hide", js_handler=keys.BLUR_JS)
-            self.brightness = ui.slider(min=-2, max=4, step=0.25, value=0).props('dense aria-label="Brightness"')
-            self.brightness.classes("w-24").on("change", self.restretch)
+            self.stretch = self.select("Stretch", STRETCHES, "w-28")
+            self.limits = self.select("Limits", LIMITS, "w-24")
+            self.colors = self.select("Colors", list(COLOR_MAPS), "w-24")
+
+    def select(self, name: str, options: Collection[str], width: str) -> ui.select:
+        """A list of display settings."""
+        chosen = ui.select(list(options), value=next(iter(options)), on_change=self.update_display)
+        chosen.props(f'dense borderless options-dense aria-label="{name}"').classes(width)
+        return chosen.on("popup-hide", js_handler=keys.BLUR_JS)
+
+    def update_display(self) -> None:
+        """Send the display settings; the browser applies them."""
+        self.canvas.props["display"] = {
+            "curve": self.stretch.value,
+            "limits": self.limits.value,
+            "table": color_table(str(self.colors.value)),
+            "grid": self.grid.value,
+        }
+        self.canvas.update()
 
     def clear_zoom(self) -> None:
-        self.mouse_px, self.zoom_is_current = None, False
-        self.magnified.set_content('<div class="lab-zoom">click a star to see its pixels</div>')
-        self.magnified.classes(remove="stale")
+        """Show the whole frame."""
+        self.canvas.run_method("fit")
 
     def toggle(self, kind: str, on: bool) -> None:
         self.shown = self.shown | {kind} if on else self.shown - {kind}
         self.update_marks()
 
-    async def restretch(self) -> None:
-        """Show the same frame with another stretch or brightness."""
-        data = await self.tab.run_task("show", self.stretch.value, 2.0 ** float(self.brightness.value))
-        if data:
-            self.display_image(data, self.size_px)
-
-    def display_image(self, data: bytes, size_px: tuple[int, int]) -> None:
-        """Display an image, as large as the window allows."""
-        if size_px != self.size_px:
-            aspect = size_px[0] / size_px[1]
-            self.canvas.style(f"width: min(100cqw, calc(100cqh * {aspect:.5f})); aspect-ratio: {aspect:.5f}")
+    def display_image(self, data: bytes) -> None:
+        """Display a new image, as large as the window allows."""
         if not self.sent_number:
             self.wait.set_visibility(False)
-            self.canvas.set_visibility(True)
-        self.size_px = size_px
         self.sent_number = next(FRAME_NUMBERS)
         frames = FRAMES.setdefault(self.tab.id, {})
         frames[self.sent_number] = data
@@ -121,12 +133,6 @@ class Sensor:
         self.drawn_number = int(event.args["src"].rpartition("/")[2])
         self.frame_drawn.set()
 
-    async def sized(self, event: Any) -> None:
-        """The browser reports the width of the image on the screen; fit the image to it."""
-        data = await self.tab.await_result(self.tab.session.run("fit", max(int(event.args["wide"]), 1)))
-        if data:
-            self.display_image(data, self.size_px)
-
     async def wait_drawn(self) -> None:
         """Wait until at most one frame is not drawn yet, so that frames do not queue up in the browser."""
         while self.sent_number > self.drawn_number + 1:
@@ -137,40 +143,43 @@ class Sensor:
                 return
 
     def show(self, view: FrameView) -> None:
-        self.lights, self.result = view.lights, view.result
-        self.prefix = self.tab.scene_info.prefix if self.tab.scene_info else "HIP"
-        self.statistics = statistics_text(view.size_px, view.statistics, view.result, view, self.tab.scene_info)
-        self.frame_changed()
-        self.display_image(view.jpeg, view.size_px)
+        info = self.tab.scene_info
+        self.prefix = info.prefix if info else "HIP"
+        self.statistics = statistics_text(view.size_px, view.statistics, view.result, view, info)
+        self.take(view, info.lens if info else None)
 
     def show_photo(self, photo: Photo) -> None:
         """Show a user's image or the frame of a study's trial."""
-        self.lights, self.result, self.prefix = photo.lights, photo.result, photo.prefix
+        self.prefix = photo.prefix
         self.statistics = statistics_text(photo.size_px, photo.statistics, photo.result)
-        self.frame_changed()
-        self.display_image(photo.jpeg, photo.size_px)
+        self.take(photo, photo.lens)
 
-    def frame_changed(self) -> None:
-        """Update the text for a new frame, and mark the enlarged pixels as those of an older one."""
+    def take(self, view: FrameView | Photo, lens: Lens | None) -> None:
+        """Take over lights, solution and pointing of a new image, and display it."""
+        self.lights, self.result = view.lights, view.result
+        self.size_px, self.saturation_dn, self.pose = view.size_px, view.saturation_dn, view.pose
+        if lens is not self.lens:
+            self.lens = lens
+            self.canvas.run_method("setLens", asdict(lens) if lens else None)
         self.update_text()
-        if self.zoom_is_current:
-            self.zoom_is_current = False
-            self.magnified.classes("stale")
+        self.display_image(view.pixels)
 
     def update_text(self) -> None:
-        """Show data on what is under the mouse, or else the frame's numbers."""
-        at = self.mouse_px
-        self.hover.set_text(self.pixel_text(*at, *self.nearest(*at)) if at else self.statistics)
+        """Show data on the light under the mouse, or else the frame's numbers."""
+        at = self.hover_px
+        self.hover.set_text(self.light_text(*self.nearest(*at)) if at else self.statistics)
 
     def update_marks(self) -> None:
-        """Send the frame's address and its marks to the canvas."""
-        self.canvas.props["view"] = {
+        """Send the frame's address, its pointing and its marks to the canvas; not as properties, which would be sent
+        again whole with each change of any of them."""
+        view = {
             "src": f"/frame/{self.tab.id}/{self.sent_number}",
             "size": self.size_px,
-            "marks": overlay.marks(self.lights, self.result, self.size_px, self.shown, self.name),
+            "saturation": self.saturation_dn if math.isfinite(self.saturation_dn) else None,
+            "pose": pose_fields(self.pose) if self.pose else None,
             "label": self.description(),
         }
-        self.canvas.update()
+        self.canvas.run_method("show", view | overlay.marks(self.lights, self.result, self.shown, self.name))
 
     def description(self) -> str:
         """Text alternative of the view for screen readers."""
@@ -183,21 +192,15 @@ class Sensor:
             return f"{self.prefix} {id}"
         return LABELS.get(id, f"HIP {id}" if id < 1_000_000 else f"star {id}")
 
-    async def mouse(self, event: Any) -> None:
-        """Handle the mouse: show data on what is under it; a click enlarges the pixels there."""
-        x, y = event.args["x"] - 0.5, event.args["y"] - 0.5
-        self.mouse_px = None if event.args["kind"] == "mouseleave" else (x, y)
+    def hover_changed(self, event: Any) -> None:
+        """The mouse is on another light, or on none."""
+        self.hover_px = (event.args["x"], event.args["y"]) if event.args["inside"] else None
         self.update_text()
-        if event.args["kind"] != "click" or not self.tab.scene_info:
-            return
-        detection, light = self.nearest(x, y)
-        target = detection or light
-        zoom = await self.tab.run_task("zoom", target.x if target else x, target.y if target else y)
-        if zoom:
-            detections = self.result.detections if self.result else ()
-            self.magnified.set_content(overlay.pixels_svg(zoom.dn, detections, zoom.x, zoom.y, ZOOM_PX))
-            self.magnified.classes(remove="stale")
-            self.zoom_is_current = True
+
+    def light_chosen(self, event: Any) -> None:
+        """A click: what is known of the light there stays on the page until the mouse is on another one."""
+        self.hover_px = (event.args["x"], event.args["y"]) if event.args["id"] is not None else None
+        self.update_text()
 
     def nearest(self, x: float, y: float) -> tuple[Detection | None, Light | None]:
         """The nearest detection and the nearest true light within a few marks' width, or None."""
@@ -211,21 +214,38 @@ class Sensor:
         lights = [light for light in self.lights if distance_px(light) < radius_px]
         return min(detections, key=distance_px, default=None), min(lights, key=distance_px, default=None)
 
-    def pixel_text(self, x: float, y: float, detection: Detection | None, light: Light | None) -> str:
-        """Text on a pixel: its true light, the detection and its error."""
-        lines = [f"pixel      {x:8.1f} {y:8.1f}"]
+    def light_text(self, detection: Detection | None, light: Light | None) -> str:
+        """Text on a light: where it truly is, the detection and its error."""
+        lines = []
         if light:
             brightness = "" if math.isnan(light.magnitude) else f"V {light.magnitude:.2f}  "
             lines += [f"truth      {light.x:8.2f} {light.y:8.2f}   {self.name(light.id)}"]
             lines += [f"           {brightness}{light.electrons:.4g} e-"]
         if detection:
             identity = self.name(detection.id) if detection.id >= 0 else "not identified"
-            lines += [f"centroid   {detection.x:8.2f} {detection.y:8.2f} ± {detection.sigma_px:.3f} px   {identity}"]
+            lines += [f"centroid   {detection.x:8.2f} {detection.y:8.2f} ± {detection.sigma_px:.3f} px"]
             residual = "" if math.isnan(detection.residual_px) else f"   residual {detection.residual_px:.3f} px"
-            lines += [f"           flux {detection.flux:.4g}{residual}"]
+            lines += [f"           {identity}", f"           flux {detection.flux:.4g}{residual}"]
             if light:
                 lines += [f"           error {math.hypot(detection.x - light.x, detection.y - light.y):.3f} px"]
         return "\n".join(lines)
+
+
+def pose_fields(pose: Pose) -> dict[str, Any]:
+    """A pose for frame.js."""
+    fields: dict[str, Any] = {"rotation": pose.rotation}
+    return fields | ({"place_m": pose.place_m, "depth_m": pose.depth_m} if pose.depth_m else {})
+
+
+@functools.cache
+def color_table(name: str) -> str:
+    """256 x (red, green, blue) of a color map, base64."""
+    ramp = np.arange(256, dtype=np.uint8)[:, None]
+    kind = COLOR_MAPS[name]
+    if kind is None:
+        table = np.repeat(ramp, 3, axis=1)
+        return base64.b64encode((255 - table if "inverted" in name else table).tobytes()).decode()
+    return base64.b64encode(cv2.applyColorMap(ramp, kind)[:, 0, ::-1].tobytes()).decode()
 
 
 def statistics_text(
@@ -247,4 +267,4 @@ def statistics_text(
     lights = ("lights", f"{len(view.lights)} in the field") if view else ()
     detected = ("identified", f"{result.identified} of {len(result.detections)}") if result else ()
     rows += [(*lights, *detected, "", "", "", "")[:4]]
-    return "\n".join(f"{a:<11s}{b:<20s}{c:<11s}{d}".rstrip() for a, b, c, d in rows)
+    return "\n".join(f"{a:<11s}{b:<18s}{c:<11s}{d}".rstrip() for a, b, c, d in rows)

@@ -1,0 +1,357 @@
+// The frame: its pixels come as numbers, so zoom, limits, colors, values under the cursor, loupe and cut are made here,
+// without the server. Marks are drawn together with their frame, so that they never appear on another one.
+import { colorTable, decode, LIMITS, palette, profile, sample } from "skysim-frame/pixels.js";
+import { drawGrid, drawHighlight, drawLoupe, drawMarks, drawNames } from "skysim-frame/marks.js";
+import { drawHistogram, drawProfile, levelAt, nearestLevel } from "skysim-frame/plots.js";
+import { directionText, gridLines } from "skysim-frame/sky.js";
+
+const LARGEST_PX = 60; // screen pixels of an enlarged pixel
+const REACH_PX = 14; // screen pixels within which the cursor finds a light
+const LOUPE = { across: 11, down: 7 };
+const PALE = "#ffe27a", GRID = "rgb(127 160 200 / 45%)", CUT = "#ff8fd0", CROSS = "#ff7b6b";
+
+export default {
+  template: `
+    <div class="lab-view">
+      <div class="lab-frame">
+        <canvas ref="frame" role="img" @wheel.prevent="wheel" @pointerdown="press" @pointermove="move"
+          @pointerup="release" @pointercancel="release" @pointerleave="leave" @dblclick="fit"></canvas>
+        <slot name="wait"></slot>
+      </div>
+      <div class="lab-readout">
+        <span ref="readout" class="mono"></span>
+        <button @click="fit" title="the whole frame (double-click)">fit</button>
+        <button @click="actualSize" title="a screen pixel for each pixel">1:1</button>
+      </div>
+      <div class="lab-under">
+        <canvas ref="loupe" class="lab-loupe" role="img"></canvas>
+        <slot></slot>
+        <canvas ref="plot" class="lab-plot" role="img" @pointerdown="grab" @pointermove="drag"
+          @pointerup="held = null" @pointercancel="held = null"></canvas>
+      </div>
+    </div>`,
+  // curve, limits: names;  table: of colors, base64;  grid: whether the coordinate grid is drawn
+  props: { display: Object },
+  created() {
+    // Not reactive: Vue must not watch arrays of a million pixels.
+    Object.assign(this, {
+      wanted: null, // the newest view: src, size, saturation, pose, marks, names, lights, label
+      drawn: null, // the view on the canvas, with pixels and their sample
+      lens: null,
+      zoom: null, // { scale, x, y }: screen pixels per pixel, and the pixel in the middle; null: the whole frame
+      cursor: null, // [x, y] in the frame's pixels
+      pinned: null, // where the loupe stays while the cursor is elsewhere
+      cut: null, // [[x, y], [x, y]]
+      manual: null, // limits that were dragged
+      pressed: null,
+      held: null, // the limit that is dragged: 0 or 1
+      hovered: null, // number of the light under the cursor
+      fetching: false,
+    });
+  },
+  mounted() {
+    this.pen = this.$refs.frame.getContext("2d", { alpha: false });
+    this.sheet = document.createElement("canvas");
+    this.watcher = new ResizeObserver(() => this.paint());
+    for (const canvas of [this.$refs.frame, this.$refs.loupe, this.$refs.plot]) this.watcher.observe(canvas);
+  },
+  beforeUnmount() {
+    this.watcher.disconnect();
+  },
+  watch: {
+    display() {
+      if (this.display.limits !== "manual") this.manual = null;
+      this.recolor();
+    },
+  },
+  methods: {
+    // From the server.
+
+    show(view) {
+      this.wanted = view;
+      this.update();
+    },
+    setLens(lens) {
+      this.lens = lens;
+    },
+    fit() {
+      this.zoom = null;
+      this.paint();
+    },
+    actualSize() {
+      if (!this.drawn) return;
+      const [width, height] = this.drawn.size;
+      this.zoom = { scale: 1 / devicePixelRatio, x: width / 2, y: height / 2 };
+      this.paint();
+    },
+
+    // Pixels.
+
+    // Draw the newest view. If a newer one arrives while a frame is fetched, draw the fetched one first, then the newer.
+    async update() {
+      if (this.fetching) return;
+      this.fetching = true;
+      try {
+        while (this.wanted && this.wanted !== this.drawn?.view) {
+          const view = this.wanted, lens = this.lens, same = view.src === this.drawn?.src;
+          const pixels = same ? this.drawn.pixels : await this.fetchPixels(view);
+          if (!pixels && view === this.wanted) break;
+          if (!pixels) continue;
+          const sampled = same ? this.drawn.sampled : sample(pixels);
+          if (String(view.size) !== String(this.drawn?.size)) this.zoom = this.cut = this.pinned = null;
+          this.drawn = { ...view, view, lens, pixels, sampled };
+          if (same) this.paint();
+          else this.recolor();
+          this.$emit("drawn", { src: view.src });
+        }
+      } finally {
+        this.fetching = false;
+      }
+    },
+    // Pixels of a frame; null if the server is unreachable or holds only newer frames, which it will announce.
+    async fetchPixels(view) {
+      try {
+        const response = await fetch((window.path_prefix || "") + view.src);
+        return response.ok ? decode(await response.arrayBuffer(), view.size) : null;
+      } catch {
+        return null;
+      }
+    },
+    recolor() {
+      if (!this.drawn) return;
+      const { pixels, sampled, saturation } = this.drawn;
+      const { data, offset, step, width, height } = pixels;
+      const levels = this.manual?.map((dn) => (dn - offset) / step);
+      this.levels = levels ?? LIMITS[this.display.limits]?.(pixels, sampled) ?? LIMITS.automatic(pixels, sampled);
+      const limit = saturation === null ? Infinity : (saturation - offset) / step;
+      const table = colorTable(sampled.high, this.levels, this.display.curve, palette(this.display.table), limit);
+      if (this.sheet.width !== width || this.sheet.height !== height || !this.sheetData) {
+        [this.sheet.width, this.sheet.height] = [width, height];
+        this.sheetPen = this.sheet.getContext("2d", { alpha: false, willReadFrequently: true });
+        this.sheetData = this.sheetPen.createImageData(width, height);
+      }
+      const out = new Uint32Array(this.sheetData.data.buffer);
+      for (let n = 0; n < data.length; n++) out[n] = table[data[n]];
+      this.sheetPen.putImageData(this.sheetData, 0, 0);
+      this.paint();
+    },
+    value(x, y) {
+      const { data, offset, step, width, height } = this.drawn.pixels;
+      return x < 0 || y < 0 || x >= width || y >= height ? null : offset + step * data[y * width + x];
+    },
+
+    // Geometry: pixels of the frame (integers are centers) to screen pixels of the canvas and back.
+
+    placement() {
+      const { clientWidth, clientHeight } = this.$refs.frame, [width, height] = this.drawn.size;
+      const whole = Math.min(clientWidth / width, clientHeight / height);
+      const scale = this.zoom?.scale ?? whole;
+      const [x, y] = this.zoom ? [this.zoom.x, this.zoom.y] : [width / 2, height / 2];
+      return { whole, scale, left: clientWidth / 2 - x * scale, top: clientHeight / 2 - y * scale };
+    },
+    toScreen(x, y) {
+      const { scale, left, top } = this.placed;
+      return [left + (x + 0.5) * scale, top + (y + 0.5) * scale];
+    },
+    toFrame(event) {
+      const { scale, left, top } = this.placed;
+      return [(event.offsetX - left) / scale - 0.5, (event.offsetY - top) / scale - 0.5];
+    },
+
+    // Drawing.
+
+    // Adapt a canvas to the screen's resolution; its pen then counts in CSS pixels.
+    sized(canvas) {
+      const wide = Math.round(canvas.clientWidth * devicePixelRatio);
+      const high = Math.round(canvas.clientHeight * devicePixelRatio);
+      if (!wide || !high) return null;
+      if (canvas.width !== wide || canvas.height !== high) [canvas.width, canvas.height] = [wide, high];
+      const pen = canvas === this.$refs.frame ? this.pen : canvas.getContext("2d");
+      pen.setTransform(devicePixelRatio, 0, 0, devicePixelRatio, 0, 0);
+      return pen;
+    },
+    paint() {
+      const canvas = this.$refs.frame, pen = this.drawn && this.sized(canvas);
+      if (!pen) return;
+      const { size, marks, names, lights } = this.drawn, window = [canvas.clientWidth, canvas.clientHeight];
+      this.placed = this.placement();
+      const { scale, left, top } = this.placed;
+      pen.fillStyle = "#000";
+      pen.fillRect(0, 0, ...window);
+      pen.imageSmoothingEnabled = scale * devicePixelRatio < 1; // enlarged frames show their pixels
+      pen.imageSmoothingQuality = scale * devicePixelRatio < 0.5 ? "medium" : "low"; // so that no star is skipped
+      pen.drawImage(this.sheet, left, top, size[0] * scale, size[1] * scale);
+      pen.strokeStyle = "#252c38";
+      pen.lineWidth = 1;
+      pen.strokeRect(left - 0.5, top - 0.5, size[0] * scale + 1, size[1] * scale + 1);
+      if (this.display.grid) drawGrid(pen, this.lines(), this.toScreen, window, GRID);
+      drawMarks(pen, marks, this.toScreen);
+      drawNames(pen, names, this.toScreen, window, "#6fdc7f");
+      if (this.cut) this.paintCut(pen);
+      const ringed = lights.find((light) => light[2] === this.hovered && light[2] >= 0);
+      if (ringed) drawHighlight(pen, this.toScreen(ringed[0], ringed[1]), PALE);
+      canvas.dataset.frame = this.drawn.src;
+      canvas.dataset.placement = [left, top, scale].map((value) => value.toFixed(6)).join(" ");
+      canvas.dataset.ringed = ringed ? ringed[2] : "";
+      canvas.ariaLabel = this.drawn.label;
+      this.paintUnder();
+    },
+    lines() {
+      if (this.gridOf !== this.drawn.view) {
+        this.gridOf = this.drawn.view;
+        this.gridKept = gridLines(this.drawn);
+      }
+      return this.gridKept;
+    },
+    paintCut(pen) {
+      const [from, to] = this.cut.map((end) => this.toScreen(...end));
+      pen.strokeStyle = CUT;
+      pen.lineWidth = 1.5;
+      pen.beginPath();
+      pen.moveTo(...from);
+      pen.lineTo(...to);
+      pen.stroke();
+    },
+    // Loupe, plot and readout.
+    paintUnder() {
+      if (!this.drawn) return;
+      const plot = this.$refs.plot, pen = this.sized(plot);
+      const { offset, step } = this.drawn.pixels, limits = this.levels.map((level) => offset + step * level);
+      plot.dataset.limits = limits.map((dn) => dn.toPrecision(8)).join(" ");
+      if (pen && this.cut) {
+        const found = profile(this.drawn.pixels, ...this.cut);
+        drawProfile(pen, found, [plot.clientWidth, plot.clientHeight], CUT);
+        plot.dataset.cut = this.cut.flat().map((value) => value.toFixed(4)).join(" ");
+        plot.dataset.profile = found.values.map((dn) => dn.toFixed(1)).join(" ");
+        plot.ariaLabel = `profile of the cut, ${found.values.length} values`;
+      } else if (pen) {
+        this.axis = drawHistogram(pen, this.drawn, this.levels, [plot.clientWidth, plot.clientHeight]);
+        plot.ariaLabel = `histogram; limits ${limits.map((dn) => dn.toFixed(1)).join(" to ")} DN`;
+      }
+      this.paintLoupe();
+      this.writeReadout();
+    },
+    paintLoupe() {
+      const canvas = this.$refs.loupe, at = this.cursor ?? this.pinned, pen = at && this.sized(canvas);
+      if (!pen) return;
+      const { width, height, offset, step } = this.drawn.pixels, { across, down } = LOUPE;
+      const x = Math.min(Math.max(Math.round(at[0]) - (across >> 1), 0), Math.max(width - across, 0));
+      const y = Math.min(Math.max(Math.round(at[1]) - (down >> 1), 0), Math.max(height - down, 0));
+      const dn = [];
+      for (let row = y; row < y + down; row++) for (let column = x; column < x + across; column++) dn.push(this.value(column, row) ?? 0);
+      const low = Math.min(...dn), range = Math.max(Math.max(...dn) - low, step);
+      const gray = (value) => Math.round(255 * Math.sqrt((value - low) / range));
+      const crosses = this.drawn.lights.filter((light) => light[3]);
+      drawLoupe(pen, { x, y, across, down, dn }, gray, crosses, [canvas.clientWidth, canvas.clientHeight], CROSS);
+      canvas.ariaLabel = `pixels from ${x} ${y}, ${across} by ${down}: ${dn.map((value) => value.toFixed(0)).join(" ")}`;
+    },
+    writeReadout() {
+      const readout = this.$refs.readout, at = this.cursor ?? this.pinned;
+      const [x, y] = at ? at.map(Math.round) : [0, 0], dn = at && this.value(x, y);
+      if (dn === null) {
+        readout.textContent = "wheel: zoom · drag: pan · shift-drag: cut · double-click: whole frame";
+        return;
+      }
+      const number = this.drawn.pixels.step === 1 ? dn.toFixed(0) : dn.toFixed(2);
+      const place = `x ${at[0].toFixed(1)}  y ${at[1].toFixed(1)}`.padEnd(20);
+      readout.textContent = `${place}${number.padStart(6)} DN   ${directionText(this.drawn, at[0], at[1])}`;
+    },
+
+    // Mouse and touch on the frame.
+
+    wheel(event) {
+      if (!this.drawn) return;
+      const [x, y] = this.toFrame(event), { scale, whole } = this.placed;
+      const next = Math.min(Math.max(scale * 1.0018 ** -event.deltaY, 0.5 * whole), Math.max(LARGEST_PX, whole));
+      const { clientWidth, clientHeight } = this.$refs.frame; // the pixel under the cursor stays there
+      this.zoom = {
+        scale: next,
+        x: x + 0.5 + (clientWidth / 2 - event.offsetX) / next,
+        y: y + 0.5 + (clientHeight / 2 - event.offsetY) / next,
+      };
+      this.paint();
+    },
+    press(event) {
+      if (!this.drawn || event.button !== 0) return;
+      this.$refs.frame.setPointerCapture(event.pointerId);
+      const { left, top, scale } = this.placed, [width, height] = this.drawn.size;
+      const { clientWidth, clientHeight } = this.$refs.frame;
+      const middle = this.zoom ?? { scale, x: (clientWidth / 2 - left) / scale, y: (clientHeight / 2 - top) / scale };
+      this.pressed = { from: [event.offsetX, event.offsetY], start: this.toFrame(event), middle, cutting: event.shiftKey };
+      if (event.shiftKey) this.cut = null;
+    },
+    move(event) {
+      if (!this.drawn) return;
+      const at = this.toFrame(event);
+      if (this.pressed) {
+        const [dx, dy] = [event.offsetX - this.pressed.from[0], event.offsetY - this.pressed.from[1]];
+        this.pressed.moved ||= Math.hypot(dx, dy) > 3;
+        if (!this.pressed.moved) return;
+        if (this.pressed.cutting) this.cut = [this.pressed.start, at];
+        else {
+          const { scale, x, y } = this.pressed.middle;
+          this.zoom = { scale, x: x - dx / scale, y: y - dy / scale };
+        }
+        this.cursor = at;
+        this.paint();
+        return;
+      }
+      this.cursor = at;
+      this.hover(at);
+      this.paintUnder();
+    },
+    // Report the light under the cursor when it is another one.
+    hover(at) {
+      const found = at && this.nearest(at), id = found ? found[2] : null;
+      const key = found ? `${found[0]} ${found[1]}` : null;
+      if (key === this.hoverKey) return;
+      this.hoverKey = key;
+      this.hovered = id;
+      this.paint();
+      this.$emit("hover", { id, x: found?.[0], y: found?.[1], inside: Boolean(found) });
+    },
+    nearest(at) {
+      const reach = REACH_PX / this.placed.scale;
+      let best = null, least = reach;
+      for (const light of this.drawn.lights) {
+        const distance = Math.hypot(light[0] - at[0], light[1] - at[1]);
+        if (distance < least) [best, least] = [light, distance];
+      }
+      return best;
+    },
+    release(event) {
+      const pressed = this.pressed;
+      this.pressed = null;
+      if (!this.drawn || !pressed || pressed.moved || event.type === "pointercancel") return;
+      if (pressed.cutting) this.cut = null;
+      const found = this.nearest(pressed.start);
+      this.pinned = found ? [found[0], found[1]] : pressed.start;
+      this.$emit("choose", { id: found ? found[2] : null, x: this.pinned[0], y: this.pinned[1] });
+      this.paint();
+    },
+    leave() {
+      if (this.pressed || !this.drawn) return;
+      this.cursor = null;
+      this.hover(null);
+      this.paintUnder();
+    },
+
+    // Mouse on the histogram: its two lines are the limits.
+
+    grab(event) {
+      if (!this.drawn || this.cut) return;
+      this.$refs.plot.setPointerCapture(event.pointerId);
+      this.held = nearestLevel(this.axis, this.levels, event.offsetX);
+      this.drag(event);
+    },
+    drag(event) {
+      if (this.held === null) return;
+      const { offset, step } = this.drawn.pixels, limits = this.levels.map((level) => offset + step * level);
+      limits[this.held] = offset + step * levelAt(this.axis, event.offsetX);
+      if (!(limits[0] < limits[1])) return;
+      if (!this.manual) this.$emit("manual");
+      this.manual = limits;
+      this.recolor();
+    },
+  },
+};

@@ -1,0 +1,73 @@
+// The plot under the frame: a histogram with the two display limits, or the profile of a cut.
+
+const MARGIN = { left: 4, right: 4, top: 16, bottom: 16 };
+const QUIET = "#8b95a5", BAR = "#46566e", LIMIT = "#f0b429";
+const BINS = 80;
+
+// The axis is an inverse hyperbolic sine about the sky, in units of its scatter: linear there, logarithmic for stars.
+function axisOf({ sorted, low, high }, width) {
+  const sky = sorted[sorted.length >> 1];
+  const scatter = Math.max(1.4826 * (sky - sorted[sorted.length >> 2]), 1);
+  const bend = (level) => Math.asinh((level - sky) / scatter);
+  const [first, last] = [bend(low) - 0.3, bend(high) + 0.3], inner = width - MARGIN.left - MARGIN.right;
+  return {
+    at: (level) => MARGIN.left + ((bend(level) - first) / (last - first)) * inner,
+    level: (x) => sky + scatter * Math.sinh(first + ((x - MARGIN.left) / inner) * (last - first)),
+  };
+}
+
+export function drawHistogram(pen, { pixels, sampled }, levels, [width, height]) {
+  const axis = axisOf(sampled, width), counts = new Float64Array(BINS);
+  for (const value of sampled.sorted) {
+    const bin = Math.floor(((axis.at(value) - MARGIN.left) / (width - MARGIN.left - MARGIN.right)) * BINS);
+    counts[Math.min(Math.max(bin, 0), BINS - 1)] += 1;
+  }
+  const most = Math.log1p(Math.max(...counts)), room = height - MARGIN.top - MARGIN.bottom;
+  pen.clearRect(0, 0, width, height);
+  pen.fillStyle = BAR;
+  const wide = (width - MARGIN.left - MARGIN.right) / BINS;
+  counts.forEach((count, n) => {
+    const tall = (Math.log1p(count) / most) * room;
+    pen.fillRect(MARGIN.left + n * wide, height - MARGIN.bottom - tall, wide + 0.3, tall);
+  });
+  pen.font = "11px ui-monospace, monospace";
+  levels.forEach((level, n) => {
+    const x = Math.min(Math.max(axis.at(level), 1), width - 1), dn = pixels.offset + pixels.step * level;
+    pen.fillStyle = LIMIT;
+    pen.fillRect(x - 1, MARGIN.top - 2, 2, room + 4);
+    pen.textAlign = n ? "right" : "left";
+    pen.fillText(dn.toFixed(0), n ? width - MARGIN.right : MARGIN.left, height - 3);
+  });
+  pen.textAlign = "left";
+  pen.fillStyle = QUIET;
+  pen.fillText("drag the limits", MARGIN.left, 11);
+  return axis;
+}
+
+// Which of the two limits is nearer to a place on the axis.
+export function nearestLevel(axis, levels, x) {
+  return Math.abs(axis.at(levels[0]) - x) <= Math.abs(axis.at(levels[1]) - x) ? 0 : 1;
+}
+
+export const levelAt = (axis, x) => axis.level(x);
+
+export function drawProfile(pen, { length, values }, [width, height], color) {
+  const low = Math.min(...values), high = Math.max(...values), range = Math.max(high - low, 1);
+  const room = height - MARGIN.top - MARGIN.bottom, wide = width - MARGIN.left - MARGIN.right;
+  pen.clearRect(0, 0, width, height);
+  pen.strokeStyle = color;
+  pen.lineWidth = 1.3;
+  pen.beginPath();
+  values.forEach((dn, n) => {
+    const x = MARGIN.left + (n / Math.max(values.length - 1, 1)) * wide, y = MARGIN.top + (1 - (dn - low) / range) * room;
+    if (n) pen.lineTo(x, y);
+    else pen.moveTo(x, y);
+  });
+  pen.stroke();
+  pen.font = "11px ui-monospace, monospace";
+  pen.fillStyle = QUIET;
+  pen.fillText(`cut: ${low.toFixed(0)} to ${high.toFixed(0)} DN`, MARGIN.left, 11);
+  pen.textAlign = "right";
+  pen.fillText(`${length.toFixed(1)} px`, width - MARGIN.right, height - 3);
+  pen.textAlign = "left";
+}
