@@ -19,17 +19,19 @@ from nicegui.events import KeyEventArguments
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.page import forms, keys, style
+from skysim.apps.gui.page.frame.sensor import FRAMES, Sensor
 from skysim.apps.gui.page.panels.attitude import AttitudeCard
+from skysim.apps.gui.page.panels.lights import LightsPanel
 from skysim.apps.gui.page.panels.monte_carlo import MonteCarloPanel
 from skysim.apps.gui.page.panels.photo import PhotoPanel
 from skysim.apps.gui.page.panels.run import RunPanel
 from skysim.apps.gui.page.panels.scene import ScenePanel
-from skysim.apps.gui.page.panels.sensor import FRAMES, Sensor
-from skysim.apps.gui.page.scene_3d import Scene3D
 from skysim.apps.gui.page.shell.arrangement import Arrangement
+from skysim.apps.gui.page.shell.help import help_dialog
 from skysim.apps.gui.page.shell.history import History
 from skysim.apps.gui.page.shell.palette import Command, Palette
 from skysim.apps.gui.page.shell.wording import for_page
+from skysim.apps.gui.page.space.space import Scene3D
 from skysim.apps.gui.state import View
 from skysim.apps.gui.worker import export, pointing
 from skysim.apps.gui.worker.photo import Photo
@@ -38,7 +40,7 @@ from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.scene.loader import find, load
 
-PANELS = ("Lab", "Scene", "Run", "Monte Carlo", "Image", "Log")
+PANELS = ("Lab", "Lights", "Scene", "Run", "Monte Carlo", "Image", "Log")
 MAX_LOG_LINES = 500
 
 
@@ -119,7 +121,7 @@ class Tab:
                 for key in keys.KEYS:
                     if key.description:
                         ui.html(f"<span><kbd>{key.label}</kbd>{key.description}</span>", sanitize=False)
-        self.help = self.build_help()
+        self.help = help_dialog()
         ui.keyboard(on_key=self.key, ignore=["input", "textarea"])
         self.history = History(self, self.scene)
         self.palette = Palette(self.commands)
@@ -164,8 +166,9 @@ class Tab:
                     ui.tab(name).mark(f"tab-{name}")
             with ui.tab_panels(self.tabs, value="Lab", animated=False, keep_alive=True).classes("lab-panels"):
                 with ui.tab_panel("Lab").classes("relative-position"):
-                    self.scene_3d = Scene3D()
-                    ui.label("drag: rotate · right drag: pan · wheel: zoom").classes("lab-turn quiet")
+                    self.scene_3d = Scene3D(self)
+                with ui.tab_panel("Lights"):
+                    self.lights = LightsPanel(self)
                 with ui.tab_panel("Scene"):
                     self.scene_panel = ScenePanel(self)
                 with ui.tab_panel("Run").classes("lab-run"):
@@ -176,20 +179,6 @@ class Tab:
                     self.photo = PhotoPanel(self)
                 with ui.tab_panel("Log"):
                     self.log_label = ui.label("Nothing yet.").classes("mono lab-log").mark("log")
-
-    def build_help(self) -> ui.dialog:
-        with ui.dialog() as dialog, ui.card().style("max-width: 600px; padding: 20px 24px; gap: 12px"):
-            ui.label("skysim gui").style("font-weight: 600; font-size: 15px")
-            ui.label(
-                "Point the star sensor, view its frame, and compare the tracker's attitude with the true one. Under a"
-                " dome the angles are the vehicle's (roll, pitch, yaw); under the stars the camera's (RA, Dec, roll)."
-            )
-            with ui.element("div").style("display: grid; grid-template-columns: 110px 1fr; gap: 4px 12px"):
-                for key in keys.KEYS:
-                    label = f'<span class="lab-keys" style="padding: 0; border: 0"><kbd>{key.label}</kbd></span>'
-                    ui.html(label, sanitize=False)
-                    ui.label(key.help)
-        return dialog
 
     def commands(self) -> list[Command]:
         """Every action with its key: those of keys, the panels, the exports."""

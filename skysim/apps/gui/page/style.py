@@ -88,6 +88,15 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-run > * {{ flex: none }}
 .mono.lab-log {{ white-space: pre-wrap; overflow-wrap: anywhere }}
 .q-uploader__subtitle {{ display: none }} .q-uploader__title {{ font-size: 13px; font-weight: 500 }}
+.lab-space {{ position: relative; overflow: hidden }}
+.lab-space > canvas {{ position: absolute; inset: 0; width: 100%; height: 100%; touch-action: none }}
+.lab-space > .lab-names {{ pointer-events: none }}
+.lab-tag {{ position: absolute; left: 0; top: 0; pointer-events: none; color: #fff; background: #0d1015b0 }}
+.lab-looks {{ position: absolute; right: 20px; top: 14px; display: flex; gap: 4px }}
+.lab-lights {{ width: 100%; border-collapse: collapse; cursor: default; text-align: right }}
+.lab-lights th {{ position: sticky; top: -10px; font-weight: normal; color: {COLORS["quiet"]};
+  background: {COLORS["panel"]} }}
+.lab-lights tr > :first-child {{ text-align: left }} .lab-lights tr.ringed {{ background: {COLORS["line"]} }}
 .lab-turn {{ position: absolute; left: 24px; bottom: 16px; font-size: 11px; pointer-events: none }}
 .stale {{ opacity: .45 }}
 .lab-side {{ display: grid; grid-template: auto auto minmax(0, 1fr) / minmax(0, 1fr);

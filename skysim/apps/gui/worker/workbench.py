@@ -15,7 +15,7 @@ from estimator.core.types import Attitude
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.gui.messages import Detection, FrameView, Lens, Light, SceneInfo, TrackerResult
+from skysim.apps.gui.messages import Detection, FrameView, LabGeometry, Lens, Light, SceneInfo, TrackerResult
 from skysim.apps.gui.worker import geometry, pixels
 from skysim.core import quaternion
 from skysim.core.types import Floats, Frame, Truth
@@ -36,7 +36,7 @@ STAGES = ("detector", "centroider", "identifier", "solver")
 class Workbench:
     """A scene that is set up, with the current attitude and the newest frame.
 
-    lens : where its camera's pixels point
+    lens : where its camera's pixels point;  geometry : of the laboratory
     rendered_count : number of frames rendered; it changes the seed, so that each frame has independent noise
     magnitude : V magnitude by a light's number
     """
@@ -46,6 +46,7 @@ class Workbench:
     estimator: factory.Estimator
     lab_from_body: Rotation
     lens: Lens
+    geometry: LabGeometry
     rendered_count: int = 0
     frame: Frame | None = None
     truth: Truth | None = None
@@ -64,8 +65,8 @@ class Workbench:
             return replace(before, scene=scene, testbed=testbed, estimator=warm_tracker(testbed))
         testbed = build_testbed(scene)
         lab_from_body = testbed.trajectory.lab_from_body[0]
-        lens = pixels.scene_lens(testbed)
-        return cls(scene, testbed, warm_tracker(testbed), lab_from_body, lens, magnitude=magnitude_by_id(testbed))
+        views = pixels.scene_lens(testbed), geometry.lab_geometry(testbed)
+        return cls(scene, testbed, warm_tracker(testbed), lab_from_body, *views, magnitude=magnitude_by_id(testbed))
 
     @property
     def stages(self) -> dict[str, str]:
@@ -87,7 +88,7 @@ class Workbench:
             self.stages,
             tracker_settings.algorithm_names(scene),
             self.testbed.duration_s,
-            geometry.lab_geometry(self.testbed),
+            self.geometry,
             self.lens,
         )
 

@@ -54,8 +54,10 @@ export default {
     this.sheet = document.createElement("canvas");
     this.watcher = new ResizeObserver(() => this.paint());
     for (const canvas of [this.$refs.frame, this.$refs.loupe, this.$refs.plot]) this.watcher.observe(canvas);
+    window.addEventListener("skysim-hover", this.ring);
   },
   beforeUnmount() {
+    window.removeEventListener("skysim-hover", this.ring);
     this.watcher.disconnect();
   },
   watch: {
@@ -306,9 +308,19 @@ export default {
       const key = found ? `${found[0]} ${found[1]}` : null;
       if (key === this.hoverKey) return;
       this.hoverKey = key;
+      this.mark(found, id);
+      window.dispatchEvent(new CustomEvent("skysim-hover", { detail: { id: id >= 0 ? id : null } }));
+    },
+    // A light is hovered elsewhere on the page, or no more.
+    ring({ detail: { id } }) {
+      if (this.drawn && id !== (this.hovered >= 0 ? this.hovered : null)) {
+        this.mark(this.drawn.lights.find((light) => light[2] === id), id);
+      }
+    },
+    mark(light, id) {
       this.hovered = id;
       this.paint();
-      this.$emit("hover", { id, x: found?.[0], y: found?.[1], inside: Boolean(found) });
+      this.$emit("hover", { id, x: light?.[0], y: light?.[1], inside: Boolean(light) });
     },
     nearest(at) {
       const reach = REACH_PX / this.placed.scale;
