@@ -209,3 +209,37 @@ class FlightStep:
     total: float
     rows: tuple[FrameRow, ...] = ()
     log: MotionLog | None = None
+
+
+class PlanCheck(NamedTuple):
+    """The check of a scene: the facts, each a name and lines of text, and the warnings."""
+
+    facts: tuple[tuple[str, tuple[str, ...]], ...]
+    findings: tuple[str, ...]
+
+
+class AmbiguityMap(NamedTuple):
+    """The most similar other field of the field about each LED.
+
+    ids, others : (N,) LEDs at the centers of the fields;  fraction : (N,) of the LEDs that coincide, at least `least`
+    coincidence_mm : two LEDs coincide if they are nearer than this
+    """
+
+    ids: NDArray[np.int64]
+    others: NDArray[np.int64]
+    fraction: Floats
+    least: float
+    coincidence_mm: float
+
+
+class SurveyPlan(NamedTuple):
+    """Attitudes to hold for a survey of the dome.
+
+    angles_deg : roll, pitch and yaw of each;  shown : LEDs that each shows;  leds : on the dome
+    led_mm     : rms error of an LED predicted after a number of frames; None where they do not determine it
+    """
+
+    angles_deg: tuple[tuple[float, ...], ...]
+    shown: tuple[int, ...]
+    leds: int
+    led_mm: tuple[tuple[int, float | None], ...]

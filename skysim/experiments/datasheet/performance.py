@@ -7,9 +7,10 @@ import time
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
 from skysim.core.types import Floats
-from skysim.experiments.datasheet.components import mean_known
+from skysim.experiments.datasheet.components import mean_known, mean_square_ratio
 from skysim.experiments.datasheet.run import Sheet
 from skysim.experiments.datasheet.terms import GROUPS, rms
 from skysim.experiments.study.execution import setups, trials
@@ -100,6 +101,24 @@ def quantiles(sheet: Sheet) -> list[dict[str, Any]]:
     ]
 
 
+def consistency(sheet: Sheet) -> dict[str, Any]:
+    """How well the tracker's covariance P and the assumption of equal axes fit the errors e of independent frames.
+
+    The normalized error squared e^T P^-1 e has the chi-square distribution of three degrees of freedom where P is
+    right: its mean is 3, and a share of LEVELS lies within the quantile of that probability.
+    """
+    rows = sheet.rows("sky")
+    right = sheet.right(rows)
+    nees = sheet.column("nees", rows)[right]
+    within = [(level, int(np.sum(nees <= chdtri(3, 1 - level))), nees.size) for level in LEVELS]
+    x, y, _ = sheet.errors(rows)[:, right] ** 2
+    return {
+        "nees": metrics.resampled(nees, np.mean),
+        "within": [{"level": level, "share": metrics.proportion(hits, total)} for level, hits, total in within],
+        "y_over_x": mean_square_ratio(y, x),
+    }
+
+
 def noise_equivalent_angle(first: Floats, second: Floats) -> float:
     """Standard deviation of the temporal noise, rms(a - b) / sqrt(2), from pairs of frames that differ in noise."""
     return float(np.sqrt(mean_known((first - second) ** 2) / 2))
@@ -127,11 +146,11 @@ def by_rate(sheet: Sheet) -> list[dict[str, Any]]:
     return found
 
 
-def by_magnitude(sheet: Sheet) -> list[dict[str, Any]]:
-    """The same by the limit of the tracker's catalog; empty under a dome."""
+def by_level(sheet: Sheet, experiment: str, key: str) -> list[dict[str, Any]]:
+    """The same by the levels of a key, in rising order; empty for a scene without the experiment."""
     return [
-        {"limit_mag": limit, **pair_row(sheet, sheet.rows("magnitude", limit_mag=limit))}
-        for limit in sorted(sheet.levels("magnitude", "limit_mag"))
+        {key: level, **pair_row(sheet, sheet.rows(experiment, **{key: level}))}
+        for level in sorted(sheet.levels(experiment, key))
     ]
 
 
@@ -157,15 +176,6 @@ def by_acceleration(sheet: Sheet) -> list[dict[str, Any]]:
             }
         )
     return found
-
-
-def by_tracked(sheet: Sheet, key: str) -> list[dict[str, Any]]:
-    """Error and outcomes in tracking mode by a rate or an acceleration; empty without the mode."""
-    experiment = f"tracked {key}"
-    return [
-        {key: value, **pair_row(sheet, sheet.rows(experiment, **{key: value}))}
-        for value in sheet.levels(experiment, key)
-    ]
 
 
 class Limit(NamedTuple):
@@ -205,9 +215,9 @@ def solution_times_s(sheet: Sheet) -> Floats:
     All are solved twice and the second time counts: the first one compiles or loads what the solutions need.
     """
     setup = setups.prepared_setup(sheet.spec, sheet.cells[sheet.rows("sky")[0]].settings)
-    found = []
-    for replicate in (*range(TIMED), *range(TIMED)):
-        frame, _, _ = trials.render_trial_frame(setup, setups.seed_of(sheet.spec, 0, replicate))
+    seeds = (setups.seed_of(sheet.spec, 0, replicate) for replicate in range(TIMED))
+    frames, found = [trials.render_trial_frame(setup, seed)[0] for seed in seeds], []
+    for frame in frames * 2:
         begin_s = time.perf_counter()
         factory.solve_frame(setup.estimator, frame)
         found.append(time.perf_counter() - begin_s)

@@ -48,6 +48,7 @@ class Statement(NamedTuple):
     counts: Counts
     claims: list[dict[str, Any]]
     quantiles: list[dict[str, Any]]
+    consistency: dict[str, Any]
     rates: list[dict[str, Any]]
     accelerations: list[dict[str, Any]]
     tracked_rates: list[dict[str, Any]]
@@ -70,11 +71,12 @@ def state(sheet: Sheet) -> Statement:
         found,
         performance.claims(found),
         performance.quantiles(sheet),
+        performance.consistency(sheet),
         performance.by_rate(sheet),
         performance.by_acceleration(sheet),
-        performance.by_tracked(sheet, "rate_deg_s"),
-        performance.by_tracked(sheet, "acceleration_deg_s2"),
-        performance.by_magnitude(sheet),
+        performance.by_level(sheet, "tracked rate_deg_s", "rate_deg_s"),
+        performance.by_level(sheet, "tracked acceleration_deg_s2", "acceleration_deg_s2"),
+        performance.by_level(sheet, "magnitude", "limit_mag"),
         performance.disturbances(sheet),
         performance.solution_times_s(sheet).tolist(),
     )
@@ -146,7 +148,7 @@ def size(square: Bounded) -> str:
     return f"{value:.3g} ({low:.3g} to {high:.3g})"
 
 
-def bounded(value: Bounded, digits: int = 3) -> str:
+def bounded(value: Bounded | Summary, digits: int = 3) -> str:
     return f"{value.value:.{digits}g} ({value.low:.{digits}g} to {value.high:.{digits}g})"
 
 
@@ -287,13 +289,23 @@ def quantile_section(statement: Statement) -> Section:
     """Quantiles of the errors."""
     texts = [
         "Errors that a frame stays below with the probability at the left, over independent frames"
-        f" ({ENSEMBLE}), with 95 % intervals between order statistics; across is the angle between the boresights."
+        f" ({ENSEMBLE}), with 95 % intervals between order statistics; across is the angle between the boresights.",
+        consistency_text(statement.consistency),
     ]
     rows = [
         [f"{100 * one['level']:g} %", *(quantile_text(one[name]) for name in terms.GROUPS)]
         for one in statement.quantiles
     ]
     return Section("Performance at a confidence", texts, ["probability", "boresight angle ″", "about ″"], rows)
+
+
+def consistency_text(found: dict[str, Any]) -> str:
+    """What the covariances of the attitudes are worth, and whether x and y err alike."""
+    shares = ", ".join(f"{percent(one['share'])} % of {100 * one['level']:g} %" for one in found["within"])
+    return (
+        f"The tracker's own covariance: normalized error squared {bounded(found['nees'])}, 3 where it is right;"
+        f" within its ellipsoids {shares}. Mean square of y over that of x: {bounded(found['y_over_x'])}."
+    )
 
 
 def quantile_text(found: Summary) -> str:

@@ -86,8 +86,11 @@ class CalibrationPrior:
         return np.nan_to_num(xy_px, nan=-1e9)
 
 
-def survey_uncertainty(imu_sigma: str, led_sigma: str, lever_sigma: str, focal_error: str) -> SurveyUncertainty:
-    """Parse the quantities of the command line. Raises InputError for an invalid or out-of-range value."""
+def survey_uncertainty(
+    imu_sigma: str = "0.5 deg", led_sigma: str = "2 mm", lever_sigma: str = "5 mm", focal_error: str = "1%"
+) -> SurveyUncertainty:
+    """Parse the quantities of the command line, with its defaults. Raises InputError for an invalid or out-of-range
+    value."""
     texts = imu_sigma, led_sigma, lever_sigma, focal_error
     return SurveyUncertainty(*option_quantities(UNCERTAINTY_OPTIONS, texts))
 

@@ -32,12 +32,14 @@ from skysim.experiments.dome_survey.prior import (
     calibration_prior,
     image_sizes,
     survey_model,
+    with_survey_errors,
 )
 from skysim.experiments.dome_survey.results.findings import accuracy_statistics, find_faults, predicted
 from skysim.experiments.dome_survey.results.report import led_errors
 from skysim.experiments.dome_survey.survey_run import SurveyRun
 from skysim.results.files import frames as frame_files
-from skysim.simulation.testbed import Testbed
+from skysim.scene.scene import Scene
+from skysim.simulation.testbed import Testbed, build_testbed
 
 PLANNED, RANDOM = "plan", "random"
 
@@ -63,6 +65,15 @@ class Plan:
         total = len(self.lab_from_body)
         counts = sorted({max(round(total * part / 4), 2) for part in range(1, 5)})
         return [(count, self.first(count)) for count in counts]
+
+
+def plan_survey(
+    scene: Scene, uncertainty: SurveyUncertainty, count: int, tilt_deg: float, kind: str = PLANNED
+) -> tuple[Testbed, CalibrationPrior, Plan]:
+    """The test bed with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
+    testbed = build_testbed(with_survey_errors(scene, uncertainty))
+    before = calibration_prior(testbed)
+    return testbed, before, make_plan(testbed, before, uncertainty, count, tilt_deg, kind)
 
 
 def make_plan(

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.camera import wcs
+from skysim.core.errors import InputError
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
@@ -23,8 +24,10 @@ from skysim.simulation.checks.sky import air, bodies, claims, depth, stray
 from skysim.simulation.checks.views import views
 from skysim.simulation.reference_limits import check_reference
 from skysim.simulation.testbed import Testbed
+from skysim.sources.dome.placement.ambiguity import Ambiguity
 
 OWN_KEYS = ("camera.", "tracker.", "exposure.")  # of a head; a finding about any other key is one about the scene
+LEAST_ALIKE, MAP_WORK = 0.3, 60_000  # of an ambiguity map: least fraction sought, fields times LEDs in a field
 SKY_FINDINGS = (depth.sky_too_shallow, depth.tracker_too_shallow, claims.floor_too_small, air.refraction)
 
 
@@ -58,8 +61,7 @@ def check(testbed: Testbed, tilt_deg: float | None = None, rate_body_rad_s: Floa
         rates = np.tile(rate_body_rad_s, (len(frames.t_s), 1))
         frames = frames._replace(rate_body_rad_s=rates, acceleration_body_rad_s2=None)
     check_reference(guidance.plan(scene.motion, testbed.trajectory.lab_from_body[0], testbed.profiles), testbed)
-    reach = attitudes.within_reach(scene, testbed.mount, frames, tilt_deg)
-    samples = Samples(sampled(frames, context), sampled(reach, context))
+    samples = samples_of(context, frames, tilt_deg)
     facts = [
         fact for build in (*FACTS, depth.faintest_star, claims.fact) if (fact := build(context, samples)) is not None
     ]
@@ -79,6 +81,24 @@ def check(testbed: Testbed, tilt_deg: float | None = None, rate_body_rad_s: Floa
     for n, head in enumerate(checked):
         findings += head_findings(n, head.findings, findings)
     return Check(facts, findings)
+
+
+def ambiguity_map(testbed: Testbed) -> tuple[Ambiguity, float]:
+    """The most similar other field of the field about each LED within the greatest tilt, and what coincides, m.
+
+    The LEDs are numbered by their rows in the tracker's map. Raises InputError where fields are not compared.
+    """
+    context = context_of(testbed)
+    samples = samples_of(context, attitudes.of_frames(testbed), None)
+    if reason := lookalike.why_not_compared(context, samples):
+        raise InputError(reason)
+    return lookalike.compared(context, samples, LEAST_ALIKE, MAP_WORK)
+
+
+def samples_of(context: Context, frames: Attitudes, tilt_deg: float | None) -> Samples:
+    """What the camera sees at the frames and within reach."""
+    reach = attitudes.within_reach(context.testbed.scene, context.testbed.mount, frames, tilt_deg)
+    return Samples(sampled(frames, context), sampled(reach, context))
 
 
 def sampled(at: Attitudes, context: Context) -> Sampled:

@@ -15,7 +15,7 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from skysim.apps.gui.messages import Detection, Light
 from skysim.apps.gui.page.panels import lights
-from skysim.apps.gui.worker import geometry
+from skysim.apps.gui.worker.scene import geometry
 from skysim.scene import loader
 from skysim.simulation.testbed import build_testbed
 

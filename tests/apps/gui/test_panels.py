@@ -25,8 +25,9 @@ from skysim.apps.gui.page.frame import overlay
 from skysim.apps.gui.page.frame.sensor import Sensor
 from skysim.apps.gui.page.frame.star_names import NAMES
 from skysim.apps.gui.server import Guard, host_of, report_path, user_of
-from skysim.apps.gui.worker import export, photo, pixels, pointing, study_process, workbench
+from skysim.apps.gui.worker import export, photo, pixels, study_process, workbench
 from skysim.apps.gui.worker.photo import SUFFIXES
+from skysim.apps.gui.worker.scene import pointing
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.io.images import IMAGE_SUFFIXES

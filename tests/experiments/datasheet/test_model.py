@@ -29,6 +29,7 @@ CONSTANTS: dict[str, Any] = {
     "scale_deg": 6.0,
     "rates_deg_s": [0.0, 1.0, 4.0],
     "noise": [[1.0, 1.0, 10.0], [1.5, 1.5, 12.0], [4.0, 4.0, 30.0]],
+    "along": [0.0, 1.2, 5.0],
 }
 
 
@@ -58,7 +59,7 @@ def test_a_process_is_stationary_and_forgets_exponentially():
 
 def test_all_is_constant_at_rest_but_the_noise(model):
     """Of one state: the mean is the slow part, the deviation the noise at the field's scale."""
-    state = State(np.array([1.0, -1.0, 0.5]), np.array([0.3, 0.2, -1.0]), 0.8, np.array([2.0, -3.0, 7.0]))
+    state = State(np.array([1.0, -1.0, 0.5]), np.array([0.3, 0.2, -1.0]), 0.8, np.array([2.0, -3.0, 7.0]), 1.0)
     errors = model.draw(np.zeros(40_000), 0.1, np.random.default_rng(5), state)
     scales = np.exp(0.5 * (0.8 * model.scale - model.scale**2 / 2))
     slow = state.bias + scales * (model.field * state.field + model.pixel * state.pixel)
@@ -70,6 +71,7 @@ def test_over_many_units_and_fields_the_variance_is_the_sum_of_the_terms(model):
     rng = np.random.default_rng(6)
     errors = np.array([model.draw(np.full(2, 1.0), 0.1, rng)[1] for _ in range(30_000)])
     expected = model.mean**2 + model.unit**2 + model.field**2 + model.pixel**2 + model.noise[1] ** 2
+    expected += model.along[1] ** 2 / 2 * np.array([1, 1, 0])
     assert np.mean(errors**2, axis=0) == pytest.approx(expected, rel=0.05)
 
 
@@ -89,6 +91,16 @@ def test_steps_have_the_statistics_of_draws(model):
         assert (found - expected) / spread == pytest.approx(np.zeros(3), abs=0.08)
 
 
+def test_noise_is_larger_about_the_axis_of_the_rate(model):
+    """At 4 degrees per second about an axis at 30 degrees from x: sqrt(4^2 + 5^2) about it, 4 about the other."""
+    state = model.start(np.random.default_rng(1))._replace(axis_rad=np.pi / 6)
+    noise = model.drawn_noise(np.full(100_000, 4.0), state.axis_rad, np.random.default_rng(3))
+    about = noise[:, :2] @ [np.cos(np.pi / 6), np.sin(np.pi / 6)]
+    other = noise[:, :2] @ [-np.sin(np.pi / 6), np.cos(np.pi / 6)]
+    assert [about.std(), other.std()] == pytest.approx([np.hypot(4, 5), 4], rel=0.01)
+    assert noise[:, 2].std() == pytest.approx(30, rel=0.01)
+
+
 @pytest.mark.parametrize("turned_deg", [0.0, 0.05, 3.0])
 def test_correlations_are_those_of_draws(model, turned_deg):
     """Of pairs of errors that the boresight's turn separates, at rest and at a rate: each pair in another field."""
@@ -100,7 +112,8 @@ def test_correlations_are_those_of_draws(model, turned_deg):
     for name, one in normal.items():
         left = np.exp(-turned_deg / model.constants[f"{name}_deg"])
         one[1] = left * one[0] + np.sqrt(1 - left**2) * one[1]
-    noise = model.noise_arcsec(np.array([rate_deg_s])) * rng.standard_normal((2, count, 3))
+    rates, axis_rad = np.full(count, rate_deg_s), rng.uniform(0, 2 * np.pi, count)
+    noise = np.stack([model.drawn_noise(rates, axis_rad, rng) for _ in range(2)])
     slow = model.field * normal["field"] + model.pixel * normal["pixel"]
     errors = np.stack([model.scales(scale[:, 0]) for scale in normal["scale"]]) * (slow + noise)
     found = np.mean(errors[0] * errors[1], axis=0) / np.mean(errors**2, axis=(0, 1))
@@ -174,16 +187,17 @@ def drawn_sheet(model: ErrorModel, fields: int) -> Sheet:
     rates = np.array([cell.settings.get("trial.rate_deg_s", 0.0) for cell in cells])
     order = np.argsort(turns)
     steps = np.diff(turns[order], prepend=turns[order][0])
-    errors = np.empty((3, len(cells), fields))
+    errors, axis_rad = np.empty((3, len(cells), fields)), np.empty(fields)
     for field in range(fields):
         state = model.start(rng, unit=False)
+        axis_rad[field] = state.axis_rad
         for row, step_deg in zip(order, steps, strict=True):
             state = turned(model, state, step_deg, rng)
-            noise = model.noise_arcsec(np.array([rates[row]]))[0] * rng.standard_normal(3)
+            noise = model.drawn_noise(rates[[row]], state.axis_rad, rng)[0]
             slow = model.field * state.field + model.pixel * state.pixel
             errors[:, row, field] = state.bias + model.scales(np.array([state.scale]))[0] * (slow + noise)
     ones = np.ones((len(cells), fields))
-    columns = dict(zip(AXES, errors, strict=True)) | {"solved": ones, "wrong": 0 * ones}
+    columns = dict(zip(AXES, errors, strict=True)) | {"solved": ones, "wrong": 0 * ones, "axis_rad": axis_rad * ones}
     return Sheet(scene, "shefex2", {}, size, designer, cells, columns, None)
 
 
@@ -194,18 +208,26 @@ def turned(model: ErrorModel, state: State, step_deg: float, rng: np.random.Gene
         left = np.exp(-step_deg / model.constants[f"{name}_deg"])
         old = np.asarray(getattr(state, name))
         new.append(left * old + np.sqrt(1 - left**2) * rng.standard_normal(old.shape))
-    return State(new[0], new[1], float(new[2]), state.bias)
+    return state._replace(field=new[0], pixel=new[1], scale=float(new[2]))
 
 
 @pytest.mark.slow
-def test_a_model_agrees_with_other_fields_of_its_own_errors_and_not_with_others():
-    """Fitted to half of 300 fields that a model drew; wrong noise and wrong memory are noticed in the other half."""
-    truth = ErrorModel(CONSTANTS | {"rates_deg_s": [0.0, 0.28, 0.57, 1.1, 2.3], "noise": [[1.0, 1.0, 10.0]] * 5})
+def test_a_model_agrees_with_other_fields_of_its_own_errors_and_not_with_others(monkeypatch: pytest.MonkeyPatch):
+    """Fitted to half of 300 fields that a model drew; wrong noise and wrong memory are noticed in the other half.
+
+    More than 5 % of the p-values are below 0.05, because the fit to 150 fields has errors of its own.
+    """
+    rates = {"rates_deg_s": [0.0, 0.28, 0.57, 1.1, 2.3], "along": [0.0, 0.5, 1.0, 2.0, 4.0]}
+    truth = ErrorModel(CONSTANTS | rates | {"noise": [[1.0, 1.0, 10.0]] * 5})
     sheet = drawn_sheet(truth, 300)
+    monkeypatch.setattr(fit, "axes_rad", lambda sheet, rate: sheet.columns["axis_rad"][0])
     found = check.agreements(sheet)
-    assert np.mean([p > 0.05 for one in found for p in one.p_values]) >= 0.8
+    assert [one.fitted for one in found] == ["even"] * 5 + ["odd"] * 5
+    assert np.mean([p > 0.05 for one in found for p in one.p_values]) >= 0.7
     assert [one.correlation for one in found] == pytest.approx([one.expected_correlation for one in found], abs=0.06)
+    constants = fit.constants(sheet)
+    assert constants["along"][:5] == pytest.approx(truth.along, abs=0.4)
     noisy = truth.constants | {"noise": [[2.0, 2.0, 20.0]] * 5}
-    assert max(check.agreement(ErrorModel(noisy), sheet, 0.0).p_values) < 0.01
-    fleeting = check.agreement(ErrorModel(truth.constants | {"field_deg": 0.02}), sheet, 2.3)
+    assert max(check.agreement(ErrorModel(noisy), sheet, 0.0, "even").p_values) < 0.01
+    fleeting = check.agreement(ErrorModel(truth.constants | {"field_deg": 0.02}), sheet, 2.3, "even")
     assert fleeting.correlation - fleeting.expected_correlation > 0.1

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import scipy
 
-from skysim.experiments.datasheet import performance
+from skysim.experiments.datasheet import performance, run
+from skysim.experiments.datasheet.cells import Cell
 from skysim.experiments.datasheet.performance import Counts, bracket, claims, noise_equivalent_angle, runs_needed
 
 
@@ -77,3 +79,33 @@ def test_frames_of_one_field_count_once():
     outcome = {"right": [[1, 1, 0, 0], [1, 0, 1, 0]], "false": [[0, 0, 1, 0], [0, 0, 0, 1]]}
     sheet = SimpleNamespace(**{name: lambda rows, name=name: np.array(outcome[name], bool)[rows] for name in outcome})
     assert performance.counts_of_fields(sheet, [0, 1]) == Counts(4, 1, 1, 2)
+
+
+def sky_sheet(errors_over_sigma: tuple[float, float, float]) -> run.Sheet:
+    """A sheet of 4,000 frames with these errors about x, y and roll, whose covariance says 1."""
+    rng = np.random.default_rng(3)
+    errors = np.asarray(errors_over_sigma)[:, None, None] * rng.standard_normal((3, 10, 400))
+    columns = dict(zip(run.AXES, errors, strict=True)) | {"nees": np.sum(errors**2, axis=0)}
+    columns |= {"solved": np.ones((10, 400)), "wrong": np.zeros((10, 400))}
+    columns["solved"][0, :5] = 0
+    columns["nees"][0, :5] = np.nan
+    cells = [Cell("sky", {"draw": number}, {}) for number in range(10)]
+    unused: Any = None
+    return run.Sheet(unused, "", {}, unused, unused, cells, columns, unused)
+
+
+def test_an_honest_covariance_is_found_honest():
+    found = performance.consistency(sky_sheet((1, 1, 1)))
+    assert found["nees"].low < 3 < found["nees"].high
+    for one in found["within"]:
+        assert one["share"].trials == 3995
+        sigma = math.sqrt(one["level"] * (1 - one["level"]) / 3995)
+        assert one["share"].value == pytest.approx(one["level"], abs=3 * sigma)
+    assert found["y_over_x"].low < 1 < found["y_over_x"].high
+
+
+def test_a_covariance_that_is_too_small_for_y_is_found_so():
+    found = performance.consistency(sky_sheet((1, 1.5, 1)))
+    assert found["nees"].value == pytest.approx(2 + 1.5**2, abs=0.2)
+    assert found["within"][1]["share"].high < 0.954
+    assert found["y_over_x"].value == pytest.approx(1.5**2, rel=0.1)

@@ -24,6 +24,7 @@ from skysim.apps.gui.page.panels.attitude import AttitudeCard
 from skysim.apps.gui.page.panels.lights import LightsPanel
 from skysim.apps.gui.page.panels.monte_carlo import MonteCarloPanel
 from skysim.apps.gui.page.panels.photo import PhotoPanel
+from skysim.apps.gui.page.panels.plan import PlanPanel
 from skysim.apps.gui.page.panels.run import RunPanel
 from skysim.apps.gui.page.panels.scene import ScenePanel
 from skysim.apps.gui.page.shell.arrangement import Arrangement
@@ -33,14 +34,15 @@ from skysim.apps.gui.page.shell.palette import Command, Palette
 from skysim.apps.gui.page.shell.wording import for_page
 from skysim.apps.gui.page.space.space import Scene3D
 from skysim.apps.gui.state import View
-from skysim.apps.gui.worker import export, pointing
+from skysim.apps.gui.worker import export
 from skysim.apps.gui.worker.photo import Photo
+from skysim.apps.gui.worker.scene import pointing
 from skysim.apps.gui.worker.session import MAX_WORKERS, Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.scene.loader import find, load
 
-PANELS = ("Lab", "Lights", "Scene", "Run", "Monte Carlo", "Image", "Log")
+PANELS = ("Lab", "Lights", "Scene", "Plan", "Run", "Monte Carlo", "Image", "Log")
 MAX_LOG_LINES = 500
 
 
@@ -171,6 +173,8 @@ class Tab:
                     self.lights = LightsPanel(self)
                 with ui.tab_panel("Scene"):
                     self.scene_panel = ScenePanel(self)
+                with ui.tab_panel("Plan"):
+                    self.plan_panel = PlanPanel(self)
                 with ui.tab_panel("Run").classes("lab-run"):
                     self.run_panel = RunPanel(self)
                 with ui.tab_panel("Monte Carlo"):
@@ -277,6 +281,7 @@ class Tab:
         self.scene_3d.set_scene(self.scene_info)
         self.sensor.clear_zoom()
         self.run_panel.set_scene()
+        self.plan_panel.clear()
         self.study_panel.set_scene()
         self.display_live(view)
         await self.scene_panel.set_scene()

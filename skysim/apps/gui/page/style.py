@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import cv2
+import numpy as np
+
+from skysim.core.types import Floats
+
 DARK = {
     **{"ground": "#0d1015", "panel": "#141922", "line": "#252c38", "text": "#d7dce4", "quiet": "#8b95a5"},
     **{"accent": "#5aa9ff", "good": "#63c174", "warn": "#f0b429", "bad": "#ff6b6b"},
@@ -27,6 +32,15 @@ TOOLTIP = {
     **{"trigger": "axis", "confine": True, ":backgroundColor": chart_color("panel"), "borderWidth": 1},
     **{":borderColor": chart_color("line"), "textStyle": {":color": chart_color("text"), "fontSize": 11}},
 }
+
+
+def color_scale(values: Floats) -> Floats:
+    """(N, 3) sRGB, 0 to 1, of values from 0 to 1: the map cividis, which is the same to color-blind eyes.
+
+    Its darkest fifth is left out, because it would not be seen on the dark ground.
+    """
+    levels = np.rint(51 + 204 * np.clip(values, 0, 1)).astype(np.uint8)
+    return np.asarray(cv2.applyColorMap(levels[:, None], cv2.COLORMAP_CIVIDIS)[:, 0, ::-1] / 255)
 
 
 def format_number(value: float) -> str:
@@ -85,6 +99,9 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-under > * {{ min-width: 0; overflow: hidden }}
 .lab-loupe {{ width: 252px; height: 160px; outline: 1px dashed {COLORS["line"]} }}
 .lab-plot {{ width: 100%; height: 160px; touch-action: none; cursor: ew-resize }}
+.lab-facts {{ display: grid; grid-template-columns: 128px minmax(0, 1fr); gap: 4px 12px }}
+.lab-stops {{ display: grid; grid-template-columns: 40px repeat(4, minmax(0, 1fr)); gap: 0 10px; align-items: center }}
+.lab-stops .num {{ text-align: right }}
 .lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-run > * {{ flex: none }}
 .mono.lab-log {{ white-space: pre-wrap; overflow-wrap: anywhere }}
 .q-uploader__subtitle {{ display: none }} .q-uploader__title {{ font-size: 13px; font-weight: 500 }}
@@ -141,7 +158,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-panels .q-uploader__header {{ background: {COLORS["line"]} }}
 .q-field--dense .q-field__suffix {{ align-self: center; padding: 0 }}
 .lab-trial {{ display: grid; width: 100%; grid-template-columns: 1fr 1.5fr 1fr .8fr 1.2fr; gap: 8px; margin: 8px 0 }}
-.q-tab {{ min-height: 34px; padding: 0 12px; text-transform: none }} .q-tabs {{ min-height: 34px }}
+.q-tab {{ min-height: 34px; padding: 0 8px; text-transform: none }} .q-tabs {{ min-height: 34px }}
 .q-btn {{ text-transform: none }} .q-btn .q-btn__content {{ font-size: 12px; line-height: 1.5 }}
 .lab-sections .q-item {{ padding: 2px 0 }}
 .q-field--borderless.q-field--focused, :focus-visible {{ outline: 2px solid {COLORS["accent"]}; outline-offset: 1px }}

@@ -8,8 +8,17 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import FlightStep, FrameView, SceneInfo, Triple
-from skysim.apps.gui.worker import export, photo, playback, pointing
+from skysim.apps.gui.messages import (
+    AmbiguityMap,
+    FlightStep,
+    FrameView,
+    PlanCheck,
+    SceneInfo,
+    SurveyPlan,
+    Triple,
+)
+from skysim.apps.gui.worker import export, photo, playback
+from skysim.apps.gui.worker.scene import planning, pointing
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core.errors import InputError
 from skysim.core.io import images
@@ -76,6 +85,15 @@ class Worker:
         bench = self.workbench
         bench.lab_from_body = pointing.moved(bench.scene, bench.testbed.mount, bench.lab_from_body, right, up, roll_deg)
         return self.render(solve)
+
+    def check(self) -> PlanCheck:
+        return planning.check(self.workbench.testbed)
+
+    def ambiguity(self) -> AmbiguityMap:
+        return planning.ambiguity(self.workbench.testbed)
+
+    def survey(self, frames: int) -> SurveyPlan:
+        return planning.survey(self.workbench.scene, frames)
 
     def begin_flight(self) -> FlightStep:
         """Begin to compute the scene's flight; `advance_flight` does the work."""

@@ -16,7 +16,8 @@ from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui.messages import Detection, FrameView, LabGeometry, Lens, Light, SceneInfo, TrackerResult
-from skysim.apps.gui.worker import geometry, pixels
+from skysim.apps.gui.worker import pixels
+from skysim.apps.gui.worker.scene import geometry
 from skysim.core import quaternion
 from skysim.core.types import Floats, Frame, Truth
 from skysim.results import scoring, stretch

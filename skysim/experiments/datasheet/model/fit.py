@@ -12,6 +12,7 @@ from skysim.experiments.datasheet.components import components, effects, mean_kn
 from skysim.experiments.datasheet.model.errors import AXES
 from skysim.experiments.datasheet.run import Sheet
 from skysim.experiments.datasheet.terms import GROUPS, term_errors
+from skysim.experiments.study.execution import setups, trials
 
 GRID = 60  # correlation angles that are tried
 LEAST_NOISE = 0.05  # of the mean square at a rate: noise below it is not told from the slow terms
@@ -24,23 +25,27 @@ def constants(sheet: Sheet) -> dict[str, Any]:
     field, pixel = (np.sqrt(np.maximum([getattr(one, name) for one in found], 0)) for name in ("field", "pixel"))
     bias = [bias_terms(one) for one in errors]
     across, about = (log_scale(*field_variances(sheet, axes)) for axes in GROUPS.values())
-    rates, squares = squares_by_rate(sheet)
-    slow = np.array([one[0] ** 2 for one in bias]) + field**2 + pixel**2
+    mean = [one[0] for one in bias]
+    by_rate = errors_by_rate(sheet)
+    squares = np.array([mean_known(one**2, (1, 2)) for one in by_rate.values()])
+    along = np.array([along_square(sheet, rate, mean, found) for rate, found in by_rate.items()])
+    slow = np.square(mean) + field**2 + pixel**2 + np.outer(along / 2, [1.0, 1.0, 0.0])
     noise = np.sqrt(np.maximum(squares - slow, LEAST_NOISE * squares))
     rest = np.sqrt([one.temporal for one in found])
     return {
         "scene": sheet.scene.name,
         "axes": list(AXES),
-        "mean": [one[0] for one in bias],
+        "mean": mean,
         "unit": [one[1] for one in bias],
         "field": field.tolist(),
         "pixel": pixel.tolist(),
         "scale": [across, across, about],
-        "field_deg": field_angle_deg(sheet, field, pixel, [one[0] for one in bias]),
+        "field_deg": field_angle_deg(sheet, field, pixel, mean),
         "pixel_deg": sheet.designer.pixel_deg,
         "scale_deg": sheet.designer.half_field_deg,
-        "rates_deg_s": rates,
+        "rates_deg_s": list(by_rate),
         "noise": [rest.tolist(), *noise[1:].tolist()],
+        "along": np.sqrt(along).tolist(),
     }
 
 
@@ -77,13 +82,35 @@ def sequences(sheet: Sheet, rate_deg_s: float) -> tuple[list[int], Floats]:
     return [sheet.cells[row].levels["step"] for row in rows], sheet.errors(rows)
 
 
-def squares_by_rate(sheet: Sheet) -> tuple[list[float], Floats]:
-    """Rates, and (rates, 3) mean squares of the errors: of the sequences, and of the faster pairs of frames."""
+def errors_by_rate(sheet: Sheet) -> dict[float, Floats]:
+    """(3, frames, fields) errors by rate, from rest on: of the sequences, and of the faster pairs of frames."""
     sequenced = sheet.levels("sequence", "rate_deg_s")
     faster = [rate for rate in sheet.levels("rate", "rate_deg_s") if rate > max(sequenced)]
-    errors = [sequences(sheet, rate)[1] for rate in sequenced]
-    errors += [sheet.errors(sheet.rows("rate", rate_deg_s=rate)) for rate in faster]
-    return [*sequenced, *faster], np.array([mean_known(one**2, (1, 2)) for one in errors])
+    found = {rate: sequences(sheet, rate)[1] for rate in sequenced}
+    return found | {rate: sheet.errors(sheet.rows("rate", rate_deg_s=rate)) for rate in faster}
+
+
+def along_square(sheet: Sheet, rate_deg_s: float, mean: list[float], errors: Floats) -> float:
+    """Mean square of the errors about the rate's axis beyond that about the other axis across the boresight.
+
+    errors : (3, frames, fields), whose means are taken off;  0 at rest, and where the difference is negative
+    """
+    if not rate_deg_s:
+        return 0.0
+    angle_rad = axes_rad(sheet, rate_deg_s)
+    x, y = errors[:2] - np.array(mean)[:2, None, None]
+    about = x * np.cos(angle_rad) + y * np.sin(angle_rad)
+    other = y * np.cos(angle_rad) - x * np.sin(angle_rad)
+    return max(float(mean_known(about**2) - mean_known(other**2)), 0.0)
+
+
+def axes_rad(sheet: Sheet, rate_deg_s: float) -> Floats:
+    """(fields,) angle of the axis of a rate from the camera's x toward y, as the trials at this rate draw it again."""
+    rows = sheet.rows("sequence", rate_deg_s=rate_deg_s) or sheet.rows("rate", rate_deg_s=rate_deg_s)
+    setup = setups.prepared_setup(sheet.spec, sheet.cells[rows[0]].settings)
+    seeds = sheet.column("seed", rows[:1])[0].tolist()
+    axes = np.array([trials.attitude_and_axis(setup, trials.streams(setup, seed)[0])[1] for seed in seeds])
+    return np.asarray(np.arctan2(axes[:, 1], axes[:, 0]))
 
 
 def lagged(sheet: Sheet, mean: list[float]) -> tuple[Floats, Floats]:

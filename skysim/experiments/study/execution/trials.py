@@ -268,8 +268,7 @@ def moving_testbed(setup: Setup, seed: int) -> tuple[Testbed, tuple[float, float
     trial, (attitude_rng, noise) = setup.trial, streams(setup, seed)
     assert isinstance(trial, FrameTrial)
     testbed = setup.testbed.in_run(int(noise.integers(2**62)))
-    middle = random_attitude(setup, attitude_rng)
-    axis_cam = rate_axis(trial.rate_axis, attitude_rng.uniform(0, 2 * math.pi), testbed.mount)
+    middle, axis_cam = attitude_and_axis(setup, attitude_rng)
     rate_cam = math.radians(trial.rate_deg_s) * axis_cam
     body_from_cam = testbed.mount.cam_from_body.inv()
     rate_body, turn_body, acceleration_body = (
@@ -282,6 +281,13 @@ def moving_testbed(setup: Setup, seed: int) -> tuple[Testbed, tuple[float, float
     # For a star on the boresight: d(x / z)/dt = -w_y, d(y / z)/dt = w_x.
     streak = (-rate_cam[1] * streak_px, rate_cam[0] * streak_px) if trial.gyro else None
     return replace(testbed, trajectory=trajectory), streak
+
+
+def attitude_and_axis(setup: Setup, rng: np.random.Generator) -> tuple[Rotation, Floats]:
+    """Random lab_from_body of a frame trial, and the (3,) axis of its rate in camera axes."""
+    assert isinstance(setup.trial, FrameTrial)
+    lab_from_body = random_attitude(setup, rng)
+    return lab_from_body, rate_axis(setup.trial.rate_axis, rng.uniform(0, 2 * math.pi), setup.testbed.mount)
 
 
 def tracked_report(setup: Setup, testbed: Testbed, frame: Frame, streak_px: tuple[float, float] | None) -> Report:

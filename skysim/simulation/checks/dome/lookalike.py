@@ -19,7 +19,7 @@ from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.expected_error import Independent, believed_sigma_px
 from skysim.simulation.checks.facts import Fact, Samples, short
-from skysim.sources.dome.placement.ambiguity import field_ambiguity
+from skysim.sources.dome.placement.ambiguity import Ambiguity, field_ambiguity
 
 ALIKE = 0.9  # fraction of coincident LEDs
 BELOW = ALIKE - 1e-9
@@ -39,11 +39,31 @@ class Lookalike(NamedTuple):
 
 def of(context: Context, samples: Samples) -> Lookalike | None:
     """The fields of a dome, each about an LED within the greatest tilt; None for few or coded LEDs, or stars."""
-    testbed, camera = context.testbed, context.camera.optics.camera
-    mean = float(samples.reach.counts().mean())
-    coded = testbed.scene.tracker.decoder is not None
-    if not isinstance(testbed.scene.light, DomeConfig) or mean < MIN_LEDS or coded:
+    if why_not_compared(context, samples):
         return None
+    found, coincidence_m = compared(context, samples, BELOW, MAX_WORK)
+    return Lookalike(float((found.fraction > BELOW).mean()), len(found.led), coincidence_m) if len(found.led) else None
+
+
+def why_not_compared(context: Context, samples: Samples) -> str:
+    """Why fields are not compared; empty if they are."""
+    if not isinstance(context.testbed.scene.light, DomeConfig):
+        return "light.kind: stars: only the layout of a dome can be ambiguous; allowed: dome"
+    if context.testbed.scene.tracker.decoder is not None:
+        return "tracker.decoder: coded LEDs are named by their codes, so that no field is ambiguous; allowed: none"
+    mean = float(samples.reach.counts().mean())
+    if mean < MIN_LEDS:
+        return f"light.layout: {mean:.2g} LEDs in a field on average; allowed: {MIN_LEDS} or more"
+    return ""
+
+
+def compared(context: Context, samples: Samples, least: float, most_work: int) -> tuple[Ambiguity, float]:
+    """The most similar other field of each field within the greatest tilt, and what coincides, m.
+
+    least : fraction below which none is sought;  most_work : fields compared, those at the least tilts, times LEDs in
+    a field
+    """
+    testbed, camera = context.testbed, context.camera.optics.camera
     sigma_px = [
         believed_sigma_px(view, Independent(centroid_variance(view, context)), context)
         for view in samples.reach.used
@@ -52,7 +72,7 @@ def of(context: Context, samples: Samples) -> Lookalike | None:
     distance_m = float(np.median(samples.reach.joined("distance_m")))
     coincidence_m = SIGMAS * float(np.median(np.concatenate(sigma_px))) * distance_m / camera.focal_px
     place_m = context.beliefs.lights.place[:, :3]
-    most = int(MAX_WORK / np.mean([len(view) for view in samples.reach.seen]))
+    most = int(most_work / np.mean([len(view) for view in samples.reach.seen]))
     zenith_rad = np.sort(np.arctan2(np.hypot(*place_m.T[:2]), place_m[:, 2]))
     tilt_rad = float(attitudes.tilts_rad(samples.reach.attitudes).max())
     found = field_ambiguity(
@@ -61,9 +81,9 @@ def of(context: Context, samples: Samples) -> Lookalike | None:
         min(tilt_rad, float(zenith_rad[most - 1])) if len(zenith_rad) >= most else tilt_rad,
         math.atan(math.sqrt(camera.width_px * camera.height_px / math.pi) / camera.focal_px),
         coincidence_m,
-        BELOW,
+        least,
     )
-    return Lookalike(float((found.fraction > BELOW).mean()), len(found.led), coincidence_m) if len(found.led) else None
+    return found, coincidence_m
 
 
 def fact(found: Lookalike) -> Fact:

@@ -99,9 +99,10 @@ def print_statement(statement: Statement) -> None:
 
 
 def print_agreements(agreements: list[Agreement]) -> None:
-    """Print how well the model, fitted to half of the fields, agrees with the other half."""
+    """Print how well the model, fitted to each half of the fields, agrees with the other half."""
     rows = [
         [
+            one.fitted,
             f"{one.rate_deg_s:g}",
             str(one.frames),
             *(f"{p:.2g}" for p in one.p_values),
@@ -110,7 +111,10 @@ def print_agreements(agreements: list[Agreement]) -> None:
         ]
         for one in agreements
     ]
-    headers = ["rate °/s", "frames", "p of x", "p of y", "p of roll", "correlation", "of the model"]
-    print_table("The model, fitted to half of the fields, beside the other half", headers, rows)
-    print_wrapped("p: Kolmogorov-Smirnov. correlation: mean over the axes and the pairs of frames of the sequences.")
+    headers = ["fitted to", "rate °/s", "frames", "p of x", "p of y", "p of roll", "correlation", "of the model"]
+    print_table("The model, fitted to half of the fields (even or odd numbers), beside the other half", headers, rows)
+    print_wrapped(
+        "p: Kolmogorov-Smirnov; of a right model one in twenty is below 0.05. correlation: mean over the axes and the"
+        " pairs of frames of the sequences."
+    )
     print()

@@ -187,13 +187,11 @@ def survey_mode(
 
 def planned(request: Request) -> tuple[Testbed, CalibrationPrior, Plan]:
     """The test bed with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
-    from skysim.experiments.dome_survey import prior, procedure
-    from skysim.simulation.testbed import build_testbed
+    from skysim.experiments.dome_survey import procedure
 
-    testbed = build_testbed(prior.with_survey_errors(request.scene, request.uncertainty))
-    before, tilt_deg = prior.calibration_prior(testbed), request.tilt_deg
-    plan = procedure.make_plan(testbed, before, request.uncertainty, request.frames, tilt_deg, request.attitudes)
-    return testbed, before, plan
+    return procedure.plan_survey(
+        request.scene, request.uncertainty, request.frames, request.tilt_deg, request.attitudes
+    )
 
 
 def plan_only(request: Request) -> dict[str, Any]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import nicegui.elements.scene  # registers three.js with the page  # noqa: F401
+import numpy as np
 from nicegui import ui
+from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo
-from skysim.apps.gui.page.style import DARK
+from skysim.apps.gui.page.style import DARK, color_scale
+from skysim.core.types import Floats
 from skysim.dynamics.multibody import Shape
 
 if TYPE_CHECKING:
@@ -62,9 +64,10 @@ class Scene3D:
             },
         )
 
-    def color_lights(self, colors: Iterable[tuple[int, str]]) -> None:
-        """Color some lights, until the scene changes. colors : (number, "#rrggbb") each"""
-        self.canvas.run_method("color", list(colors))
+    def color_lights(self, ids: NDArray[np.int64], values: Floats) -> None:
+        """Color some lights by values from 0 to 1, until the scene changes."""
+        colors = (f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in 255 * color_scale(values))
+        self.canvas.run_method("color", list(zip(ids.tolist(), colors, strict=True)))
 
     def show(self, view: FrameView) -> None:
         """Queue the newest attitude for the timer."""
