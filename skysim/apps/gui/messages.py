@@ -122,8 +122,9 @@ class SceneInfo:
     """Facts about a loaded scene that the page displays.
 
     names : of its three angles;  prefix : of its lights' numbers (HIP or LED)
-    field_deg : horizontal field of view;  stages : the tracker's algorithm by stage;  choices : all algorithms by stage
-    duration_s : of its motion
+    field_deg : horizontal field of view;  pixel_arcsec : angle of a pixel in the frame's middle
+    stages : the tracker's algorithm by stage;  choices : all algorithms by stage
+    duration_s : of its motion;  noise : whether the camera has noise, else a frame is the expected value
     """
 
     scene: str
@@ -132,9 +133,11 @@ class SceneInfo:
     names: tuple[str, str, str]
     prefix: str
     field_deg: float
+    pixel_arcsec: float
     stages: dict[str, str]
     choices: dict[str, tuple[str, ...]]
     duration_s: float
+    noise: bool
     geometry: LabGeometry
     lens: Lens
 

@@ -157,8 +157,10 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-trial .q-field__control {{ padding: 0 4px 0 8px }} .lab-panels .q-btn {{ padding: 2px 8px }}
 .lab-panels .q-uploader__header {{ background: {COLORS["line"]} }}
 .q-field--dense .q-field__suffix {{ align-self: center; padding: 0 }}
-.lab-trial {{ display: grid; width: 100%; grid-template-columns: 1fr 1.5fr 1fr .8fr 1.2fr; gap: 8px; margin: 8px 0 }}
-.q-tab {{ min-height: 34px; padding: 0 8px; text-transform: none }} .q-tabs {{ min-height: 34px }}
+.lab-trial {{ display: grid; width: 100%; grid-template-columns: 1fr 1.4fr 1fr 1fr .7fr 1fr; gap: 6px;
+  margin: 8px 0 }}
+.q-tab {{ min-height: 34px; padding: 0 6px; text-transform: none }} .q-tab__label {{ font-size: 13px }}
+.q-tabs {{ min-height: 34px }}
 .q-btn {{ text-transform: none }} .q-btn .q-btn__content {{ font-size: 12px; line-height: 1.5 }}
 .lab-sections .q-item {{ padding: 2px 0 }}
 .q-field--borderless.q-field--focused, :focus-visible {{ outline: 2px solid {COLORS["accent"]}; outline-offset: 1px }}

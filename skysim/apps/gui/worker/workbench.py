@@ -19,6 +19,7 @@ from skysim.apps.gui.messages import Detection, FrameView, LabGeometry, Lens, Li
 from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.scene import geometry
 from skysim.core import quaternion
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Truth
 from skysim.results import scoring, stretch
 from skysim.scene.loader import load
@@ -56,7 +57,8 @@ class Workbench:
 
     @classmethod
     def open(cls, name: str, overrides: Mapping[str, str], before: Workbench | None = None) -> Workbench:
-        """Set up a scene. If only the tracker differs from `before`, its testbed and attitude are kept.
+        """Set up a scene. If only the tracker differs from `before`, its testbed is kept; if tracker or camera, its
+        attitude.
 
         Raises InputError.
         """
@@ -65,7 +67,8 @@ class Workbench:
             testbed = replace(before.testbed, scene=scene)
             return replace(before, scene=scene, testbed=testbed, estimator=warm_tracker(testbed))
         testbed = build_testbed(scene)
-        lab_from_body = testbed.trajectory.lab_from_body[0]
+        same = before and before.scene.model_copy(update={"tracker": scene.tracker, "camera": scene.camera}) == scene
+        lab_from_body = before.lab_from_body if before and same else testbed.trajectory.lab_from_body[0]
         views = pixels.scene_lens(testbed), geometry.lab_geometry(testbed)
         return cls(scene, testbed, warm_tracker(testbed), lab_from_body, *views, magnitude=magnitude_by_id(testbed))
 
@@ -86,9 +89,11 @@ class Workbench:
             scoring.angle_names(scene),
             id_prefix(self.testbed),
             2 * math.degrees(math.atan(camera.width_px / 2 / camera.focal_px)),
+            1 / camera.focal_px / ARCSEC_RAD,
             self.stages,
             tracker_settings.algorithm_names(scene),
             self.testbed.duration_s,
+            camera.detector.noise,
             self.geometry,
             self.lens,
         )
