@@ -7,16 +7,17 @@ import numpy as np
 
 from skysim.core.types import Floats
 
+# The colors of states, marks and curves are told apart by color-blind eyes too: tests/apps/gui/test_shell.py.
 DARK = {
     **{"ground": "#0d1015", "panel": "#141922", "line": "#252c38", "text": "#d7dce4", "quiet": "#8b95a5"},
-    **{"accent": "#5aa9ff", "good": "#63c174", "warn": "#f0b429", "bad": "#ff6b6b"},
+    **{"accent": "#5aa9ff", "good": "#4fdcc0", "warn": "#d9b400", "bad": "#e2567f"},
 }
 LIGHT = {
     **{"ground": "#f4f6f9", "panel": "#ffffff", "line": "#d3d9e2", "text": "#1b2330", "quiet": "#56606f"},
-    **{"accent": "#1463b8", "good": "#1d7a35", "warn": "#8a5a00", "bad": "#b3261e"},
+    **{"accent": "#1463b8", "good": "#007f78", "warn": "#b05400", "bad": "#8a1040"},
 }
 COLORS = {name: f"var(--lab-{name})" for name in DARK}  # in CSS: of the theme
-CURVE_COLORS = ["#3d8fe0", "#d1901a", "#3f9a52", "#e05555", "#9b6fa3", "#4f9fb5", "#9b6fa3", "#4f9fb5"]  # of both
+CURVE_COLORS = ["#3aa6f2", "#e0a82a", "#0d7b84", "#d02f28"]  # of both
 
 
 def chart_color(name: str) -> str:

@@ -8,7 +8,7 @@ import { directionText, gridLines } from "skysim-frame/sky.js";
 const LARGEST_PX = 60; // screen pixels of an enlarged pixel
 const REACH_PX = 14; // screen pixels within which the cursor finds a light
 const LOUPE = { across: 11, down: 7 };
-const PALE = "#ffe27a", GRID = "rgb(127 160 200 / 45%)", CUT = "#ff8fd0", CROSS = "#ff7b6b";
+const PALE = "#ffe27a", GRID = "rgb(127 160 200 / 45%)", CUT = "#ff8fd0", CROSS = "#dd5a60", NAME = "#6ff0d8";
 
 export default {
   template: `
@@ -188,7 +188,7 @@ export default {
       pen.strokeRect(left - 0.5, top - 0.5, size[0] * scale + 1, size[1] * scale + 1);
       if (this.display.grid) drawGrid(pen, this.lines(), this.toScreen, window, GRID);
       drawMarks(pen, marks, this.toScreen);
-      drawNames(pen, names, this.toScreen, window, "#6fdc7f");
+      drawNames(pen, names, this.toScreen, window, NAME);
       if (this.cut) this.paintCut(pen);
       const ringed = lights.find((light) => light[2] === this.hovered && light[2] >= 0);
       if (ringed) drawHighlight(pen, this.toScreen(ringed[0], ringed[1]), PALE);

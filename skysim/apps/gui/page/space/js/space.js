@@ -145,7 +145,7 @@ export default {
       [canvas.width, canvas.height] = [clientWidth * devicePixelRatio, clientHeight * devicePixelRatio];
       pen.setTransform(devicePixelRatio, 0, 0, devicePixelRatio, 0, 0);
       const names = this.named.map(([n, name]) => [...this.place(n), name]).filter(([x]) => x !== null);
-      drawNames(pen, names, (x, y) => [x, y], [clientWidth, clientHeight], "#6fdc7f");
+      drawNames(pen, names, (x, y) => [x, y], [clientWidth, clientHeight], "#6ff0d8");
     },
     // Where a light is on the screen; null behind the eye.
     place(n) {
