@@ -18,9 +18,8 @@ import numpy as np
 from benchmarks.timing import verdict
 from skysim.experiments.study import loader, store
 from skysim.experiments.study.execution import engines, runner
-from skysim.experiments.study.execution.engines import Chunks, Pool
+from skysim.experiments.study.execution.engines import Chunks, Job, Pool
 from skysim.experiments.study.execution.trials import Row
-from skysim.experiments.study.plan import TrialSpec
 
 STUDY = """
 schema: 1
@@ -52,9 +51,9 @@ class TimedPool:
         self.pool, self.name, self.workers = pool, pool.name, pool.workers
         self.batches: list[tuple[float, int, float]] = []
 
-    def run(self, spec: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
+    def run(self, job: Job, chunks: Chunks) -> Iterator[list[Row]]:
         """See `engines.Engine`."""
-        for rows in self.pool.run(spec, chunks):
+        for rows in self.pool.run(job, chunks):
             self.batches.append((time.perf_counter(), len(rows), sum(row.seconds for row in rows)))
             yield rows
 

@@ -143,7 +143,25 @@ def render(
         peak_xy=table[on_chip, 6:8].astype(np.int64),
         saturated=np.zeros(len(electrons), bool),  # set by the detector
         snr=np.full(len(electrons), np.nan),
+        streak_xy_px=streak_vectors_px(tracks, mid_px, window, rows)[on_chip],
     )
+
+
+def streak_vectors_px(tracks: Tracks, mid_px: Floats, window: Window, rows: int) -> Floats:
+    """(N, 2) displacement of each image over the exposure of the row that it is on at mid-exposure."""
+    row = np.clip(np.nan_to_num(mid_px[:, 1]), 0, rows - 1)
+    begin_s = window.open_s + window.row_time_s * row
+    return _displacement(tracks, begin_s, begin_s + window.exposure_s)
+
+
+@jit
+def _displacement(tracks: Tracks, begin_s: Floats, end_s: Floats) -> Floats:
+    out = np.empty((len(begin_s), 2))
+    for n in range(len(begin_s)):
+        x0, y0, _ = _interpolate(tracks, n, begin_s[n])
+        x1, y1, _ = _interpolate(tracks, n, end_s[n])
+        out[n, 0], out[n, 1] = x1 - x0, y1 - y0
+    return out
 
 
 def sample_times(open_s: float, close_s: float, trajectory: Trajectory) -> Floats:

@@ -216,6 +216,8 @@ class SourceTruth:
     peak_xy      : (N, 2) the brightest pixel
     saturated    : (N,) whether that pixel is expected to be full
     snr          : (N,) signal-to-noise ratio of its electrons over that area, without saturation
+    streak_xy_px : (N, 2) displacement of the image from the begin to the end of the exposure of the row that it is on;
+                   NaN where it has no image at one of them
     """
 
     id: NDArray[np.int64]
@@ -228,6 +230,7 @@ class SourceTruth:
     peak_xy: NDArray[np.int64]
     saturated: NDArray[np.bool_]
     snr: Floats
+    streak_xy_px: Floats = field(default_factory=lambda: np.empty((0, 2)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Clock
 from skysim.camera import thermal
+from skysim.camera.detector.added_charge import AddedCharge
 from skysim.camera.detector.detector import add_snr_and_saturation, expose, saturation_dn, smear
 from skysim.camera.discs.bodies import FEW, behind, concatenated, render_bodies
 from skysim.camera.discs.disc_image import Exposed
@@ -51,11 +52,16 @@ from skysim.sources.solar_system.bodies import BodyLight
 
 
 def render_frame(
-    testbed: Testbed, index: int, clock: Clock | None = None, exposure_s: float | None = None
+    testbed: Testbed,
+    index: int,
+    clock: Clock | None = None,
+    exposure_s: float | None = None,
+    added: AddedCharge | None = None,
 ) -> tuple[Frame, Truth]:
     """Render one frame and its truth, both for mid-exposure of the middle row.
 
     They depend only on the test bed, the index and the exposure time (the scene's if left out), not on other frames.
+    added : gets the masks of smear and particles
     """
     clock = clock or Clock()
     scene, camera = testbed.scene, testbed.scene.camera
@@ -84,11 +90,12 @@ def render_frame(
     exposed = Exposed(optics, testbed.trajectory, testbed.mount, window)
     sources = draw_lights(light_e, lights, exposed, testbed.emitter, occludes)
     sources = add_stray(light_e, sources, lights, exposed, testbed, occludes)
-    smear(light_e, window.exposure_s, testbed.detector.shutter)
+    smear(light_e, window.exposure_s, testbed.detector.shutter, added)
     # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
     sources = add_snr_and_saturation(sources, light_e, window.exposure_s, testbed.detector)
     clock.lap("render")
-    image = expose(light_e, window.exposure_s, testbed.detector, random_stream(scene.seed, DETECTOR, index))
+    rng = random_stream(scene.seed, DETECTOR, index)
+    image = expose(light_e, window.exposure_s, testbed.detector, rng, added)
     clock.lap("detector")
     rate_cam = testbed.mount.cam_from_body.apply(testbed.trajectory.rate_at(middle_s))
     seen = tuple(body.truth() for body in lights.bodies if body.id in sources.id)

@@ -11,6 +11,9 @@ Their weighted sum of squares is minimized by the Gauss-Newton method, which for
 iterated Kalman smoother (Bell, SIAM J. Optimization 4, 1994, 626; Bock's multiple shooting, 1983). The states of a
 record form a banded matrix and are eliminated, so that records of different trim add their information on the
 parameters, whose covariance is the inverse of the sum.
+
+Errors that attitudes share, of a map of LEDs or a lens, are not fitted, but considered (Schmidt 1966): the weights are
+those of the noise alone, and the covariance of the parameters has what the shared errors add to it (`considered`).
 """
 
 from __future__ import annotations
@@ -42,6 +45,7 @@ from estimator.calibration.mass_properties.record import (
 )
 from estimator.core.arrays import Floats
 from estimator.core.errors import ImageError
+from estimator.filter.models import TrackerModel
 
 MAX_ITERATIONS = 30
 CONVERGED_SIGMA = 0.01  # largest step of a parameter, in its standard deviations
@@ -82,6 +86,7 @@ def estimate_mass(records: Sequence[BearingRecord], lab: Lab, prior: Prior) -> M
         ]
         values = values + step
         if np.all(np.abs(step) < CONVERGED_SIGMA * np.sqrt(np.diag(covariance))):
+            covariance = covariance + considered(records, parts, covariance)
             chi2 = sum(part.chi2 for part in parts) + np.sum(((prior.values - values) / prior.sigma) ** 2)
             return MassEstimate(values, covariance, float(chi2 / (3 * attitudes - 6 * len(records))), iteration)
         if not np.all(np.isfinite(values)):
@@ -90,20 +95,45 @@ def estimate_mass(records: Sequence[BearingRecord], lab: Lab, prior: Prior) -> M
 
 
 def estimate_with_noise(records: Sequence[BearingRecord], lab: Lab, prior: Prior) -> MassEstimate:
-    """The mass properties, with the attitudes' covariance scaled by a factor at which the misfit is 1.
+    """The mass properties, with the attitudes' noise scaled by a factor at which the misfit is 1.
 
-    A tracker's own covariance is too large where it counts an error that successive attitudes share (of the map of the
-    LEDs), and too small where an error is unknown to it. The level of the random torque is taken as known. Raises
-    ImageError as `estimate_mass`.
+    A tracker's own covariance is too small where an error is unknown to it, and too large where it is cautious. The
+    level of the random torque is taken as known. Raises ImageError as `estimate_mass`.
     """
     factor = 1.0
     for _ in range(MAX_FACTORS):
-        scaled = [replace(one, covariance_rad2=factor * one.covariance_rad2) for one in records]
-        estimate = estimate_mass(scaled, lab, prior)
+        estimate = estimate_mass([one.with_noise(factor) for one in records], lab, prior)
         if abs(np.log(estimate.misfit)) < MISFIT_TOLERANCE:
             break
         factor = float(np.clip(factor * estimate.misfit**FACTOR_POWER, *FACTOR_LIMITS))
     return replace(estimate, attitude_factor=factor)
+
+
+def considered(records: Sequence[BearingRecord], parts: Sequence[Reduced], covariance: Floats) -> Floats:
+    """(P, P) what errors that attitudes share add to the covariance of the parameters.
+
+    An attitude's error e_n changes the parameters by K_n e_n = C (B - X_n)^T W_n e_n: C their covariance by the noise,
+    W_n the weight, B the derivatives of a measured attitude by the parameters (those of the bias) and X_n those of the
+    fitted one. Errors of covariance S_n = L_n L_n^T whose correlation r falls with the rotation between two attitudes
+    add sum K_m L_m r_mn L_n^T K_n^T. The process is that of `filter.models.TrackerModel`, without its time.
+    """
+    size, effects, attitudes = len(covariance), [], []
+    by_bias = np.zeros((3, size))
+    by_bias[:, BIAS] = np.eye(3)
+    for record, part in zip(records, parts, strict=True):
+        if record.systematic_rad2 is None:
+            continue
+        fitted = part.states_by_parameter.reshape(-1, STATE, size)[:, :3]
+        gain = covariance @ (by_bias - fitted).transpose(0, 2, 1) @ np.linalg.inv(record.noise_rad2)
+        values, axes = np.linalg.eigh(record.systematic_rad2)
+        effects.append(gain @ (axes * np.sqrt(np.maximum(values, 0))[:, None]) @ axes.transpose(0, 2, 1))
+        attitudes.append(record.lab_from_body)
+    if not effects:
+        return np.zeros((size, size))
+    effect, quaternion = np.concatenate(effects), Rotation.concatenate(attitudes).as_quat()
+    angle_rad = 2 * np.arccos(np.minimum(np.abs(quaternion @ quaternion.T), 1))
+    shared = np.exp(-angle_rad / TrackerModel().systematic_angle_rad)
+    return np.asarray(np.einsum("mpk,mn,nqk->pq", effect, shared, effect, optimize=True))
 
 
 def first_states(record: BearingRecord, lab: Lab, values: Floats) -> States:
@@ -170,7 +200,7 @@ def add_measured(
     (N, 9, P + 1) and corner (P + 1, P + 1); the last column is the gradient.
     """
     diagonal, border, corner = to
-    weight, torque_weight = np.linalg.inv(record.covariance_rad2), lab.torque_rms_nm**-2.0
+    weight, torque_weight = np.linalg.inv(record.noise_rad2), lab.torque_rms_nm**-2.0
     off = measured_minus(record.lab_from_body, states.rotation, values[BIAS])
     pull = np.einsum("nij,nj->ni", weight, off)
     diagonal[:, :3, :3] += weight

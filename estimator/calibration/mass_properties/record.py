@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,6 +27,7 @@ class BearingRecord:
     wheel_momentum_nms : (M, n) assumed axial inertia times measured speed
     added_inertia_kg_m2, added_moment_kg_m : (3, 3) and (3,) that trim masses have added to the vehicle since the
         configuration whose mass properties are sought
+    systematic_rad2    : (N, 3, 3) the part of covariance_rad2 that attitudes near one another share; None without one
     """
 
     t_s: Floats
@@ -36,6 +37,7 @@ class BearingRecord:
     wheel_momentum_nms: Floats
     added_inertia_kg_m2: Floats = field(default_factory=lambda: np.zeros((3, 3)))
     added_moment_kg_m: Floats = field(default_factory=lambda: np.zeros(3))
+    systematic_rad2: Floats | None = None
 
     def __post_init__(self) -> None:
         if len(self.t_s) < MIN_ATTITUDES:
@@ -47,6 +49,16 @@ class BearingRecord:
                 f"mass properties: wheel speeds from {self.wheel_t_s[0]:g} to {self.wheel_t_s[-1]:g} s; allowed: over"
                 f" all attitudes, {self.t_s[0]:g} to {self.t_s[-1]:g} s"
             )
+
+    @property
+    def noise_rad2(self) -> Floats:
+        """(N, 3, 3) the part of covariance_rad2 that is independent from attitude to attitude."""
+        return self.covariance_rad2 if self.systematic_rad2 is None else self.covariance_rad2 - self.systematic_rad2
+
+    def with_noise(self, factor: float) -> BearingRecord:
+        """The record with its independent part scaled."""
+        added = (factor - 1) * self.noise_rad2
+        return replace(self, covariance_rad2=self.covariance_rad2 + added)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +103,7 @@ class MassEstimate:
 
     values, covariance : (P,) and (P, P), in the order of `Prior`
     misfit     : chi-square of the residuals over their number; 1 if noise and torques are as assumed
-    iterations : 0 of a recursive estimate;  attitude_factor : by which the attitudes' covariance was scaled
+    iterations : 0 of a recursive estimate;  attitude_factor : by which the attitudes' noise was scaled
     """
 
     values: Floats

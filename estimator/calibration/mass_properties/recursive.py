@@ -44,6 +44,7 @@ def cut(record: BearingRecord, which: slice) -> BearingRecord:
         t_s=record.t_s[which],
         lab_from_body=record.lab_from_body[which],
         covariance_rad2=record.covariance_rad2[which],
+        systematic_rad2=None if record.systematic_rad2 is None else record.systematic_rad2[which],
     )
 
 

@@ -34,6 +34,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "survey": ("skysim survey afit_simsat --frames 60 --checks 5 --out out/surveyed",),
     "datasheet": ("skysim datasheet shefex2 --quick", "skysim datasheet afit_simsat --fields 200 --out out/afit_sheet"),
+    "dataset": (
+        "skysim dataset shefex2 --frames 1000 --out out/frames",
+        "skysim dataset shefex2 --frames 64 --vary night.yaml --out s3://bucket/night",
+    ),
     "characterize": (
         "skysim characterize --camera imx264 --darks lab/darks --flats lab/flats",
         "skysim characterize --camera mine.yaml --frames-to out/lab",

@@ -17,6 +17,7 @@ from skysim.apps.cli.commands.files import catalog_app, export, scenes_app
 from skysim.apps.cli.commands.gui import gui
 from skysim.apps.cli.commands.measure.balance import balance
 from skysim.apps.cli.commands.measure.characterize import characterize
+from skysim.apps.cli.commands.measure.dataset import dataset
 from skysim.apps.cli.commands.measure.datasheet import datasheet
 from skysim.apps.cli.commands.measure.survey import survey
 from skysim.apps.cli.commands.reproduce import reproduce
@@ -42,6 +43,7 @@ COMMANDS = (
     solve,
     survey,
     datasheet,
+    dataset,
     characterize,
     balance,
     reproduce,

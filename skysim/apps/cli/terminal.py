@@ -152,7 +152,7 @@ def progress_callback(what: str, quiet: bool = False) -> Iterator[Callable[[floa
 
 
 @contextmanager
-def trial_progress(what: str, total: int) -> Iterator[Callable[[Progress], None]]:
+def trial_progress(what: str, total: int, unit: str = "trials") -> Iterator[Callable[[Progress], None]]:
     """Show a progress bar for trials on stderr: done, rate, time left, failures. Yields its update function.
 
     If stderr is no terminal, print a line after every tenth of the trials instead.
@@ -172,7 +172,7 @@ def trial_progress(what: str, total: int) -> Iterator[Callable[[Progress], None]
             shown.update(task, completed=done.done, rate=done.rate, faults=faults)
             if not console.is_terminal and 10 * done.done // total > tenth:
                 tenth = 10 * done.done // total
-                line = f"{what}: {done.done} of {total}, {done.rate:.0f} trials/s, {faults}"
+                line = f"{what}: {done.done} of {total}, {done.rate:.0f} {unit}/s, {faults}"
                 print(line, file=sys.stderr, flush=True)
 
         yield update

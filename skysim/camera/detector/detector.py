@@ -6,6 +6,7 @@ read noise, nonlinearity and the converter. Each step is switched off by its par
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from math import hypot
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from skysim.camera.detector import charge_transfer, cosmic_rays, noise
+from skysim.camera.detector.added_charge import PARTICLES, SMEAR, AddedCharge
 from skysim.core.jit import jit
 from skysim.core.random_streams import random_stream
 from skysim.core.types import SourceTruth
@@ -83,12 +85,15 @@ def dark_current_e_s(config: DetectorConfig, shape: tuple[int, int], rng: Genera
     return dark
 
 
-def expose(light_e: NDArray[Any], exposure_s: float, detector: Detector, rng: Generator) -> NDArray[Any]:
+def expose(
+    light_e: NDArray[Any], exposure_s: float, detector: Detector, rng: Generator, added: AddedCharge | None = None
+) -> NDArray[Any]:
     """Convert a frame's light to digital numbers. Returns (H, W) uint16.
 
     light_e : (H, W) float32 mean photo-electrons of a perfect pixel, including the shutter's `smear`; overwritten
     With noise off the frame is the expected value in digital numbers, of light_e's own type, neither rounded nor
     clipped, for tests of the steps that follow.
+    added   : gets the mask of the particles' pixels
     """
     config = detector.config
     if not config.noise:
@@ -102,7 +107,8 @@ def expose(light_e: NDArray[Any], exposure_s: float, detector: Detector, rng: Ge
         return frame
     _count(light_e, *pattern, constants, count_seeds, tables)
     if config.particles:
-        cosmic_rays.add_particles(light_e, exposure_s, detector.pixel_m, config.particles, rng)
+        with added.watch(PARTICLES, light_e) if added else nullcontext():
+            cosmic_rays.add_particles(light_e, exposure_s, detector.pixel_m, config.particles, rng)
     if config.blooming == "column":
         charge_transfer.bloom(light_e, config.full_well_e, config.anti_blooming)
     else:
@@ -121,15 +127,18 @@ def expectation(light_e: NDArray[Any], exposure_s: float, detector: Detector) ->
     return (mean_e + detector.column_offset_e) / config.gain_e_dn + config.offset_dn
 
 
-def smear(light_e: NDArray[Any], exposure_s: float, shutter: Shutter) -> None:
+def smear(light_e: NDArray[Any], exposure_s: float, shutter: Shutter, added: AddedCharge | None = None) -> None:
     """Add the smear of a frame-transfer or interline shutter to the light (in place). Other shutters add none.
 
-    Rolling shutters are part of the time integral in render.py.
+    Rolling shutters are part of the time integral in render.py. added : gets the mask of the pixels
     """
-    if isinstance(shutter, FrameTransferConfig):
-        charge_transfer.frame_transfer_smear(light_e, exposure_s, shutter.row_time_s)
-    elif isinstance(shutter, InterlineConfig):
-        charge_transfer.interline_smear(light_e, exposure_s, shutter.row_time_s, shutter.leak)
+    if not isinstance(shutter, FrameTransferConfig | InterlineConfig):
+        return
+    with added.watch(SMEAR, light_e) if added else nullcontext():
+        if isinstance(shutter, FrameTransferConfig):
+            charge_transfer.frame_transfer_smear(light_e, exposure_s, shutter.row_time_s)
+        else:
+            charge_transfer.interline_smear(light_e, exposure_s, shutter.row_time_s, shutter.leak)
 
 
 class ReadoutConstants(NamedTuple):

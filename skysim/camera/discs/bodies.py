@@ -71,7 +71,8 @@ def render_points(
     if not resolved or not len(truth.id):
         return [truth] if len(truth.id) else []
     image += own
-    return [whole(own, np.zeros(2, np.int64), body, center_px, float(truth.streak_px.mean()))]
+    streak = (float(truth.streak_px.mean()), truth.streak_xy_px.mean(axis=0))
+    return [whole(own, np.zeros(2, np.int64), body, center_px, *streak)]
 
 
 def add_disc(image: NDArray[Any], disc: DiscImage, body: BodyLight, center_px: Floats) -> list[SourceTruth]:
@@ -83,11 +84,16 @@ def add_disc(image: NDArray[Any], disc: DiscImage, body: BodyLight, center_px: F
     if not own.size or own.max() <= 0:
         return []
     image[low[1] : high[1], low[0] : high[0]] += own
-    return [whole(own, low, body, center_px, disc.streak_px)]
+    return [whole(own, low, body, center_px, disc.streak_px, disc.streak_xy_px)]
 
 
 def whole(
-    own_e: NDArray[Any], corner_px: NDArray[np.int64], body: BodyLight, center_px: Floats, streak_px: float
+    own_e: NDArray[Any],
+    corner_px: NDArray[np.int64],
+    body: BodyLight,
+    center_px: Floats,
+    streak_px: float,
+    streak_xy_px: Floats,
 ) -> SourceTruth:
     """The truth of one body, a row, from its own light in a part of the image that begins at a corner (x, y)."""
     electrons = own_e.sum(dtype=float)
@@ -105,6 +111,7 @@ def whole(
         peak_xy=corner_px[None] + np.array([[x, y]]),
         saturated=np.zeros(1, bool),  # set by the detector
         snr=np.full(1, np.nan),
+        streak_xy_px=streak_xy_px[None],
     )
 
 

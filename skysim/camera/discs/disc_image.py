@@ -125,11 +125,14 @@ def star_kernel(optics: Optics, xy_px: Floats, chromatic: Floats | None) -> Kern
 
 
 class DiscImage(NamedTuple):
-    """(h, w) electrons, the chip's pixel (x, y) of the first one, and the path length."""
+    """(h, w) electrons, the chip's pixel (x, y) of the first one, the path length, and the (2,) displacement at the
+    speed of mid-exposure.
+    """
 
     electrons: Floats
     corner_px: NDArray[np.int64]
     streak_px: float
+    streak_xy_px: Floats
 
 
 def disc_image(body: BodyLight, disc: DiscOnChip, exposed: Exposed, hidden: Hidden | None) -> DiscImage:
@@ -145,7 +148,8 @@ def disc_image(body: BodyLight, disc: DiscOnChip, exposed: Exposed, hidden: Hidd
     radius_from_px = np.asarray(np.linalg.inv(disc.px_from_radius) @ sheared, float)
     reach_px = math.ceil(float(np.linalg.norm(np.linalg.inv(radius_from_px), 2))) + 4
     light = light_on_lattice(body, radius_from_px, reach_px, steps, hidden)
-    return DiscImage(convolved(light, star.patches), star.corner_px - reach_px, star.streak_px)
+    corner_px, streak_xy_px = star.corner_px - reach_px, star.speed_px_s * exposed.window.exposure_s
+    return DiscImage(convolved(light, star.patches), corner_px, star.streak_px, streak_xy_px)
 
 
 def convolved(light: Floats, patches: Floats) -> Floats:

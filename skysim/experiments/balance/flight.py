@@ -130,13 +130,13 @@ def fly(scene: Scene, assumptions: Assumptions, uncertainty: Uncertainty, watch:
     testbed = run.simulate_motion(build_testbed(scene), watch)
     rows = measured_attitudes(testbed, watch)
     vehicle, log = testbed.vehicle, testbed.log
-    tilts_deg = np.array([multibody.tilt_deg(attitude) for _, attitude, _ in rows])
+    tilts_deg = np.array([multibody.tilt_deg(attitude) for _, attitude, *_ in rows])
     contact = np.flatnonzero(tilts_deg > scene.vehicle.tilt_stop_deg - STOP_MARGIN_DEG)
     kept = rows[: contact[0]] if len(contact) else rows
     if len(kept) < LEAST_ATTITUDES:
         cause = "before the vehicle touched its tilt stop: balance it by hand first" if len(contact) else "were solved"
         raise InputError(f"balance: {len(kept)} attitudes {cause}; allowed: {LEAST_ATTITUDES} or more")
-    t_s, attitudes, covariances = zip(*kept, strict=True)
+    t_s, attitudes, covariances, shared = zip(*kept, strict=True)
     speeds = log.wheel_rad_s + uncertainty.tacho_sigma_rad_s * random_stream(scene.seed, BALANCE, 1).standard_normal(
         log.wheel_rad_s.shape
     )
@@ -148,19 +148,25 @@ def fly(scene: Scene, assumptions: Assumptions, uncertainty: Uncertainty, watch:
         log.t_s,
         speeds * assumptions.wheel_inertia_kg_m2,
         *vehicle.trims.added(vehicle.trims.position_m),
+        np.array(shared),
     )
     return Flight(record, vehicle, testbed.scene.exposure.frames, len(rows), len(rows) - len(kept))
 
 
-def measured_attitudes(testbed: Testbed, watch: ProgressCallback | None) -> list[tuple[float, Rotation, Floats]]:
-    """Time, attitude and covariance (3, 3) in body axes of every frame that the tracker solved."""
+def measured_attitudes(
+    testbed: Testbed, watch: ProgressCallback | None
+) -> list[tuple[float, Rotation, Floats, Floats]]:
+    """Of every frame that the tracker solved: time, attitude, (3, 3) covariance in body axes, and its shared part."""
     body_from_cam = testbed.mount.cam_from_body.inv()
     R_body_from_cam, rows = body_from_cam.as_matrix(), []
     for result in run.run(testbed, build_tracker(testbed)):
         attitude = result.report.attitude
         if attitude.cam_from_ref is not None and attitude.covariance_rad2 is not None:
-            covariance = R_body_from_cam @ attitude.covariance_rad2 @ R_body_from_cam.T
-            rows.append((result.frame.t_mid_s, (body_from_cam * attitude.cam_from_ref).inv(), covariance))
+            systematic = np.zeros((3, 3)) if attitude.systematic_rad2 is None else attitude.systematic_rad2
+            covariance, shared = (
+                R_body_from_cam @ one @ R_body_from_cam.T for one in (attitude.covariance_rad2, systematic)
+            )
+            rows.append((result.frame.t_mid_s, (body_from_cam * attitude.cam_from_ref).inv(), covariance, shared))
         if watch:
             watch(result.frame.index + 1, testbed.scene.exposure.frames)
     return rows

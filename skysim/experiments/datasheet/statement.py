@@ -142,6 +142,8 @@ def limits(statement: Statement) -> dict[str, Any]:
 
 def size(square: Bounded) -> str:
     """A root mean square with its interval; where the square is not known to be above 0, what it is below."""
+    if square.high <= 0:
+        return "not seen"
     if square.low <= 0:
         return f"< {math.sqrt(max(square.high, 0.0)):.3g}"
     low, value, high = (math.sqrt(one) for one in (square.low, square.value, square.high))

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -64,12 +65,29 @@ def load(
     check_version(tree, path, text)
     for key, value in (overrides or {}).items():
         set_key(tree, key, value)
+    return plan_of(tree, text, path, overrides=overrides, programs=programs)
+
+
+def plan_of(
+    tree: dict[str, Any],
+    text: str,
+    path: Path,
+    base: Path | None = None,
+    *,
+    overrides: Mapping[str, str] | None = None,
+    programs: Mapping[str, str] | None = None,
+) -> Plan:
+    """The validated plan of a study's tree, read from a text.
+
+    path : of the text, for messages;  base : a file beside which scenes are, `path` if left out
+    Raises InputError with one line.
+    """
     try:
         study = Study.model_validate(tree)
     except ValidationError as error:
         raise InputError(explain(error, Study, tree, [(path, text)], overrides or {})) from None
     try:
-        plan = make_plan(path, study, tree["trial"], programs or {})
+        plan = make_plan(base or path, study, tree["trial"], programs or {})
         check(plan, to_run=programs is not None)
     except InputError as error:  # about a key of the study: add file and line
         message = str(error)

@@ -422,25 +422,31 @@ def make_plan(path: Path, study: Study, trial: dict[str, Any], programs: Mapping
 
 def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
     """The scene and the trial at a point, with its settings applied. Raises InputError with one line."""
-    values = spec.base | settings
+    trial, values = resolve_trial(spec, settings), spec.base | settings
     name = str(values.pop("scene", spec.scene))
+    local = Path(spec.folder) / name
+    path = local if local.suffix in {".yaml", ".yml"} and is_file(local) else find_scene(name)
+    overrides = {key: one_line(value) for key, value in values.items() if not key.startswith(TRIAL)}
+    return load_scene(path, overrides, refuses_unused=False), trial  # `unused_options` refuses, for the whole study
+
+
+def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:
+    """The trial at a point, with its settings applied. Raises InputError with one line."""
     tree: dict[str, Any] = {"trial": dict(spec.trial)}
-    # Each value as YAML on one line.
-    dumped = {key: yaml.safe_dump(value, default_flow_style=True, width=1_000_000) for key, value in values.items()}
-    texts = {key: text.removesuffix("\n...\n") for key, text in dumped.items()}
-    for key, text in texts.items():
+    for key, value in (spec.base | settings).items():
         if key.startswith(TRIAL):
-            set_key(tree, key, text)
+            set_key(tree, key, one_line(value))
     try:
-        trial = TrialSection.model_validate(tree).trial
+        return TrialSection.model_validate(tree).trial
     except ValidationError as error:
         # One line without file and line number; the caller adds the factor.
         message = explain(error, TrialSection, tree, [(Path(), "")], {})
         raise InputError(message.removesuffix(f" ({Path()})")) from None
-    local = Path(spec.folder) / name
-    path = local if local.suffix in {".yaml", ".yml"} and is_file(local) else find_scene(name)
-    overrides = {key: text for key, text in texts.items() if not key.startswith(TRIAL)}
-    return load_scene(path, overrides, refuses_unused=False), trial  # `unused_options` refuses, for the whole study
+
+
+def one_line(value: Value) -> str:
+    """A value as YAML on one line."""
+    return yaml.safe_dump(value, default_flow_style=True, width=1_000_000).removesuffix("\n...\n")
 
 
 class TrialSection(ConfigModel):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bearing_motion import GRAVITY_M_S2, INERTIA, SMALL, Vehicle, prior, record
+from scipy.spatial.transform import Rotation
 from scipy.special import ellipj, ellipkinc
 from scipy.stats import chi2
 
@@ -187,3 +188,36 @@ def test_too_few_attitudes_and_missing_wheel_speeds_are_refused() -> None:
         next(filter_mass(whole, SMALL.lab, assumed))
     with pytest.raises(ImageError, match=r"standard deviations above 0$"):
         replace(assumed, sigma=0 * assumed.sigma)
+
+
+def shared_errors(attitudes: Rotation, sigma_rad: float, rng: np.random.Generator) -> Floats:
+    """(N, 3) errors whose correlation falls with the rotation between two attitudes, exp(-rotation / 0.2 rad)."""
+    turned = np.array([(attitudes[n].inv() * attitudes).magnitude() for n in range(len(attitudes))])
+    correlation = np.exp(-turned / 0.2) + 1e-9 * np.eye(len(attitudes))
+    return np.asarray(sigma_rad * np.linalg.cholesky(correlation) @ rng.standard_normal((len(attitudes), 3)))
+
+
+@pytest.mark.slow
+def test_errors_that_attitudes_share_are_in_the_covariance() -> None:
+    """Shared errors five times as large as the noise: of 12 draws the sum of 9 NEES each is as claimed.
+
+    Without their part the covariance claims too little.
+    """
+    rng, honest, blind = np.random.default_rng(21), 0.0, 0.0
+    for _ in range(12):
+        assumed, vehicle = prior(SMALL, rng)
+        one = record(vehicle, rng)
+        sigma_rad = 5 * vehicle.attitude_sigma_rad
+        errors = shared_errors(one.lab_from_body, sigma_rad, rng)
+        shared = np.tile(sigma_rad**2 * np.eye(3), (len(errors), 1, 1))
+        one = replace(
+            one,
+            lab_from_body=one.lab_from_body * Rotation.from_rotvec(errors),
+            covariance_rad2=one.covariance_rad2 + shared,
+            systematic_rad2=shared,
+        )
+        honest += nees(estimate_with_noise([one], vehicle.lab, assumed), vehicle)
+        unshared = replace(one, covariance_rad2=one.noise_rad2, systematic_rad2=None)
+        blind += nees(estimate_with_noise([unshared], vehicle.lab, assumed), vehicle)
+    assert chi2.ppf(1e-4, 108) < honest < chi2.ppf(1 - 1e-4, 108)
+    assert blind > chi2.ppf(1 - 1e-4, 108)

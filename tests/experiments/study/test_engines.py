@@ -201,7 +201,7 @@ def test_trials_that_are_lost_with_a_worker_are_retried_alone(
     queue = SimpleNamespace(next=lambda: chunks.pop(0) if chunks else (), report_time=lambda *_: None)
     monkeypatch.setattr(engines, "start_pool", lambda *_: pool)
     monkeypatch.setattr(engines, "wait", pool.wait)
-    rows = [row for batch in engines.Pool(2).run(plan_.spec, queue) for row in batch]
+    rows = [row for batch in engines.Pool(2).run(trials.TrialJob(plan_.spec), queue) for row in batch]
     assert sorted(row.trial for row in rows) == list(range(12))
     assert [row.trial for row in rows if row.error is not None] == failed
     assert set(pool.retries) == ({1} if deaths else set())
@@ -365,7 +365,7 @@ def test_a_chunk_travels_as_text_and_comes_back_bit_for_bit() -> None:
 @pytest.mark.long
 def test_a_run_that_is_stopped_leaves_nothing_on_the_cluster(cluster: Cluster, plan_: plan.Plan) -> None:
     engine = on_dask(cluster, 2)
-    rows = engine.run(plan_.spec, runner.ChunkQueue(plan_.points, 150, np.arange(plan_.trials)))
+    rows = engine.run(trials.TrialJob(plan_.spec), runner.ChunkQueue(plan_.points, 150, np.arange(plan_.trials)))
     assert next(rows)[0].error is None
     assert {len(state) for state in engine.client.run(recipes).values()} == {1}
     assert isinstance(rows, Generator)
@@ -385,7 +385,7 @@ def recipes() -> list[str]:
     """The runs that a worker was told of."""
     from skysim.experiments.study.execution import dask_engine
 
-    return list(dask_engine.SPECS)
+    return list(dask_engine.JOBS)
 
 
 def tasks(dask_scheduler: Any) -> int:

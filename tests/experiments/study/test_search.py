@@ -21,7 +21,7 @@ from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution import engines, runner
 from skysim.experiments.study.execution.outcomes import FAILED, Outcome
 from skysim.experiments.study.execution.setups import code_version, seed_of
-from skysim.experiments.study.execution.trials import Row
+from skysim.experiments.study.execution.trials import Row, TrialJob
 from skysim.experiments.study.factors import Settings
 from skysim.results.files.builder.parts import parts_list
 from skysim.results.files.builder.prices import find_prices, read_prices
@@ -57,10 +57,11 @@ class Law:
     def __init__(self, law: Callable[[Settings], Outcome]) -> None:
         self.law = law
 
-    def run(self, spec: plan.TrialSpec, chunks: engines.Chunks) -> Iterator[list[Row]]:
+    def run(self, job: engines.Job, chunks: engines.Chunks) -> Iterator[list[Row]]:
+        assert isinstance(job, TrialJob)
         while chunk := chunks.next():
             yield [
-                self.row(spec, segment, segment.first + n, k)
+                self.row(job.spec, segment, segment.first + n, k)
                 for segment in chunk
                 for n, k in enumerate(segment.replicates)
             ]

@@ -113,38 +113,38 @@ def axes_rad(sheet: Sheet, rate_deg_s: float) -> Floats:
     return np.asarray(np.arctan2(axes[:, 1], axes[:, 0]))
 
 
-def lagged(sheet: Sheet, mean: list[float]) -> tuple[Floats, Floats]:
-    """Angles in degrees between frames of the sequences, and the products of their errors over the axes' mean squares.
+def lagged(sheet: Sheet, mean: list[float]) -> tuple[Floats, Floats, Floats]:
+    """Angles in degrees between frames of the sequences, the products of their errors, and the mean square at the rate.
 
-    (M,) each, the mean over the fields and the axes across the boresight, without the mean error.
+    (M,) each, the mean over the fields and the axes across the boresight, without the mean error; arcsec^2
     """
-    angles, products = [], []
+    angles, products, squares = [], [], []
     for rate in sheet.levels("sequence", "rate_deg_s"):
         steps, errors = sequences(sheet, rate)
         errors = errors[:2] - np.array(mean)[:2, None, None]
-        square = mean_known(errors**2)
         for first in range(len(steps)):
             for second in range(first + 1, len(steps)):
                 apart = steps[second] - steps[first]
                 angles.append(rate * apart / sheet.scene.exposure.rate_hz)
-                products.append(mean_known(errors[:, first] * errors[:, second]) / square)
-    return np.array(angles), np.array(products)
+                products.append(mean_known(errors[:, first] * errors[:, second]))
+                squares.append(mean_known(errors**2))
+    return np.array(angles), np.array(products), np.array(squares)
 
 
 def field_angle_deg(sheet: Sheet, field: Floats, pixel: Floats, mean: list[float]) -> float:
     """The correlation angle of the field term: that with the least squares of the lagged products.
 
-    They are fitted by a exp(-angle / field_deg) + b exp(-angle / pixel_deg) with a : b as the terms at rest; between a
-    pixel and four fields.
+    They are fitted by a exp(-angle / field_deg) + b exp(-angle / pixel_deg) with a : b as the terms at rest, each in
+    units of the mean square at its rate, to which its error is proportional; between a pixel and four fields.
     """
-    angles, products = lagged(sheet, mean)
+    angles, products, squares = lagged(sheet, mean)
     pixel_deg, weight = sheet.designer.pixel_deg, float(np.sum(field[:2] ** 2))
     total = weight + float(np.sum(pixel[:2] ** 2))
-    trials = np.geomspace(pixel_deg, 8 * sheet.designer.half_field_deg, GRID)
+    trials_deg = np.geomspace(pixel_deg, 8 * sheet.designer.half_field_deg, GRID)
     if not total:
-        return float(trials[-1])
-    shapes = [
-        (weight * np.exp(-angles / angle) + (total - weight) * np.exp(-angles / pixel_deg)) / total for angle in trials
-    ]
-    left = [float(np.sum((products - shape * (shape @ products) / (shape @ shape)) ** 2)) for shape in shapes]
-    return float(trials[int(np.argmin(left))])
+        return float(trials_deg[-1])
+    found, left = products / squares, []
+    for angle in trials_deg:
+        shape = (weight * np.exp(-angles / angle) + (total - weight) * np.exp(-angles / pixel_deg)) / total / squares
+        left.append(float(np.sum((found - shape * (shape @ found) / (shape @ shape)) ** 2)))
+    return float(trials_deg[int(np.argmin(left))])

@@ -19,10 +19,9 @@ from uuid import uuid4
 import cv2
 
 from skysim.core.errors import InputError
-from skysim.experiments.study.execution.engines import AHEAD, Chunk, Chunks, failed_row, run_timed, split_chunk
+from skysim.experiments.study.execution.engines import AHEAD, DIED, Chunk, Chunks, Job, run_timed, split_chunk
 from skysim.experiments.study.execution.setups import code_version
-from skysim.experiments.study.execution.trials import Row, Segment
-from skysim.experiments.study.plan import TrialSpec
+from skysim.experiments.study.execution.trials import Segment
 
 try:
     from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed
@@ -79,8 +78,8 @@ def thread_count(client: Client) -> int:
 
 
 def collect_rows(
-    client: Client, name: str, spec: TrialSpec, chunks: Chunks, in_flight: dict[Future, Submission]
-) -> Iterator[list[Row]]:
+    client: Client, name: str, job: Job, chunks: Chunks, in_flight: dict[Future, Submission]
+) -> Iterator[list[Any]]:
     """Yield rows as chunks complete. `in_flight` maps futures to their chunks.
 
     Dask gives up a task (KilledWorker) after several of its workers died, whether the task was the cause or was only
@@ -105,7 +104,7 @@ def collect_rows(
             rows, seconds = future.result()
         except KilledWorker:
             if was_alone:
-                yield [failed_row(spec, chunk[0])]
+                yield [job.failed(chunk[0], DIED)]
             else:
                 retries.extend(split_chunk(chunk))
         else:
@@ -127,32 +126,32 @@ def decode_chunk(text: str) -> Chunk:
 
 # On the workers.
 
-SPECS: dict[str, TrialSpec] = {}  # specification of each run that this worker serves
+JOBS: dict[str, Job] = {}  # job of each run that this worker serves
 
 
-class SpecPlugin(WorkerPlugin):
-    """Worker plugin that gives every worker a run's trial specification, including workers that join later."""
+class JobPlugin(WorkerPlugin):
+    """Worker plugin that gives every worker a run's job, including workers that join later."""
 
-    def __init__(self, name: str, spec: TrialSpec, code: str) -> None:
-        self.name, self.spec, self.code = name, spec, code
+    def __init__(self, name: str, job: Job, code: str) -> None:
+        self.name, self.job, self.code = name, job, code
 
     def setup(self, worker: Any) -> None:
-        """Store the specification on the worker. Raises InputError if its code version differs from the run's."""
+        """Store the job on the worker. Raises InputError if its code version differs from the run's."""
         if code_version() != self.code:
             raise InputError(f"{worker.address} has skysim {code_version()}; allowed: {self.code}")
         cv2.setNumThreads(1)
-        SPECS[self.name] = self.spec
+        JOBS[self.name] = self.job
 
     def teardown(self, worker: Any) -> None:
-        """Remove the specification from the worker."""
-        SPECS.pop(self.name, None)
+        """Remove the job from the worker."""
+        JOBS.pop(self.name, None)
 
 
-def run_encoded(name: str, text: str) -> tuple[list[Row], float]:
-    """`run_timed` with the run's specification on this worker. Raises InputError if `SpecPlugin.setup` rejected it."""
-    if name not in SPECS:
+def run_encoded(name: str, text: str) -> tuple[list[Any], float]:
+    """`run_timed` with the run's job on this worker. Raises InputError if `JobPlugin.setup` rejected it."""
+    if name not in JOBS:
         raise InputError(f"scheduler: a new worker has skysim {code_version()}; allowed: the version of the run")
-    return run_timed(SPECS[name], decode_chunk(text))
+    return run_timed(JOBS[name], decode_chunk(text))
 
 
 class Dask:
@@ -169,14 +168,14 @@ class Dask:
         self.scheduler, self.client = scheduler, connect(scheduler)
         self.workers = thread_count(self.client)
 
-    def run(self, spec: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
+    def run(self, job: Job, chunks: Chunks) -> Iterator[list[Any]]:
         """See `Engine`; the client is closed at the end. Raises InputError if the scheduler's connection is lost."""
         if self.client.status != "running":  # a previous run closed it
             self.client = connect(self.scheduler)
         client, name, in_flight = self.client, f"skysim-{uuid4().hex}", dict[Future, Submission]()
         try:
-            client.register_plugin(SpecPlugin(name, spec, code_version()), name)
-            yield from collect_rows(client, name, spec, chunks, in_flight)
+            client.register_plugin(JobPlugin(name, job, code_version()), name)
+            yield from collect_rows(client, name, job, chunks, in_flight)
         except (CancelledError, OSError):
             message = "connection lost, finished trials are stored; allowed: skysim study resume"
             raise InputError(f"scheduler: {message}") from None

@@ -1,6 +1,7 @@
 """Execution engines: this process (Serial) or a pool of processes (Pool); `dask_engine` adds a Dask cluster.
 
-All engines produce identical rows.
+All engines produce identical rows. What they run is a `Job`: trials of a study (`trials.TrialJob`), or other work
+that is divided into numbered items.
 """
 
 from __future__ import annotations
@@ -14,20 +15,29 @@ from collections import Counter, deque
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from typing import Protocol
+from typing import Any, Protocol
 
 from skysim.core.errors import InputError
 from skysim.experiments.study.execution import workers
-from skysim.experiments.study.execution.outcomes import FAILED
-from skysim.experiments.study.execution.setups import code_version, seed_of
-from skysim.experiments.study.execution.trials import Row, Segment, run_segments
-from skysim.experiments.study.plan import TrialSpec
+from skysim.experiments.study.execution.setups import code_version
+from skysim.experiments.study.execution.trials import Segment
 
 AHEAD = 1  # chunks queued for each worker in addition to the one it runs
 MAX_ATTEMPTS = 3  # attempts of a trial whose worker dies
+DIED = f"its worker process died, {MAX_ATTEMPTS} times"
 
 Chunk = tuple[Segment, ...]
-TimedRows = tuple[list[Row], float]  # rows of a chunk, and the seconds it took
+TimedRows = tuple[list[Any], float]  # rows of a chunk, and the seconds it took
+
+
+class Job(Protocol):
+    """What the items of a chunk are: a frozen value that is sent to the workers."""
+
+    def run(self, chunk: Chunk) -> list[Any]:
+        """The rows of a chunk, one an item."""
+
+    def failed(self, segment: Segment, error: str) -> Any:
+        """The row of an item, alone in its segment, that repeatedly killed its worker."""
 
 
 class Chunks(Protocol):
@@ -43,7 +53,7 @@ class Engine(Protocol):
     name: str
     workers: int
 
-    def run(self, spec: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]: ...
+    def run(self, job: Job, chunks: Chunks) -> Iterator[list[Any]]: ...
 
     def close(self) -> None:
         """Release the resources kept between runs."""
@@ -54,9 +64,9 @@ class Serial:
 
     name, workers = "serial", 1
 
-    def run(self, spec: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
+    def run(self, job: Job, chunks: Chunks) -> Iterator[list[Any]]:
         while chunk := chunks.next():
-            rows, seconds = run_timed(spec, chunk)
+            rows, seconds = run_timed(job, chunk)
             chunks.report_time(chunk, seconds)
             yield rows
 
@@ -77,16 +87,16 @@ class Pool:
     def __init__(self, count: int | None = None) -> None:
         self.workers = count or cores()
         self._pool: ProcessPoolExecutor | None = None
-        self._spec: TrialSpec | None = None
+        self._job: Job | None = None
 
-    def run(self, spec: TrialSpec, chunks: Chunks) -> Iterator[list[Row]]:
+    def run(self, job: Job, chunks: Chunks) -> Iterator[list[Any]]:
         retries: deque[Chunk] = deque()
         deaths: Counter[int] = Counter()  # by trial
         done = False
         while not done:
             in_flight: dict[Future[TimedRows], Chunk] = {}
             try:
-                yield from self._run_until_death(self._pool_for(spec), chunks, retries, in_flight)
+                yield from self._run_until_death(self._pool_for(job), chunks, retries, in_flight)
                 done = True
             except BrokenProcessPool:
                 # Count a death only for a trial that was alone in flight; otherwise the culprit is unknown.
@@ -94,7 +104,7 @@ class Pool:
                 deaths.update(single[0].first for single in lost if len(lost) == 1)
                 for single in lost:
                     if deaths[single[0].first] == MAX_ATTEMPTS:
-                        yield [failed_row(spec, single[0])]
+                        yield [job.failed(single[0], DIED)]
                     else:
                         retries.append(single)
             finally:
@@ -106,12 +116,12 @@ class Pool:
             self._pool.shutdown()
         self._pool = None
 
-    def _pool_for(self, spec: TrialSpec) -> ProcessPoolExecutor:
-        """The pool of the previous run if it was started with this specification, otherwise a new one."""
-        if spec != self._spec:
+    def _pool_for(self, job: Job) -> ProcessPoolExecutor:
+        """The pool of the previous run if it was started with this job, otherwise a new one."""
+        if job != self._job:
             self.close()
         if self._pool is None:
-            self._pool, self._spec = start_pool(self.workers, spec), spec
+            self._pool, self._job = start_pool(self.workers, job), job
         return self._pool
 
     def _kill(self) -> None:
@@ -128,7 +138,7 @@ class Pool:
         chunks: Chunks,
         retries: deque[Chunk],
         in_flight: dict[Future[TimedRows], Chunk],
-    ) -> Iterator[list[Row]]:
+    ) -> Iterator[list[Any]]:
         """Yield rows as chunks complete; retries first, each alone in flight. `in_flight` maps futures to their chunks.
 
         Raises BrokenProcessPool if a worker dies; `in_flight` then holds the chunks that were lost.
@@ -150,10 +160,10 @@ class Pool:
                 yield rows
 
 
-def run_timed(spec: TrialSpec, chunk: Chunk) -> TimedRows:
+def run_timed(job: Job, chunk: Chunk) -> TimedRows:
     """Rows of a chunk and the seconds it took on the worker."""
     start_s = time.perf_counter()
-    return run_segments(spec, chunk), time.perf_counter() - start_s
+    return job.run(chunk), time.perf_counter() - start_s
 
 
 def split_chunk(chunk: Chunk) -> Iterator[Chunk]:
@@ -164,13 +174,6 @@ def split_chunk(chunk: Chunk) -> Iterator[Chunk]:
             yield (segment._replace(first=segment.first + n, replicates=single),)
 
 
-def failed_row(spec: TrialSpec, segment: Segment) -> Row:
-    """The row of a trial that repeatedly killed its worker."""
-    replicate = segment.replicates[0]
-    seed, error = seed_of(spec, segment.point, replicate), f"its worker process died, {MAX_ATTEMPTS} times"
-    return Row(segment.first, segment.point, replicate, seed, "", code_version(), FAILED, error, 0.0)
-
-
 def cores() -> int:
     """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -178,12 +181,12 @@ def cores() -> int:
 
 # Worker processes.
 
-SPEC: list[TrialSpec] = []  # the trial specification of this worker process
+JOB: list[Job] = []  # the job of this worker process
 
 
-def start_pool(count: int, spec: TrialSpec) -> ProcessPoolExecutor:
+def start_pool(count: int, job: Job) -> ProcessPoolExecutor:
     """Start a pool of single-threaded processes that have imported everything a trial needs. Raises InputError."""
-    pool = ProcessPoolExecutor(count, workers.start_fork_server(), initialize_worker, (spec,))
+    pool = ProcessPoolExecutor(count, workers.start_fork_server(), initialize_worker, (job,))
     try:
         for future in [pool.submit(code_version) for _ in range(count)]:
             future.result()
@@ -192,13 +195,13 @@ def start_pool(count: int, spec: TrialSpec) -> ProcessPoolExecutor:
     return pool
 
 
-def initialize_worker(spec: TrialSpec) -> None:
+def initialize_worker(job: Job) -> None:
     """Initialize a worker: ignore Ctrl-C, which the parent handles, and exit when the parent ends, even by kill -9."""
     import cv2
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
-    SPEC[:] = [spec]
+    JOB[:] = [job]
     threading.Thread(target=exit_with_parent, daemon=True).start()
 
 
@@ -211,5 +214,5 @@ def exit_with_parent() -> None:
 
 
 def run_chunk(chunk: Chunk) -> TimedRows:
-    """`run_timed` with the trial specification with which this worker was started."""
-    return run_timed(SPEC[0], chunk)
+    """`run_timed` with the job with which this worker was started."""
+    return run_timed(JOB[0], chunk)

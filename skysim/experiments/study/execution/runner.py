@@ -15,7 +15,7 @@ from skysim.core.errors import InputError
 from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
 from skysim.experiments.study.execution.setups import code_version, scene_hash
-from skysim.experiments.study.execution.trials import Row, Segment
+from skysim.experiments.study.execution.trials import Row, Segment, TrialJob
 from skysim.experiments.study.plan import Plan, TrialSpec, resolve_point
 from skysim.experiments.study.store import Store
 
@@ -181,9 +181,8 @@ def run_points(
     failed_before = store.counts()["failed"]
     progress = Progress(len(numbers), len(numbers) - len(missing), failed_before)
     budget = plan.study.budget
-    rows = (
-        engine.run(plan.spec, ChunkQueue(points, replicates, missing, first, plan.spec)) if len(missing) else iter(())
-    )
+    queue = ChunkQueue(points, replicates, missing, first, plan.spec)
+    rows = engine.run(TrialJob(plan.spec), queue) if len(missing) else iter(())
     try:
         for batch in rows:
             store.add(batch)

@@ -9,7 +9,7 @@ import math
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import Health, TrackedReport, TrackingMode
 from skysim.camera import render
+from skysim.camera.detector.added_charge import AddedCharge
 from skysim.core import quaternion
 from skysim.core.paths import ROOT
 from skysim.core.random_streams import random_stream
@@ -87,6 +88,23 @@ class Segment(NamedTuple):
 
 
 # Running trials.
+
+
+@dataclass(frozen=True)
+class TrialJob:
+    """The trials of a study as a job of the engines."""
+
+    spec: TrialSpec
+
+    def run(self, chunk: tuple[Segment, ...]) -> list[Row]:
+        """Run all trials of a chunk, in order."""
+        return run_segments(self.spec, chunk)
+
+    def failed(self, segment: Segment, error: str) -> Row:
+        """The row of a trial that repeatedly killed its worker."""
+        replicate = segment.replicates[0]
+        seed = seed_of(self.spec, segment.point, replicate)
+        return Row(segment.first, segment.point, replicate, seed, "", code_version(), FAILED, error, 0.0)
 
 
 def run_segments(spec: TrialSpec, segments: tuple[Segment, ...]) -> list[Row]:
@@ -251,10 +269,15 @@ def zyz(first_rad: float, second_rad: float, third_rad: float) -> Floats:
     return np.array([cosine * math.cos(sum_), x, y, cosine * math.sin(sum_)])
 
 
-def render_trial_frame(setup: Setup, seed: int) -> tuple[Frame, Truth, tuple[float, float] | None]:
-    """Frame of a frame trial, its truth and, with a gyro, the streak vector (dx, dy) in pixels at the image center."""
+def render_trial_frame(
+    setup: Setup, seed: int, added: AddedCharge | None = None
+) -> tuple[Frame, Truth, tuple[float, float] | None]:
+    """Frame of a frame trial, its truth and, with a gyro, the streak vector (dx, dy) in pixels at the image center.
+
+    added : gets the masks of smear and particles
+    """
     testbed, streak_px = moving_testbed(setup, seed)
-    return *exposure.render_frame(testbed, tracked_frames(setup)), streak_px
+    return *exposure.render_frame(testbed, tracked_frames(setup), added=added), streak_px
 
 
 def tracked_frames(setup: Setup) -> int:

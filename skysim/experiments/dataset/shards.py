@@ -1,0 +1,230 @@
+"""The files of one shard: a tar of frames and labels (WebDataset), COCO JSON, part of a Zarr array, Parquet tables."""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.core.types import ra_dec_roll_rad
+from skysim.core.errors import InputError
+from skysim.experiments.dataset.labels import MASKS, Extents, LabelledFrame
+from skysim.experiments.dataset.storage import EXTRA, Storage
+from skysim.scene.scene import Scene
+from skysim.scene.sections.light import StarsConfig
+
+ZARR, ZARR_ARRAY = "images.zarr", "images"
+BLOCK = 512  # bytes of a block of a tar file
+COCO_SNR = 3.0  # sources below are no annotations; they are in the other labels
+CATEGORIES = ("source", *MASKS)
+
+
+def to_npy(array: NDArray[Any]) -> bytes:
+    """The header of an array in NumPy's format, version 1."""
+    file = io.BytesIO()
+    description = np.lib.format.header_data_from_array_1_0(array)
+    np.lib.format.write_array_header_1_0(file, description)
+    return file.getvalue()
+
+
+class TarWriter:
+    """A tar file in the POSIX ustar format, without times and owners, so that the same frames give the same bytes."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self.file, self.position = file, 0
+
+    def add(self, name: str, *parts: bytes | memoryview) -> int:
+        """Append a file that is made of some parts; return the position of the last part in the tar."""
+        header = tarfile.TarInfo(name)
+        header.size = sum(len(part) for part in parts)
+        self._write(header.tobuf(tarfile.USTAR_FORMAT))
+        for part in parts:
+            last = self.position
+            self._write(part)
+        self._write(bytes(-self.position % BLOCK))
+        return last
+
+    def close(self) -> None:
+        """Write the two empty blocks at the end."""
+        self._write(bytes(2 * BLOCK))
+
+    def _write(self, data: bytes | memoryview) -> None:
+        self.file.write(data)
+        self.position += len(data)
+
+
+def key_of(frame: int) -> str:
+    """The key of a frame's files in a shard."""
+    return f"{frame:09d}"
+
+
+def shard_name(folder: str, shard: int, suffix: str) -> str:
+    """Name of a shard's file in the dataset."""
+    return f"{folder}/{shard:06d}.{suffix}"
+
+
+def add_frame(tar: TarWriter, number: int, one: LabelledFrame, labels: dict[str, Any]) -> int:
+    """Append a frame with its labels; return the position of its first pixel."""
+    key, image = key_of(number), np.ascontiguousarray(one.frame.image_dn)
+    position = tar.add(f"{key}.image.npy", to_npy(image), image.data.cast("B"))
+    tar.add(f"{key}.sources.npy", to_npy(one.sources), one.sources.tobytes())
+    masks = {name: {"size": list(image.shape), "counts": counts} for name, counts in one.masks.items()}
+    more = {"masks": masks, "unmatched_px": one.unmatched_px.tolist(), "hidden": one.truth.hidden.tolist()}
+    tar.add(f"{key}.frame.json", json.dumps(labels | more).encode())
+    return position
+
+
+def frame_labels(one: LabelledFrame, scene: Scene, numbers: dict[str, Any]) -> dict[str, Any]:
+    """The labels of a frame that are one number each, by column of the index; `numbers` come first."""
+    truth, frame = one.truth, one.frame
+    labels = {**numbers, "height": frame.image_dn.shape[0], "width": frame.image_dn.shape[1]}
+    labels |= {"exposure_s": frame.exposure_s, "saturation_dn": frame.saturation_dn}
+    for name in ("lab_from_body", "cam_from_lab"):
+        rotation: Rotation = getattr(truth, name)
+        labels |= {f"{name}_q{end}": float(q) for end, q in zip("xyzw", rotation.as_quat(), strict=True)}
+    labels |= {f"rate_cam_{end}_rad_s": float(rate) for end, rate in zip("xyz", truth.rate_cam_rad_s, strict=True)}
+    if isinstance(scene.light, StarsConfig):
+        angles = np.degrees(ra_dec_roll_rad(truth.cam_from_lab))
+        labels |= dict(zip(("ra_deg", "dec_deg", "roll_deg"), map(float, angles), strict=True))
+    labels |= {"sources": len(one.sources), "detected": int(one.sources["detected"].sum())}
+    labels["unmatched"] = len(one.unmatched_px)
+    return labels | {f"{name}_pixels": sum(one.masks.get(name, [])[1::2]) for name in MASKS}
+
+
+# COCO.
+
+
+def coco_image(labels: dict[str, Any]) -> dict[str, Any]:
+    """The entry of an image; its file is that in the tar of the shard."""
+    name = f"{shard_name('shards', labels['shard'], 'tar')}/{key_of(labels['frame'])}.image.npy"
+    return {"id": labels["frame"], "file_name": name, "height": labels["height"], "width": labels["width"]}
+
+
+def coco_annotations(one: LabelledFrame, number: int) -> bytes:
+    """JSON objects, joined by commas: outlines of the sources, and masks of the rest as crowds.
+
+    Ids are unique in the dataset. Objects of a whole shard would take longer, for the sake of Python's garbage.
+    """
+    seen = one.sources["snr"] >= COCO_SNR
+    found: list[dict[str, Any]] = [
+        {"category_id": 1, "bbox": box, "area": box[2] * box[3], "segmentation": [outline], "iscrowd": 0, **labels}
+        for box, outline, labels in outlines(one.sources[seen], one.extents.of(seen))
+    ]
+    height, width = one.frame.image_dn.shape
+    for name, counts in one.masks.items():
+        if len(counts) > 1:
+            code = {"size": [height, width], "counts": counts}
+            mask = {"bbox": mask_box(counts, height), "area": sum(counts[1::2]), "segmentation": code, "iscrowd": 1}
+            found.append({"category_id": 1 + CATEGORIES.index(name), **mask})
+    numbered = [{"id": number * 100_000 + n, "image_id": number, **each} for n, each in enumerate(found, 1)]
+    return json.dumps(numbered)[1:-1].encode()
+
+
+def outlines(rows: NDArray[Any], extents: Extents) -> list[tuple[list[float], list[float], dict[str, Any]]]:
+    """Box (x, y, width, height), outline (x, y of four corners) and labels of each source.
+
+    COCO's origin is the corner of the first pixel, half a pixel from its center.
+    """
+    across = extents.along[:, ::-1] * [-1, 1]
+    a, b = extents.along * extents.half_px[:, :1], across * extents.half_px[:, 1:]
+    corners = np.round(extents.center_px[:, None] + 0.5 + np.stack([-a - b, a - b, a + b, b - a], axis=1), 2)
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    boxes = np.round(np.column_stack([low, high - low]), 2).tolist()
+    names = {"source": "id", "electrons": "electrons", "detected": "detected"}
+    columns = zip(*(rows[name].tolist() for name in names.values()), strict=True)
+    labels = [dict(zip(names, values, strict=True)) for values in columns]
+    return list(zip(boxes, corners.reshape(-1, 8).tolist(), labels, strict=True))
+
+
+def mask_box(counts: list[int], height: int) -> list[float]:
+    """The box about the pixels of a mask."""
+    ends = np.cumsum(counts)
+    first, last = ends[:-1:2], ends[1::2] - 1
+    x0, x1 = int(first[0] // height), int(last[-1] // height)
+    whole = first // height != last // height  # a run over the end of a column has its first and its last row
+    y0 = 0 if whole.any() else int((first % height).min())
+    y1 = height - 1 if whole.any() else int((last % height).max())
+    return [float(x0), float(y0), float(x1 - x0 + 1), float(y1 - y0 + 1)]
+
+
+def coco_file(images: list[dict[str, Any]], annotations: list[bytes]) -> bytes:
+    """A COCO file of one shard, from the annotations of each frame."""
+    categories = json.dumps([{"id": n, "name": name} for n, name in enumerate(CATEGORIES, 1)]).encode()
+    parts = (json.dumps(images).encode(), b", ".join(filter(None, annotations)), categories)
+    return b'{"images": %b, "annotations": [%b], "categories": %b}' % parts
+
+
+# Tables.
+
+
+def parquet(columns: dict[str, Any]) -> bytes:
+    """A Parquet file of some columns, the same bytes for the same columns. Raises InputError without pyarrow."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise InputError(f"--out: a dataset {EXTRA}") from None
+    sink = pyarrow.BufferOutputStream()
+    pyarrow.parquet.write_table(pyarrow.table(columns), sink, compression="zstd")
+    return bytes(sink.getvalue())
+
+
+def index_table(rows: list[dict[str, Any]]) -> bytes:
+    """The index of a shard: a row for each frame."""
+    return parquet({name: [row[name] for row in rows] for name in rows[0]})
+
+
+def sources_table(frames: list[int], sources: list[NDArray[Any]]) -> bytes:
+    """The sources of a shard: a row for each source of each frame."""
+    rows = np.concatenate(sources)
+    number = np.repeat(frames, [len(one) for one in sources])
+    return parquet({"frame": number, **{name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names or ()}})
+
+
+# Zarr.
+
+
+def require_zarr() -> Any:
+    """The package zarr. Raises InputError."""
+    try:
+        import zarr
+    except ImportError:
+        raise InputError(f"--to zarr: {EXTRA}") from None
+    return zarr
+
+
+def zarr_is_there(storage: Storage) -> bool:
+    """Whether the array was created: its description is written last."""
+    return "zarr.json" in storage.names(f"{ZARR}/{ZARR_ARRAY}")
+
+
+def create_zarr(storage: Storage, frames: int, per_shard: int, image: NDArray[Any]) -> None:
+    """Create the array of all images, of the size and the type of this one; its shards are the dataset's."""
+    shape = image.shape
+    group = require_zarr().create_group(storage.zarr_store(ZARR), zarr_format=3, overwrite=True)
+    group.create_array(
+        ZARR_ARRAY,
+        shape=(frames, *shape),
+        chunks=(1, *shape),
+        shards=(per_shard, *shape),
+        dtype=image.dtype,
+        dimension_names=("frame", "y", "x"),
+        attributes={"units": "DN"},
+    )
+
+
+def write_zarr(storage: Storage, first: int, images: list[NDArray[Any]], shard: int) -> None:
+    """Write the images of one shard, which is one object. Raises InputError for an image of another size."""
+    array = require_zarr().open_group(storage.zarr_store(ZARR), mode="r+")[ZARR_ARRAY]
+    for n, image in enumerate(images):
+        if image.shape != array.shape[1:] or image.dtype != array.dtype:
+            raise InputError(
+                f"--to zarr: frame {first + n} of shard {shard} is {image.shape[1]}x{image.shape[0]} {image.dtype}, the"
+                f" first one {array.shape[2]}x{array.shape[1]} {array.dtype}; allowed: one size, or --to webdataset"
+            )
+    array[first : first + len(images)] = np.stack(images)
