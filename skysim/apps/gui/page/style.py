@@ -111,6 +111,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-space > .lab-names {{ pointer-events: none }}
 .lab-tag {{ position: absolute; left: 0; top: 0; pointer-events: none; color: #fff; background: #0d1015b0 }}
 .lab-looks {{ position: absolute; right: 20px; top: 14px; display: flex; gap: 4px }}
+.lab-looks > .q-btn {{ color: #9cc4ff !important; background: #0d1015b0 !important }}
 .lab-lights {{ width: 100%; border-collapse: collapse; cursor: default; text-align: right }}
 .lab-lights th {{ position: sticky; top: -10px; font-weight: normal; color: {COLORS["quiet"]};
   background: {COLORS["panel"]} }}
@@ -173,7 +174,6 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   .lab-said {{ text-align: left; flex-basis: 200px }}
   .lab-keys {{ flex-wrap: wrap; padding: 6px 14px; row-gap: 4px }}
   .lab-sensor {{ grid-template-rows: auto min(60vh, 100vw) auto }} .lab-bar {{ flex-wrap: wrap; padding: 4px 14px }}
-  .lab-under {{ grid-template-columns: repeat(auto-fit, minmax(252px, 1fr)); overflow: auto }}
   .lab-side {{ grid-template-rows: auto auto 620px; border-left: 0 }}
   .lab-run > .row:first-child {{ flex-wrap: wrap }}
 }}

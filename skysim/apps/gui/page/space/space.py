@@ -24,7 +24,7 @@ VIEWS = {
     "top": "from above",
 }
 UPDATE_S = 0.1
-AXIS = 0.35  # length of the axes over the distance from which the laboratory is seen
+AXIS, MOST_AXIS_M = 0.35, 1.2  # length of the axes over the distance from which the laboratory is seen
 DIGITS = 5  # of meters
 
 
@@ -60,7 +60,11 @@ class Scene3D:
                 "shapes": [shape_fields(shape) for shape in lab.shapes],
                 "lights": light_fields(lab),
                 "views": {name: view._asdict() for name, view in lab.views.items()},
-                **{"background": DARK["ground"], "prefix": scene_info.prefix, "axis": round(AXIS * distance_m, DIGITS)},
+                **{
+                    "background": DARK["ground"],
+                    "prefix": scene_info.prefix,
+                    "axis": min(AXIS * distance_m, MOST_AXIS_M),
+                },
             },
         )
 
