@@ -1,6 +1,7 @@
-"""Speed of the browser GUI in Chromium: frames per second while a key is held, and latency from key to image.
+"""Speed of the browser GUI in Chromium: frames per second while a key is held, what a frame takes over the websocket,
+latency from key to image, and the time until a page shows its first frame.
 
-`python -m benchmarks.gui [SECONDS]` serves shefex2 with a detector of 1024 x 1024 pixels and prints both numbers for
+`python -m benchmarks.gui [SECONDS]` serves shefex2 with a detector of 1024 x 1024 pixels and prints the numbers for
 screens of 1280 x 800 and 1920 x 1080. Every frame is solved. A browser without a graphics card draws on the same cores
 that render the frames.
 """
@@ -18,6 +19,7 @@ import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -89,10 +91,11 @@ def delays_ms(page: Any) -> np.ndarray:
 
 
 def main(seconds: float) -> None:
-    """Print both numbers for each screen size."""
+    """Print the numbers for each screen size."""
     from playwright.sync_api import sync_playwright
 
-    print(f"{'screen':12s} frames/s   key to picture: median, 90 %, ms   (bars: 15; 100)")
+    print("screen       frames/s   kB/frame   key to picture: median, 90 %, ms   page, s")
+    print("bars               30         20                           60      90         3")
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder) / "square.yaml"
         scene.write_text(SCENE)
@@ -104,16 +107,29 @@ def measured(driver: Any, url: str, seconds: float) -> None:
     """Print one line per screen size."""
     browser = driver.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
     for width, height in SIZES:
-        page = browser.new_page(viewport={"width": width, "height": height})
+        page, received = browser.new_page(viewport={"width": width, "height": height}), []
+        page.on("websocket", partial(count_bytes, received))
+        begin = time.monotonic()
         page.goto(url)
+        page.locator(".lab-frame canvas[data-frame]").wait_for(timeout=90_000)
+        shown_s = time.monotonic() - begin
         page.locator(".lab-card .good").wait_for(timeout=90_000)
         page.wait_for_timeout(20_000)  # the server starts the spare worker for the next tab
         page.evaluate(LOADS)
-        rate, late = held(page, seconds), delays_ms(page)
+        received.clear()
+        rate = held(page, seconds)
+        frame_kb = sum(received) / 1e3 / max(rate * seconds, 1)
+        late = delays_ms(page)
         middle, most = np.quantile(late, [0.5, 0.9])
-        print(f"{width} x {height:<6d} {rate:8.1f}   {middle:15.0f} {most:8.0f}", flush=True)
+        numbers = f"{rate:8.1f}   {frame_kb:8.1f}   {middle:26.0f} {most:7.0f}   {shown_s:7.1f}"
+        print(f"{width} x {height:<6d} {numbers}", flush=True)
         page.close()
     browser.close()
+
+
+def count_bytes(received: list[int], socket: Any) -> None:
+    """Note the length of each message that a websocket receives, before compression."""
+    socket.on("framereceived", lambda message: received.append(len(message)))
 
 
 def chromium() -> str:

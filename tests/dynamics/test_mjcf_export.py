@@ -475,3 +475,31 @@ def test_the_tilt_stop_is_hidden_and_no_hardware_is() -> None:
         assert stop
         assert all(stop)
         assert not any(group == mjcf_export.GROUP_HIDDEN for name, group in named if not name.startswith("tilt_stop"))
+
+
+# The shapes for other drawing programs
+
+
+def test_the_shapes_of_a_laboratory_are_the_file_s_without_its_lights() -> None:
+    scene, vehicle, sources = dome_lab()
+    lab_from_body = Rotation.from_euler("ZYX", (30.0, -5.0, 10.0), degrees=True)
+    text = mjcf_export.mjcf(vehicle, scene, sources, lab_from_body)
+    lab, (model, data) = multibody.laboratory(text), loaded(text)
+    by_name = {shape.name: shape for shape in lab.shapes}
+    assert {"stage_floor", "stage_column", "stage_rim_inside", "stage_field"} < set(by_name)
+    assert not [name for name in by_name if name.startswith(("stage_leds", "stage_stars"))]
+    dome = by_name["stage_dome_inside"]
+    turn = Rotation.from_quat(dome.parent_from_shape_wxyz, scalar_first=True)
+    inside = surface.build_surface(scene.light.surface)
+    on_it = turn.apply(dome.vertices_m) + dome.position_m
+    np.testing.assert_allclose(
+        np.sum(((on_it - inside.center_m) / inside.semi_axes_m) ** 2, axis=1), 1.0, rtol=0, atol=1e-5
+    )
+    assert dome.faces.max() == len(dome.vertices_m) - 1
+    # Shapes of the vehicle turn with it: the file's start has them where its attitude takes those of body axes.
+    for name in ("ball", "upper_deck", "stage_ray_0"):
+        shape, geom = by_name[name], model.geom(name).id
+        assert shape.on_vehicle
+        np.testing.assert_allclose(lab_from_body.apply(shape.position_m), data.geom_xpos[geom], rtol=0, atol=1e-9)
+    assert not dome.on_vehicle
+    np.testing.assert_array_equal(lab.eye_m, model.camera("lab").pos)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.types import Floats
+from skysim.dynamics.multibody import Shape
 from skysim.results import stretch
 
 Triple = tuple[float, float, float]
@@ -121,8 +122,9 @@ class SceneInfo:
     """Facts about a loaded scene that the page displays.
 
     names : of its three angles;  prefix : of its lights' numbers (HIP or LED)
-    field_deg : horizontal field of view;  stages : the tracker's algorithm by stage;  choices : all algorithms by stage
-    duration_s : of its motion
+    field_deg : horizontal field of view;  pixel_arcsec : angle of a pixel in the frame's middle
+    stages : the tracker's algorithm by stage;  choices : all algorithms by stage
+    duration_s : of its motion;  noise : whether the camera has noise, else a frame is the expected value
     """
 
     scene: str
@@ -131,30 +133,44 @@ class SceneInfo:
     names: tuple[str, str, str]
     prefix: str
     field_deg: float
+    pixel_arcsec: float
     stages: dict[str, str]
     choices: dict[str, tuple[str, ...]]
     duration_s: float
+    noise: bool
     geometry: LabGeometry
     lens: Lens
+
+
+class LookFrom(NamedTuple):
+    """A place to look from and what to look at, m, in the lab frame, or in body axes if it is on the vehicle.
+
+    fov_deg : vertical field of view
+    """
+
+    eye_m: Triple
+    target_m: Triple
+    up: Triple
+    fov_deg: float
+    on_vehicle: bool
 
 
 @dataclass(frozen=True, slots=True)
 class LabGeometry:
     """3-D geometry of the laboratory; meters in the lab frame unless stated otherwise.
 
-    shapes  : the vehicle's, in body axes (kind, size, position, wxyz, rgb)
-    ids, lights_m, size : (N,) the lights, (N, 3) their positions, (N,) drawn sizes, 0 to 1; stars are on a sphere
-    camera_m : (3,) its pupil, body axes;  corners_m : (4, 3) where the corners of its field meet the surface, body axes
-    dome_m  : (K, 3) points of lines on the dome
+    shapes  : those of the MJCF file that `skysim scenes export` writes, without the lights
+    ids, lights_m, radius_m, lit : (N,) the lights, (N, 3) their positions, (N,) drawn radii, (N,) whether they shine;
+        stars are on a sphere
+    views   : places to look from, by name
     """
 
-    shapes: tuple[tuple[str, Triple, Triple, tuple[float, float, float, float], Triple], ...]
+    shapes: tuple[Shape, ...]
     ids: NDArray[np.int64]
     lights_m: Floats
-    size: Floats
-    camera_m: Floats
-    corners_m: Floats
-    dome_m: Floats
+    radius_m: Floats
+    lit: NDArray[np.bool_]
+    views: dict[str, LookFrom]
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,9 +16,9 @@ from starlette.datastructures import MutableHeaders
 from starlette.requests import HTTPConnection, Request
 from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
 
+from skysim.apps.gui.page.frame.sensor import FRAMES
 from skysim.apps.gui.page.page import Tab
 from skysim.apps.gui.page.panels.photo import LIMIT_BYTES
-from skysim.apps.gui.page.panels.sensor import FRAMES
 from skysim.apps.gui.worker.session import MAX_WORKERS, SpareWorker
 from skysim.apps.gui.worker.study_process import StudyProcess, is_shown
 from skysim.scene.loader import find
@@ -193,7 +193,6 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str]) -> None:
         tab.session, tab.new_session = session, spare.take
         client.on_delete(tab.close)
         await tab.start()
-        await tab.scene_3d.adapt_frame_rate()
         spare.start()
 
 

@@ -113,7 +113,7 @@ def test_the_marks_are_drawn_on_their_stars(page: Any) -> None:
     green = """() => { const canvas = document.querySelector('.lab-frame canvas');
       const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
       let count = 0;
-      for (let n = 0; n < data.length; n += 4) count += data[n + 1] > data[n] + 40 && data[n + 1] > data[n + 2] + 40;
+      for (let n = 0; n < data.length; n += 4) count += data[n + 1] > data[n] + 60;
       return count; }"""
     assert page.evaluate(green) > 500
     page.get_by_role("checkbox", name="identified").click()

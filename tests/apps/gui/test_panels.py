@@ -20,9 +20,10 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui.messages import Detection, Light, TrackerResult
-from skysim.apps.gui.page import forms, keys, overlay
-from skysim.apps.gui.page.panels.sensor import Sensor
-from skysim.apps.gui.page.star_names import NAMES
+from skysim.apps.gui.page import forms, keys
+from skysim.apps.gui.page.frame import overlay
+from skysim.apps.gui.page.frame.sensor import Sensor
+from skysim.apps.gui.page.frame.star_names import NAMES
 from skysim.apps.gui.server import Guard, host_of, report_path, user_of
 from skysim.apps.gui.worker import export, photo, pixels, study_process, workbench
 from skysim.apps.gui.worker.photo import SUFFIXES

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 import pytest
 from labpage import CHROMIUM, NARROW, Server, changed, come, onto_the_page, opened, panel, pictured, source
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
+from skysim.apps.gui.page import style
+from skysim.apps.gui.page.frame import overlay
 from skysim.apps.gui.page.shell.palette import Command, matching
 from skysim.apps.gui.page.shell.wording import for_page
 from skysim.apps.gui.worker.study_process import MAX_STUDIES, StudyProcess
@@ -48,6 +52,36 @@ def test_a_study_beyond_the_number_allowed_is_refused(tmp_path: Any, monkeypatch
     monkeypatch.setattr(StudyProcess, "running", property(lambda _: True))
     with pytest.raises(InputError, match=f"{MAX_STUDIES} of {MAX_STUDIES} studies are running"):
         StudyProcess.check_count()
+
+
+EYES = {  # linear RGB as seen: Machado, Oliveira and Fernandes 2009, severity 1
+    "normal": np.eye(3),
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+}
+STATES = ("good", "warn", "bad")
+
+
+def distance(colors: Iterable[str], eye: str) -> float:
+    """The least distance between two of some colors, in Oklab (Ottosson 2020), of which 0.02 is just noticeable."""
+    srgb = np.array([[int(color[n : n + 2], 16) / 255 for n in (1, 3, 5)] for color in colors])
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4) @ np.array(EYES[eye]).T
+    cones = [[0.412221, 0.536333, 0.051446], [0.211903, 0.680700, 0.107397], [0.088302, 0.281719, 0.629979]]
+    lab = [[0.210454, 0.793618, -0.004072], [1.977998, -2.428592, 0.450594], [0.025904, 0.782772, -0.808676]]
+    seen = np.cbrt(np.clip(linear, 0, 1) @ np.array(cones).T) @ np.array(lab).T
+    i, j = np.triu_indices(len(seen), 1)
+    return float(np.linalg.norm(seen[i] - seen[j], axis=1).min())
+
+
+@pytest.mark.parametrize("eye", EYES)
+def test_colors_are_told_apart_by_every_eye(eye: str) -> None:
+    """Red and green of equal lightness would be 0.04 apart in deuteranopia."""
+    assert distance(["#3f9a52", "#e05555"], "deuteranopia") < 0.04
+    marks = [color for kind, color in overlay.COLORS.items() if kind != "windows"]  # these are dashed
+    states = [[theme[name] for name in STATES] for theme in (style.DARK, style.LIGHT)]
+    for colors in (style.CURVE_COLORS, marks, *states):
+        assert distance(colors, eye) > 0.1
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from math import isfinite
+from math import isfinite, radians, tan
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args, get_origin
 
@@ -142,6 +142,18 @@ FEEDBACKS = {
     "filter": "closed by the filter",
     "": "open loop",
 }
+
+
+def field_override(name: str, overrides: Mapping[str, str], field_deg: float) -> dict[str, str]:
+    """Override by which a scene's horizontal field of view becomes another: f = width / (2 tan(field / 2)).
+
+    Raises InputError.
+    """
+    if not 0.5 <= field_deg <= 120:
+        raise InputError("field: allowed: 0.5 to 120 deg")
+    camera = load(name, overrides).camera
+    focal_m = camera.focal_length_m / camera.focal_px * camera.width_px / 2 / tan(radians(field_deg / 2))
+    return {"camera.focal_length": f"{1e3 * focal_m:.5g} mm"}
 
 
 def loop_overrides(name: str, overrides: Mapping[str, str], feedback: str) -> dict[str, str]:

@@ -31,6 +31,7 @@ KEYS = (
     Key(("e", "r"), "E R", "move", "roll", "roll the camera by a degree: E counterclockwise, R clockwise"),
     Key(("Shift",), "⇧", "coarse", "coarse", "with an arrow, E or R: steps ten times as large"),
     Key(("1",), "1", "identify", "identify", "render a new frame and solve it"),
+    Key(("n",), "N", "noise", "noise", "render without the camera's noise, or with it again"),
     Key(("2",), "2", "monte_carlo", "Monte Carlo", "start a Monte Carlo study; F8 sets its number of trials"),
     Key(("F5",), "F5", "attitude", "attitude", "type an attitude; Enter points the camera there"),
     Key(("F6",), "F6", "sensor", "sensor", "select the detection algorithm"),
@@ -45,7 +46,8 @@ KEYS = (
     Key(("F1",), "F1", "help", "help", "show this help"),
     Key(("Escape",), "Esc", "close", "close", "close the help"),
 )
-PERFORMED = {"identify", "monte_carlo", "play", "live", "attitude", "sensor", "identifier", "runs", "log", "help"}
+PERFORMED = {"identify", "noise", "monte_carlo", "play", "live", "attitude", "sensor", "identifier", "runs", "log"}
+PERFORMED |= {"help"}
 ACTION_BY_KEY = {name: key.action for key in KEYS for name in key.keys}
 
 # A list or tab keeps the keyboard focus after a choice, so the focus is removed from it.

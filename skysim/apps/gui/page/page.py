@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import secrets
 import signal
 import time
@@ -19,18 +18,21 @@ from nicegui.events import KeyEventArguments
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.page import forms, keys, style
+from skysim.apps.gui.page.frame.sensor import FRAMES, Sensor
 from skysim.apps.gui.page.panels.attitude import AttitudeCard
+from skysim.apps.gui.page.panels.lights import LightsPanel
 from skysim.apps.gui.page.panels.monte_carlo import MonteCarloPanel
 from skysim.apps.gui.page.panels.photo import PhotoPanel
 from skysim.apps.gui.page.panels.plan import PlanPanel
 from skysim.apps.gui.page.panels.run import RunPanel
 from skysim.apps.gui.page.panels.scene import ScenePanel
-from skysim.apps.gui.page.panels.sensor import FRAMES, Sensor
-from skysim.apps.gui.page.scene_3d import Scene3D
 from skysim.apps.gui.page.shell.arrangement import Arrangement
+from skysim.apps.gui.page.shell.help import help_dialog
 from skysim.apps.gui.page.shell.history import History
+from skysim.apps.gui.page.shell.log import LogPanel
 from skysim.apps.gui.page.shell.palette import Command, Palette
 from skysim.apps.gui.page.shell.wording import for_page
+from skysim.apps.gui.page.space.space import Scene3D
 from skysim.apps.gui.state import View
 from skysim.apps.gui.worker import export
 from skysim.apps.gui.worker.photo import Photo
@@ -40,8 +42,7 @@ from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.scene.loader import find, load
 
-PANELS = ("Lab", "Scene", "Plan", "Run", "Monte Carlo", "Image", "Log")
-MAX_LOG_LINES = 500
+PANELS = ("Lab", "Lights", "Scene", "Plan", "Run", "Monte Carlo", "Image", "Log")
 
 
 class Tab:
@@ -70,7 +71,6 @@ class Tab:
         self.steps, self.moving = np.zeros(3), False
         self.message_text = ""
         self.editing = asyncio.Lock()
-        self.lines: list[str] = []
 
     async def close(self) -> None:
         """Release the tab's resources after its browser has gone: frames, study and worker."""
@@ -121,7 +121,7 @@ class Tab:
                 for key in keys.KEYS:
                     if key.description:
                         ui.html(f"<span><kbd>{key.label}</kbd>{key.description}</span>", sanitize=False)
-        self.help = self.build_help()
+        self.help = help_dialog()
         ui.keyboard(on_key=self.key, ignore=["input", "textarea"])
         self.history = History(self, self.scene)
         self.palette = Palette(self.commands)
@@ -141,6 +141,7 @@ class Tab:
             self.spinner = ui.spinner(size="16px").classes("lab-busy").mark("busy")
             self.latency = ui.label().classes("lab-rate mono quiet").mark("rate")
             self.latency.props('title="latency: from the request for a frame to its arrival"')
+            self.noise = ui.switch("noise", value=True, on_change=self.switch_noise).props("dense size=xs")
             ui.switch("identify", value=True).bind_value_to(self, "solving").props("dense size=xs")
             with ui.button("Export").props("dense flat size=sm").mark("export"), ui.menu():
                 for name in export.FILE_BY_ITEM:
@@ -166,8 +167,9 @@ class Tab:
                     ui.tab(name).mark(f"tab-{name}")
             with ui.tab_panels(self.tabs, value="Lab", animated=False, keep_alive=True).classes("lab-panels"):
                 with ui.tab_panel("Lab").classes("relative-position"):
-                    self.scene_3d = Scene3D()
-                    ui.label("drag: rotate · right drag: pan · wheel: zoom").classes("lab-turn quiet")
+                    self.scene_3d = Scene3D(self)
+                with ui.tab_panel("Lights"):
+                    self.lights = LightsPanel(self)
                 with ui.tab_panel("Scene"):
                     self.scene_panel = ScenePanel(self)
                 with ui.tab_panel("Plan"):
@@ -179,21 +181,7 @@ class Tab:
                 with ui.tab_panel("Image"):
                     self.photo = PhotoPanel(self)
                 with ui.tab_panel("Log"):
-                    self.log_label = ui.label("Nothing yet.").classes("mono lab-log").mark("log")
-
-    def build_help(self) -> ui.dialog:
-        with ui.dialog() as dialog, ui.card().style("max-width: 600px; padding: 20px 24px; gap: 12px"):
-            ui.label("skysim gui").style("font-weight: 600; font-size: 15px")
-            ui.label(
-                "Point the star sensor, view its frame, and compare the tracker's attitude with the true one. Under a"
-                " dome the angles are the vehicle's (roll, pitch, yaw); under the stars the camera's (RA, Dec, roll)."
-            )
-            with ui.element("div").style("display: grid; grid-template-columns: 110px 1fr; gap: 4px 12px"):
-                for key in keys.KEYS:
-                    label = f'<span class="lab-keys" style="padding: 0; border: 0"><kbd>{key.label}</kbd></span>'
-                    ui.html(label, sanitize=False)
-                    ui.label(key.help)
-        return dialog
+                    self.log_panel = LogPanel(self)
 
     def commands(self) -> list[Command]:
         """Every action with its key: those of keys, the panels, the exports."""
@@ -288,6 +276,7 @@ class Tab:
         self.picker.set_value(scene)
         self.title.props["title"] = self.scene_info.title  # tooltip with the full title
         self.title.set_text(self.scene_info.title)
+        self.noise.set_value(self.scene_info.noise)
         self.attitude.set_scene(self.scene_info)
         self.scene_3d.set_scene(self.scene_info)
         self.sensor.clear_zoom()
@@ -304,14 +293,12 @@ class Tab:
         async with self.editing:
             await self.open(self.scene, {**self.overrides, **overrides})
 
-    async def set_field_of_view(self, field_deg: float) -> None:
-        """Change the field of view by the focal length: f' = f tan(field / 2) / tan(field' / 2)."""
-        if self.scene_info is None or not 0.5 <= field_deg <= 120:
-            self.show_message("field: allowed: 0.5 to 120 deg")
-            return
-        camera = (await asyncio.to_thread(load, self.scene_path, self.overrides)).camera
-        factor = math.tan(math.radians(self.scene_info.field_deg / 2)) / math.tan(math.radians(field_deg / 2))
-        await self.apply_overrides({"camera.focal_length": f"{1e3 * camera.focal_length_m * factor:.5g} mm"})
+    async def switch_noise(self) -> None:
+        """Render with the camera's noise, or each pixel's expected value; the attitude is kept."""
+        info = self.scene_info
+        if info and info.noise != self.noise.value:
+            await self.apply_overrides({"camera.detector.noise": str(bool(self.noise.value)).lower()})
+            self.noise.set_value(self.scene_info.noise if self.scene_info else True)
 
     @property
     def scene_path(self) -> str:
@@ -404,9 +391,8 @@ class Tab:
             self.log(text)
 
     def log(self, text: str) -> None:
-        """Add a line to the log, the newest first."""
-        self.lines = [f"{time.strftime('%H:%M:%S')}  {text}", *self.lines[: MAX_LOG_LINES - 1]]
-        self.log_label.set_text("\n".join(self.lines))
+        """Add a line to the log."""
+        self.log_panel.add(text)
 
     async def export(self, kind: str) -> None:
         files = await self.run_task("export")
@@ -461,7 +447,10 @@ class Tab:
         if action == "identify":
             self.stop_playback()
             await self.show_live(self.session.run("render", True))
-            self.log(f"identify: {self.view.result.status if self.view and self.view.result else 'no result'}")
+            if self.view and self.view.result and self.scene_info:
+                self.log_panel.identified(self.view, self.scene_info)
+        elif action == "noise":
+            self.noise.set_value(not self.noise.value)
         elif action == "monte_carlo":
             self.tabs.set_value("Monte Carlo")
             await self.study_panel.start()

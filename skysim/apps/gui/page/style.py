@@ -7,16 +7,17 @@ import numpy as np
 
 from skysim.core.types import Floats
 
+# The colors of states, marks and curves are told apart by color-blind eyes too: tests/apps/gui/test_shell.py.
 DARK = {
     **{"ground": "#0d1015", "panel": "#141922", "line": "#252c38", "text": "#d7dce4", "quiet": "#8b95a5"},
-    **{"accent": "#5aa9ff", "good": "#63c174", "warn": "#f0b429", "bad": "#ff6b6b"},
+    **{"accent": "#5aa9ff", "good": "#4fdcc0", "warn": "#d9b400", "bad": "#e2567f"},
 }
 LIGHT = {
     **{"ground": "#f4f6f9", "panel": "#ffffff", "line": "#d3d9e2", "text": "#1b2330", "quiet": "#56606f"},
-    **{"accent": "#1463b8", "good": "#1d7a35", "warn": "#8a5a00", "bad": "#b3261e"},
+    **{"accent": "#1463b8", "good": "#007f78", "warn": "#b05400", "bad": "#8a1040"},
 }
 COLORS = {name: f"var(--lab-{name})" for name in DARK}  # in CSS: of the theme
-CURVE_COLORS = ["#3d8fe0", "#d1901a", "#3f9a52", "#e05555", "#9b6fa3", "#4f9fb5", "#9b6fa3", "#4f9fb5"]  # of both
+CURVE_COLORS = ["#3aa6f2", "#e0a82a", "#0d7b84", "#d02f28"]  # of both
 
 
 def chart_color(name: str) -> str:
@@ -105,6 +106,16 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-run > * {{ flex: none }}
 .mono.lab-log {{ white-space: pre-wrap; overflow-wrap: anywhere }}
 .q-uploader__subtitle {{ display: none }} .q-uploader__title {{ font-size: 13px; font-weight: 500 }}
+.lab-space {{ position: relative; overflow: hidden }}
+.lab-space > canvas {{ position: absolute; inset: 0; width: 100%; height: 100%; touch-action: none }}
+.lab-space > .lab-names {{ pointer-events: none }}
+.lab-tag {{ position: absolute; left: 0; top: 0; pointer-events: none; color: #fff; background: #0d1015b0 }}
+.lab-looks {{ position: absolute; right: 20px; top: 14px; display: flex; gap: 4px }}
+.lab-looks > .q-btn {{ color: #9cc4ff !important; background: #0d1015b0 !important }}
+.lab-lights {{ width: 100%; border-collapse: collapse; cursor: default; text-align: right }}
+.lab-lights th {{ position: sticky; top: -10px; font-weight: normal; color: {COLORS["quiet"]};
+  background: {COLORS["panel"]} }}
+.lab-lights tr > :first-child {{ text-align: left }} .lab-lights tr.ringed {{ background: {COLORS["line"]} }}
 .lab-turn {{ position: absolute; left: 24px; bottom: 16px; font-size: 11px; pointer-events: none }}
 .stale {{ opacity: .45 }}
 .lab-side {{ display: grid; grid-template: auto auto minmax(0, 1fr) / minmax(0, 1fr);
@@ -148,8 +159,10 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-trial .q-field__control {{ padding: 0 4px 0 8px }} .lab-panels .q-btn {{ padding: 2px 8px }}
 .lab-panels .q-uploader__header {{ background: {COLORS["line"]} }}
 .q-field--dense .q-field__suffix {{ align-self: center; padding: 0 }}
-.lab-trial {{ display: grid; width: 100%; grid-template-columns: 1fr 1.5fr 1fr .8fr 1.2fr; gap: 8px; margin: 8px 0 }}
-.q-tab {{ min-height: 34px; padding: 0 8px; text-transform: none }} .q-tabs {{ min-height: 34px }}
+.lab-trial {{ display: grid; width: 100%; grid-template-columns: 1fr 1.4fr 1fr 1fr .7fr 1fr; gap: 6px;
+  margin: 8px 0 }}
+.q-tab {{ min-height: 34px; padding: 0 6px; text-transform: none }} .q-tab__label {{ font-size: 13px }}
+.q-tabs {{ min-height: 34px }}
 .q-btn {{ text-transform: none }} .q-btn .q-btn__content {{ font-size: 12px; line-height: 1.5 }}
 .lab-sections .q-item {{ padding: 2px 0 }}
 .q-field--borderless.q-field--focused, :focus-visible {{ outline: 2px solid {COLORS["accent"]}; outline-offset: 1px }}
@@ -161,7 +174,6 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   .lab-said {{ text-align: left; flex-basis: 200px }}
   .lab-keys {{ flex-wrap: wrap; padding: 6px 14px; row-gap: 4px }}
   .lab-sensor {{ grid-template-rows: auto min(60vh, 100vw) auto }} .lab-bar {{ flex-wrap: wrap; padding: 4px 14px }}
-  .lab-under {{ grid-template-columns: repeat(auto-fit, minmax(252px, 1fr)); overflow: auto }}
   .lab-side {{ grid-template-rows: auto auto 620px; border-left: 0 }}
   .lab-run > .row:first-child {{ flex-wrap: wrap }}
 }}

@@ -24,6 +24,8 @@ RESPONSES = {  # label on the page by response
     "refused": "refused",
     "cross_arcsec_rms": "cross rms, ″",
     "roll_arcsec_rms": "roll rms, ″",
+    "cross_arcsec_mean": "cross mean, ″",
+    "roll_arcsec_mean": "roll mean, ″",
     "angle_arcsec_mean": "angle mean, ″",
     "time_ms_median": "ms per trial",
 }

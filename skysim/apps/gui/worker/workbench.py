@@ -15,10 +15,11 @@ from estimator.core.types import Attitude
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.gui.messages import Detection, FrameView, Lens, Light, SceneInfo, TrackerResult
+from skysim.apps.gui.messages import Detection, FrameView, LabGeometry, Lens, Light, SceneInfo, TrackerResult
 from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.scene import geometry
 from skysim.core import quaternion
+from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Truth
 from skysim.results import scoring, stretch
 from skysim.scene.loader import load
@@ -37,7 +38,7 @@ STAGES = ("detector", "centroider", "identifier", "solver")
 class Workbench:
     """A scene that is set up, with the current attitude and the newest frame.
 
-    lens : where its camera's pixels point
+    lens : where its camera's pixels point;  geometry : of the laboratory
     rendered_count : number of frames rendered; it changes the seed, so that each frame has independent noise
     magnitude : V magnitude by a light's number
     """
@@ -47,6 +48,7 @@ class Workbench:
     estimator: factory.Estimator
     lab_from_body: Rotation
     lens: Lens
+    geometry: LabGeometry
     rendered_count: int = 0
     frame: Frame | None = None
     truth: Truth | None = None
@@ -55,7 +57,8 @@ class Workbench:
 
     @classmethod
     def open(cls, name: str, overrides: Mapping[str, str], before: Workbench | None = None) -> Workbench:
-        """Set up a scene. If only the tracker differs from `before`, its testbed and attitude are kept.
+        """Set up a scene. If only the tracker differs from `before`, its testbed is kept; if tracker or camera, its
+        attitude.
 
         Raises InputError.
         """
@@ -64,9 +67,10 @@ class Workbench:
             testbed = replace(before.testbed, scene=scene)
             return replace(before, scene=scene, testbed=testbed, estimator=warm_tracker(testbed))
         testbed = build_testbed(scene)
-        lab_from_body = testbed.trajectory.lab_from_body[0]
-        lens = pixels.scene_lens(testbed)
-        return cls(scene, testbed, warm_tracker(testbed), lab_from_body, lens, magnitude=magnitude_by_id(testbed))
+        same = before and before.scene.model_copy(update={"tracker": scene.tracker, "camera": scene.camera}) == scene
+        lab_from_body = before.lab_from_body if before and same else testbed.trajectory.lab_from_body[0]
+        views = pixels.scene_lens(testbed), geometry.lab_geometry(testbed)
+        return cls(scene, testbed, warm_tracker(testbed), lab_from_body, *views, magnitude=magnitude_by_id(testbed))
 
     @property
     def stages(self) -> dict[str, str]:
@@ -85,10 +89,12 @@ class Workbench:
             scoring.angle_names(scene),
             id_prefix(self.testbed),
             2 * math.degrees(math.atan(camera.width_px / 2 / camera.focal_px)),
+            1 / camera.focal_px / ARCSEC_RAD,
             self.stages,
             tracker_settings.algorithm_names(scene),
             self.testbed.duration_s,
-            geometry.lab_geometry(self.testbed),
+            camera.detector.noise,
+            self.geometry,
             self.lens,
         )
 

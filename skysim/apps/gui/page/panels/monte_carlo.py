@@ -11,7 +11,7 @@ from urllib.parse import quote
 
 from nicegui import run, ui
 
-from skysim.apps.gui.page import keys
+from skysim.apps.gui.page import forms, keys
 from skysim.apps.gui.page.style import CURVE_COLORS, TOOLTIP, chart_color, format_number
 from skysim.apps.gui.worker.study_process import (
     PAGE_STUDY,
@@ -55,9 +55,12 @@ class MonteCarloPanel:
             self.kind = ui.select(TRIAL_KINDS, value="centroids", label="of").props("dense outlined options-dense")
             self.kind.on("popup-hide", js_handler=keys.BLUR_JS)
             self.noise = ui.number("noise, px", value=0.1, min=0, max=10, step=0.05).props("dense outlined")
+            self.noise.on_value_change(self.show_noise)
+            self.magnitude = ui.number("noise, mag", value=0.25, min=0, max=5, step=0.05).props("dense outlined")
             self.false_lights = ui.number("false", value=0, min=0, max=100, precision=0).props("dense outlined")
             self.field = ui.number("field, °", min=1, max=90).props("dense outlined").mark("field")
             self.field.on("keydown.enter", self.set_field_of_view)
+        self.noise_text = ui.label().classes("quiet").mark("noise-text")
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
         self.note = ui.label("No study has been run yet: press 2.").classes("quiet").style("margin-top: 6px")
         self.note.mark("trials-note")
@@ -76,15 +79,29 @@ class MonteCarloPanel:
         self.study_select.set_options(options, value=self.study_select.value or "")
         if self.tab.scene_info:
             self.field.set_value(round(self.tab.scene_info.field_deg, 3))
+        self.show_noise()
+
+    def show_noise(self) -> None:
+        """Say what the centroids' noise is as an angle, in the middle of the frame."""
+        info = self.tab.scene_info
+        angle = f"{float(self.noise.value or 0) * info.pixel_arcsec:.3g}″" if info else ""
+        self.noise_text.set_text(f"noise of a centroid: {angle} an axis")
 
     def study_chosen(self) -> None:
         """Hide the Monte Carlo fields when a study file is chosen."""
-        self.fields.set_visibility(not self.study_select.value)
+        for item in (self.fields, self.noise_text):
+            item.set_visibility(not self.study_select.value)
 
     async def set_field_of_view(self) -> None:
-        scene_info = self.tab.scene_info
-        if scene_info and self.field.value:
-            await self.tab.set_field_of_view(float(self.field.value))
+        """Change the scene's field of view by the focal length."""
+        try:
+            change = await run.io_bound(
+                forms.field_override, self.tab.scene_path, self.tab.overrides, float(self.field.value or 0)
+            )
+        except InputError as error:
+            self.tab.show_message(str(error))
+            return
+        await self.tab.apply_overrides(change)
 
     async def start_or_stop(self) -> None:
         if not self.process.running:
@@ -143,7 +160,9 @@ class MonteCarloPanel:
             return STUDIES / f"{self.study_select.value}.yaml"
         trial: dict[str, Any] = {"kind": self.kind.value}
         if self.kind.value == "centroids":
-            trial |= {"noise_px": float(self.noise.value or 0), "false_lights": int(self.false_lights.value or 0)}
+            noise = {"noise_px": self.noise, "magnitude_sigma": self.magnitude}
+            trial |= {name: float(field.value or 0) for name, field in noise.items()}
+            trial |= {"false_lights": int(self.false_lights.value or 0)}
         if not (self.count.value and 1 <= self.count.value <= 100_000):
             raise InputError("runs: allowed: 1 to 100000")
         settings = self.tab.scene_path, self.tab.overrides, trial, int(self.count.value)
@@ -197,6 +216,7 @@ class MonteCarloPanel:
         self.count.set_value(study.trials)
         self.kind.set_value(trial["kind"])
         self.noise.set_value(trial.get("noise_px", self.noise.value))
+        self.magnitude.set_value(trial.get("magnitude_sigma", self.magnitude.value))
         self.false_lights.set_value(trial.get("false_lights", self.false_lights.value))
 
     def show_count(self, done: int) -> None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from nicegui import ui
 
-# The splitter works in the browser alone. An arrow key on it is not the camera's. The 3-D view takes its size only when
-# the window changes, so that a change by the splitter or by its tab sends a resize event.
+# The splitter works in the browser alone. An arrow key on it is not the camera's.
 SPLITTER_JS = """
 window.skysimSplitter = {
   set(px) {
@@ -19,12 +18,6 @@ try {
   const wide = Number(localStorage.getItem("skysim.side"));
   if (wide) document.documentElement.style.setProperty("--lab-side", wide + "px");
 } catch { /* storage is off */ }
-const waiting = setInterval(() => {
-  const space = document.querySelector(".lab-space");
-  if (!space) return;
-  clearInterval(waiting);
-  new ResizeObserver(() => window.dispatchEvent(new Event("resize"))).observe(space);
-}, 200);
 document.addEventListener("pointerdown", event => {
   if (!event.target.classList.contains("lab-split")) return;
   event.preventDefault();

@@ -17,8 +17,9 @@ import numpy as np
 from nicegui import ui
 
 from skysim.apps.gui.messages import Detection, FrameView, Lens, Light, Pose, SceneInfo, TrackerResult
-from skysim.apps.gui.page import keys, overlay
-from skysim.apps.gui.page.star_names import NAMES
+from skysim.apps.gui.page import keys
+from skysim.apps.gui.page.frame import overlay
+from skysim.apps.gui.page.frame.star_names import NAMES
 from skysim.results import stretch
 from skysim.sources.solar_system.bodies import NAMES as BODIES
 
@@ -40,7 +41,7 @@ KEPT_FRAMES = 3
 DRAW_TIMEOUT_S = 1.0  # for the browser to report a drawn frame
 
 
-class Canvas(ui.element, component="frame/frame.js", esm={"skysim-frame": "frame"}):  # type: ignore[call-arg]
+class Canvas(ui.element, component="js/frame.js", esm={"skysim-frame": "js"}):  # type: ignore[call-arg]
     """The frame with its loupe and plot, implemented in frame.js."""
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from skysim.apps.gui.messages import Detection, Light, TrackerResult
 
 COLORS = {
-    **{"truth": "#5aa9ff", "detected": "#ff7b6b", "identified": "#6fdc7f", "false": "#ffc04d"},
+    **{"truth": "#7a8cff", "detected": "#dd5a60", "identified": "#6ff0d8", "false": "#e8b90f"},
     "windows": "#7f8a9a",
 }
 KINDS = tuple(COLORS)

@@ -8,7 +8,7 @@ import { directionText, gridLines } from "skysim-frame/sky.js";
 const LARGEST_PX = 60; // screen pixels of an enlarged pixel
 const REACH_PX = 14; // screen pixels within which the cursor finds a light
 const LOUPE = { across: 11, down: 7 };
-const PALE = "#ffe27a", GRID = "rgb(127 160 200 / 45%)", CUT = "#ff8fd0", CROSS = "#ff7b6b";
+const PALE = "#ffe27a", GRID = "rgb(127 160 200 / 45%)", CUT = "#ff8fd0", CROSS = "#dd5a60", NAME = "#6ff0d8";
 
 export default {
   template: `
@@ -54,8 +54,10 @@ export default {
     this.sheet = document.createElement("canvas");
     this.watcher = new ResizeObserver(() => this.paint());
     for (const canvas of [this.$refs.frame, this.$refs.loupe, this.$refs.plot]) this.watcher.observe(canvas);
+    window.addEventListener("skysim-hover", this.ring);
   },
   beforeUnmount() {
+    window.removeEventListener("skysim-hover", this.ring);
     this.watcher.disconnect();
   },
   watch: {
@@ -186,7 +188,7 @@ export default {
       pen.strokeRect(left - 0.5, top - 0.5, size[0] * scale + 1, size[1] * scale + 1);
       if (this.display.grid) drawGrid(pen, this.lines(), this.toScreen, window, GRID);
       drawMarks(pen, marks, this.toScreen);
-      drawNames(pen, names, this.toScreen, window, "#6fdc7f");
+      drawNames(pen, names, this.toScreen, window, NAME);
       if (this.cut) this.paintCut(pen);
       const ringed = lights.find((light) => light[2] === this.hovered && light[2] >= 0);
       if (ringed) drawHighlight(pen, this.toScreen(ringed[0], ringed[1]), PALE);
@@ -306,9 +308,19 @@ export default {
       const key = found ? `${found[0]} ${found[1]}` : null;
       if (key === this.hoverKey) return;
       this.hoverKey = key;
+      this.mark(found, id);
+      window.dispatchEvent(new CustomEvent("skysim-hover", { detail: { id: id >= 0 ? id : null } }));
+    },
+    // A light is hovered elsewhere on the page, or no more.
+    ring({ detail: { id } }) {
+      if (this.drawn && id !== (this.hovered >= 0 ? this.hovered : null)) {
+        this.mark(this.drawn.lights.find((light) => light[2] === id), id);
+      }
+    },
+    mark(light, id) {
       this.hovered = id;
       this.paint();
-      this.$emit("hover", { id, x: found?.[0], y: found?.[1], inside: Boolean(found) });
+      this.$emit("hover", { id, x: light?.[0], y: light?.[1], inside: Boolean(light) });
     },
     nearest(at) {
       const reach = REACH_PX / this.placed.scale;

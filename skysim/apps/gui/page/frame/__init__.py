@@ -1,0 +1,1 @@
+"""The sensor view: a frame with its marks, and the tools to read it."""

@@ -1,0 +1,105 @@
+"""3-D view of the laboratory (three.js): the shapes of its MJCF file, the lights and the vehicle's attitude."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import nicegui.elements.scene  # registers three.js with the page  # noqa: F401
+import numpy as np
+from nicegui import ui
+from numpy.typing import NDArray
+
+from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo
+from skysim.apps.gui.page.style import DARK, color_scale
+from skysim.core.types import Floats
+from skysim.dynamics.multibody import Shape
+
+if TYPE_CHECKING:
+    from skysim.apps.gui.page.page import Tab
+
+VIEWS = {
+    "outside": "from beside the laboratory",
+    "camera": "from the star camera along its boresight",
+    "bearing": "from the bearing upwards",
+    "top": "from above",
+}
+UPDATE_S = 0.1
+AXIS, MOST_AXIS_M = 0.35, 1.2  # length of the axes over the distance from which the laboratory is seen
+DIGITS = 5  # of meters
+
+
+class Space(ui.element, component="js/space.js", esm={"skysim-space": "js"}):  # type: ignore[call-arg]
+    """The picture, implemented in space.js."""
+
+
+class Scene3D:
+    """The view and its buttons; `set_scene` builds it, `show` sets the attitude, which a timer sends."""
+
+    def __init__(self, tab: Tab) -> None:
+        self.tab = tab
+        self.newest_view: FrameView | None = None
+        self.canvas = Space().classes("w-full h-full").mark("space")
+        with ui.element("div").classes("lab-looks"):
+            for name, text in VIEWS.items():
+                button = ui.button(name, on_click=lambda name=name: self.look(name)).props("dense outline size=xs")
+                button.props(f'title="look {text}"').mark(f"look-{name}")
+        ui.label("drag: rotate · right drag: pan · wheel: zoom").classes("lab-turn quiet")
+        ui.timer(UPDATE_S, self.update)
+
+    def look(self, name: str) -> None:
+        """Look from a preset, also to undo how the user has turned the view."""
+        self.canvas.run_method("look", name)
+
+    def set_scene(self, scene_info: SceneInfo) -> None:
+        lab = scene_info.geometry
+        outside = lab.views["outside"]
+        distance_m = sum((a - b) ** 2 for a, b in zip(outside.eye_m, outside.target_m, strict=True)) ** 0.5
+        self.canvas.run_method(
+            "build",
+            {
+                "shapes": [shape_fields(shape) for shape in lab.shapes],
+                "lights": light_fields(lab),
+                "views": {name: view._asdict() for name, view in lab.views.items()},
+                **{
+                    "background": DARK["ground"],
+                    "prefix": scene_info.prefix,
+                    "axis": min(AXIS * distance_m, MOST_AXIS_M),
+                },
+            },
+        )
+
+    def color_lights(self, ids: NDArray[np.int64], values: Floats) -> None:
+        """Color some lights by values from 0 to 1, until the scene changes."""
+        colors = (f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in 255 * color_scale(values))
+        self.canvas.run_method("color", list(zip(ids.tolist(), colors, strict=True)))
+
+    def show(self, view: FrameView) -> None:
+        """Queue the newest attitude for the timer."""
+        self.newest_view = view
+
+    def update(self) -> None:
+        """Timer: send the vehicle's attitude, and the lights that are on the frame and that are identified."""
+        view, self.newest_view = self.newest_view, None
+        if view is None:
+            return
+        found = view.result.detections if view.result else ()
+        identified = {spot.id: self.tab.sensor.name(spot.id) for spot in found if spot.id >= 0}
+        fields = {"wxyz": view.body_wxyz, "seen": [light.id for light in view.lights]}
+        self.canvas.run_method("show", fields | {"identified": list(identified.items())})
+
+
+def shape_fields(shape: Shape) -> dict[str, Any]:
+    """A shape for space.js."""
+    return {
+        **{"name": shape.name, "kind": shape.kind, "size": shape.size_m, "position": shape.position_m},
+        **{"wxyz": shape.parent_from_shape_wxyz, "rgba": shape.rgba, "on_vehicle": shape.on_vehicle},
+        **{"vertices": shape.vertices_m.round(DIGITS).ravel().tolist(), "faces": shape.faces.ravel().tolist()},
+    }
+
+
+def light_fields(lab: LabGeometry) -> dict[str, Any]:
+    """The lights for space.js."""
+    return {
+        **{"id": lab.ids.tolist(), "place": lab.lights_m.round(DIGITS).ravel().tolist()},
+        **{"radius": lab.radius_m.round(DIGITS).tolist(), "lit": lab.lit.tolist()},
+    }

@@ -1,0 +1,143 @@
+"""The frame, the laboratory in 3-D and the table of lights show the same lights, and a hovered one in all of them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from labpage import CHROMIUM, NARROW, Server, chosen, come, exported, opened, panel, pictured, screen, status
+
+pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
+
+from skysim.apps.gui.messages import Detection, Light
+from skysim.apps.gui.page.panels import lights
+from skysim.apps.gui.worker.scene import geometry
+from skysim.scene import loader
+from skysim.simulation.testbed import build_testbed
+
+pytest_plugins = ["labpage"]
+in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+
+
+def test_the_table_has_every_light_with_its_detection_then_the_false_ones() -> None:
+    true = [Light(3, 10, 20, 5000, 1.5), Light(4, 40, 50, 900, float("nan")), Light(5, 70, 80, 100, 4.0)]
+    found = [
+        Detection(200, 200, 0.1, 50),
+        Detection(10.3, 20.4, 0.05, 700, 3, 0.02),
+        Detection(40.0, 50.0, 0.1, 90, 9, 0.5),
+    ]
+    table = list(lights.rows(true, found, "LED {}".format))
+    assert [row["id"] for row in table] == [3, 4, 5, -1]
+    assert [row["state"] for row in table] == ["good", "warn", "quiet", "warn"]
+    assert table[0]["cells"] == ["LED 3", "1.50", "5000", "10.00", "20.00", "0.500", "LED 3"]
+    assert table[1]["cells"][-1] == "LED 9"
+    assert table[1]["cells"][1] == ""  # an LED has no magnitude
+    assert table[3]["cells"][:5] == ["no light", "", "50", "200.00", "200.00"]
+    assert len({row["key"] for row in table}) == 4
+
+
+@pytest.mark.slow
+def test_an_led_without_current_is_dark_and_the_views_look_where_they_say() -> None:
+    testbed = build_testbed(loader.load("afit_simsat", {}))
+    strength = testbed.sources.strength.copy()
+    strength[5] = 0.0
+    dark = testbed.sources.id[5]
+    sources = replace(testbed.sources, strength=strength)
+    ids, places_m, radius_m, lit = geometry.lights(sources)
+    assert ids[~lit].tolist() == [dark]
+    assert radius_m[lit].min() > 0
+    np.testing.assert_array_equal(places_m[ids == dark][0], sources.place[5, :3])
+    views = geometry.lab_geometry(testbed).views
+    boresight = testbed.mount.cam_from_body.inv().apply([0.0, 0.0, 1.0])
+    eye, target = np.array(views["camera"].eye_m), np.array(views["camera"].target_m)
+    np.testing.assert_allclose(eye, testbed.mount.camera_body_m, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(target - eye, boresight, rtol=0, atol=1e-12)
+    assert views["top"].eye_m[2] > places_m[:, 2].max()
+    assert views["outside"].eye_m[2] < places_m[:, 2].max()
+
+
+# In the browser.
+
+
+@pytest.fixture(scope="module")
+def dome(browser: Any, server: Server) -> Any:
+    """A tab with a dome."""
+    with opened(browser, server.login, NARROW) as page:
+        chosen(page, "Scene", "afit_simsat")
+        page.get_by_text("AFIT SimSat under its measured dome").wait_for()
+        status(page, "solved")
+        assert come(lambda: "dark 0" in drawn(page, "lights"))
+        yield page
+
+
+def drawn(page: Any, name: str) -> str:
+    """What the 3-D picture says of itself."""
+    return str(page.locator(".lab-space canvas").first.get_attribute(f"data-{name}") or "")
+
+
+def identified(page: Any, folder: Path) -> dict[int, tuple[float, float]]:
+    """Pixels of the identified lights."""
+    spots = json.loads(exported(page, "solution", folder).read_text())["spots"]
+    return {spot["id"]: (spot["x"], spot["y"]) for spot in spots if spot["id"] >= 0}
+
+
+@pytest.mark.browser
+@in_browser
+def test_the_laboratory_shows_which_lights_are_lit_seen_and_identified(dome: Any, tmp_path: Path) -> None:
+    panel(dome, "Lab")
+    count = len(identified(dome, tmp_path))
+    assert come(lambda: f"identified {count}," in drawn(dome, "lights"))
+    for name in ("camera", "bearing", "top", "outside"):
+        before = drawn(dome, "drawn")
+        dome.get_by_role("button", name=name, exact=True).click()
+        assert come(lambda: drawn(dome, "view") == name and drawn(dome, "drawn") != before)  # noqa: B023
+        pictured(dome, f"the_laboratory_from_{name}")
+    box = dome.locator(".lab-space").bounding_box()
+    dome.mouse.move(box["x"] + 200, box["y"] + 200)
+    dome.mouse.down()
+    dome.mouse.move(box["x"] + 260, box["y"] + 220, steps=3)
+    dome.mouse.up()
+    assert drawn(dome, "view") == "free"
+    dome.get_by_role("button", name="outside", exact=True).click()
+    assert come(lambda: drawn(dome, "view") == "outside")
+
+
+@pytest.mark.browser
+@in_browser
+def test_a_light_that_is_hovered_in_one_view_lights_up_in_the_others(dome: Any, tmp_path: Path) -> None:
+    """From the star camera the 3-D view shows each LED where the frame does."""
+    spots = identified(dome, tmp_path)
+    one, (x, y) = next(iter(spots.items()))
+    frame = dome.locator(".lab-frame canvas")
+    panel(dome, "Lab")
+    dome.mouse.move(*screen(dome, x, y))
+    assert come(lambda: drawn(dome, "ringed") == str(one))
+    dome.mouse.move(*screen(dome, 2, 2))
+    assert come(lambda: drawn(dome, "ringed") == "")
+
+    dome.get_by_role("button", name="camera", exact=True).click()
+    assert come(lambda: drawn(dome, "view") == "camera")
+    space, (width, height) = dome.locator(".lab-space").bounding_box(), (1600, 1200)
+    scale = space["height"] / height
+    inside = {n: at for n, at in spots.items() if abs(at[0] - width / 2) * scale < space["width"] / 2 - 10}
+    assert len(inside) > 4
+    nearest = min(inside, key=lambda n: np.hypot(inside[n][0] - 800, inside[n][1] - 700))
+    at = np.array(inside[nearest]) - ((width - 1) / 2, (height - 1) / 2)
+    dome.mouse.move(space["x"] + space["width"] / 2 + at[0] * scale, space["y"] + space["height"] / 2 + at[1] * scale)
+    assert come(lambda: frame.get_attribute("data-ringed") == str(nearest))
+    dome.locator(".lab-under .mono", has_text=f"LED {nearest}").wait_for()
+    dome.get_by_role("button", name="outside", exact=True).click()
+
+    panel(dome, "Lights")
+    row = dome.locator(f".lab-lights tr[data-id='{one}']")
+    row.hover()
+    assert come(lambda: frame.get_attribute("data-ringed") == str(one))
+    assert "ringed" in str(row.get_attribute("class"))
+    dome.mouse.move(*screen(dome, *inside[nearest]))
+    other = dome.locator(f".lab-lights tr[data-id='{nearest}'].ringed")
+    other.wait_for()
+    pictured(dome, "the_table_of_lights")
