@@ -46,9 +46,11 @@ def print_comparison(result: dict[str, Any]) -> None:
     ]
     print_table("", ["what", "predicted", "simulated", "ratio"], lines)
     print_wrapped(
-        f"{result['surveys']} surveys of {result['frames']} frames, {min(result['measured'])} to"
+        f"{len(result['measured'])} surveys of {result['frames']} frames, {min(result['measured'])} to"
         f" {max(result['measured'])} LEDs measured; {result['false_alarms']} faults reported, of none"
     )
+    for failure in result["failures"]:
+        print_wrapped(f"one more survey failed: {failure}")
 
 
 def print_coverage(result: dict[str, Any]) -> None:

@@ -156,13 +156,19 @@ class Errors:
     false_alarms: int
 
 
-def repeat_survey(testbed: Testbed, uncertainty: SurveyUncertainty, plan: Plan, repeats: int) -> Iterator[Errors]:
-    """The errors of simulated surveys at the attitudes of a plan, each with its own noise, IMU errors and list."""
+def repeat_survey(testbed: Testbed, uncertainty: SurveyUncertainty, plan: Plan, repeats: int) -> Iterator[Errors | str]:
+    """The errors of simulated surveys at the attitudes of a plan, each with its own noise, IMU errors and list.
+
+    Of a survey that does not determine the dome, why.
+    """
     for n in range(repeats):
         again = in_survey(testbed, n)
         prior = calibration_prior(again)
         frames = list(simulated_frames(again, uncertainty, plan.lab_from_body))
-        yield survey_errors(run_survey(frames, prior, uncertainty), prior, again)
+        try:
+            yield survey_errors(run_survey(frames, prior, uncertainty), prior, again)
+        except InputError as error:
+            yield str(error)
 
 
 def in_survey(testbed: Testbed, n: int) -> Testbed:

@@ -42,7 +42,7 @@ def dataset(
     from skysim.experiments.dataset import plan, run
     from skysim.experiments.dataset.storage import Storage
 
-    Storage(out)  # a wrong URL is told first
+    Storage(out)  # refuses a wrong URL before the scene is read
     formats = tuple(to or ("webdataset", "coco"))
     made = plan.load(
         scene, vary, frames, seed=seed, overrides=parse_overrides(set_), frames_per_shard=shard_frames, formats=formats

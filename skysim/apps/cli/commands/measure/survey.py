@@ -219,7 +219,11 @@ def repeated(request: Request, repeat: int) -> dict[str, Any]:
 
     testbed, _, plan = planned(request)
     surveys = procedure.repeat_survey(testbed, request.uncertainty, plan, repeat)
-    errors = list(progress(surveys, repeat, "surveys"))
+    results = list(progress(surveys, repeat, "surveys"))
+    errors = [one for one in results if isinstance(one, procedure.Errors)]
+    failures = [one for one in results if isinstance(one, str)]
+    if not errors:
+        raise InputError(failures[0])
     return {
         "scene": request.scene.name,
         "frames": len(plan.shown),
@@ -227,6 +231,7 @@ def repeated(request: Request, repeat: int) -> dict[str, Any]:
         "rows": procedure.comparison(plan, errors),
         "measured": [one.measured for one in errors],
         "false_alarms": sum(one.false_alarms for one in errors),
+        "failures": failures,
     }
 
 
