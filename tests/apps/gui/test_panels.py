@@ -191,6 +191,16 @@ def test_each_kind_of_mark_can_be_switched_off_and_stands_where_it_should() -> N
     assert overlay.marks(LIGHTS, result, (), str)["marks"] == []
 
 
+def test_a_faint_light_beside_a_detection_of_noise_gets_no_tick() -> None:
+    noise = Detection(51.0, 60.0, 0.1, 1.0)
+    result = TrackerResult("solved", (SPOTS[0], noise), 1.0, (0.0, 0.0, 0.0))
+    solved = {mark["kind"]: mark["points"] for mark in overlay.marks(LIGHTS, result, {"truth"}, str)["marks"]}
+    assert solved == {"truth": [(10.0, 20.0)], "faint": [(50.0, 60.0)]}
+    unsolved = TrackerResult("too few", (noise,), 1.0)
+    ticks = {mark["kind"]: mark["points"] for mark in overlay.marks(LIGHTS, unsolved, {"truth"}, str)["marks"]}
+    assert ticks == {"truth": [(10.0, 20.0), (50.0, 60.0)]}
+
+
 def test_the_cursor_finds_true_lights_and_detections_whatever_is_marked() -> None:
     found = overlay.marks(LIGHTS, TrackerResult("solved", SPOTS, 1.0), (), str)["lights"]
     assert found == [(10.0, 20.0, 1, 0), (50.0, 60.0, 2, 0), (10.1, 20.0, 1, 1), (80.0, 80.0, -1, 1)]

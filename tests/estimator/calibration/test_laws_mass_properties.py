@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from bearing_motion import SMALL, prior, record
 from hypothesis import given
@@ -12,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from estimator.calibration.mass_properties import batch, dynamics, recursive
 from estimator.calibration.mass_properties.dynamics import STATE, Motion, States
 from estimator.calibration.mass_properties.record import (
+    BearingRecord,
     MassEstimate,
     Prior,
     inertia_matrix,
@@ -116,6 +119,27 @@ def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) ->
     np.testing.assert_allclose(part.normal * scale, schur[:-1, :-1] * scale, rtol=1e-4, atol=1e-4)
     band = batch.lower_band(diagonal, np.zeros((count - 1, STATE, STATE)))
     np.testing.assert_array_equal(band[0], diagonal[:, range(STATE), range(STATE)].ravel())
+
+
+@law(batch.considered, BearingRecord.noise_rad2, BearingRecord.with_noise, slow=True)
+@given(rng=SEEDS, at=some.integers(2, 24))
+def test_what_is_considered_is_what_the_error_of_an_attitude_changes(rng: np.random.Generator, at: int) -> None:
+    """The covariance e e^T of one attitude adds d d^T, with d the change of the estimate by the error e."""
+    assumed, vehicle = prior(SMALL, rng)
+    error = 2e-5 * rng.standard_normal(3)
+    systematic = np.zeros((len(RECORD.t_s), 3, 3))
+    systematic[at] = np.outer(error, error)
+    shared = replace(RECORD, covariance_rad2=RECORD.covariance_rad2 + systematic, systematic_rad2=systematic)
+    np.testing.assert_allclose(shared.noise_rad2, RECORD.covariance_rad2, rtol=1e-12)
+    np.testing.assert_allclose(shared.with_noise(3.0).noise_rad2, 3 * shared.noise_rad2, rtol=1e-12)
+    np.testing.assert_array_equal(shared.with_noise(3.0).systematic_rad2, systematic)
+    turns = np.zeros((len(RECORD.t_s), 3))
+    turns[at] = error
+    turned = replace(RECORD, lab_from_body=RECORD.lab_from_body * Rotation.from_rotvec(turns))
+    before, after, considered = (batch.estimate_mass([one], vehicle.lab, assumed) for one in (RECORD, turned, shared))
+    change = (after.values - before.values) / before.sigma
+    added = (considered.covariance - before.covariance) / np.outer(before.sigma, before.sigma)
+    np.testing.assert_allclose(added, np.outer(change, change), rtol=0.05, atol=0.02 * change @ change)
 
 
 @law(MassEstimate.inertia_kg_m2, MassEstimate.moment_kg_m, MassEstimate.sigma, inertia_matrix, inertia_six)

@@ -25,9 +25,9 @@ Point = tuple[float, float]
 def marks(
     lights: Collection[Light], result: TrackerResult | None, shown: Collection[str], name: Callable[[int], str]
 ) -> dict[str, Any]:
-    """What frame.js draws: marks by kind (ticks for true lights, dots for those fainter than any detection, squares for
-    detections, circles for identified ones, crosses for false ones, dashed squares for predicted windows), names of
-    identified lights, and all lights that the cursor may find.
+    """What frame.js draws: marks by kind (ticks for true lights, dots for those fainter than any identified one,
+    squares for detections, circles for identified ones, crosses for false ones, dashed squares for predicted windows),
+    names of identified lights, and all lights that the cursor may find.
 
     lights of the answer : (x, y, number or -1, whether it is a detection), detections last
     """
@@ -58,12 +58,19 @@ def marks(
 
 
 def bright_count(lights: Sequence[Light], detections: Collection[Detection]) -> int:
-    """How many lights, the brightest first, are as bright as the faintest detected one."""
+    """How many lights, the brightest first, are as bright as the faintest identified one, or else detected one.
+
+    In a field of hundreds of faint stars some detection of noise is beside one of them.
+    """
     if not detections or not lights:
         return UNSOLVED_TICKS
+    identified = {one.id for one in detections if one.id >= 0}
     found_px = np.array([(one.x, one.y) for one in detections])
-    near = [(np.abs(found_px - (light.x, light.y)) < NEAR_PX).all(axis=1).any() for light in lights]
-    return max((n + 1 for n, is_near in enumerate(near) if is_near), default=0)
+    seen = [
+        light.id in identified if identified else bool((np.abs(found_px - (light.x, light.y)) < NEAR_PX).all(1).any())
+        for light in lights
+    ]
+    return max((n + 1 for n, is_seen in enumerate(seen) if is_seen), default=0)
 
 
 def places(items: Collection[Detection] | Collection[Light]) -> list[Point]:
