@@ -71,7 +71,7 @@ docs: $(READY)
 reference: $(READY)
 	$(BIN)/python docs/site/commands.py
 	$(BIN)/python docs/site/keys.py
-	$(BIN)/python docs/site/responses.py
+	$(BIN)/python docs/site/study_responses.py
 
 figures: $(READY)
 	$(BIN)/python docs/site/figures.py

@@ -30,7 +30,7 @@ def of_the_site(name: str) -> ModuleType:
     return module
 
 
-commands, keys, responses = (of_the_site(name) for name in ("commands", "keys", "responses"))
+commands, keys, responses = (of_the_site(name) for name in ("commands", "keys", "study_responses"))
 COMMANDS_MARKDOWN = commands.commands_markdown()
 SECTIONS = dict(re.findall(r"^##+ `skysim ?([^`]*)`\n(.*?)(?=^##|\Z)", COMMANDS_MARKDOWN, re.DOTALL | re.MULTILINE))
 
