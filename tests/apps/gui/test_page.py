@@ -20,6 +20,7 @@ from astropy.wcs import WCS
 from labpage import (
     CHROMIUM,
     NARROW,
+    SLOW_MS,
     TOKEN,
     WIDE,
     Server,
@@ -311,7 +312,7 @@ def test_names_are_beside_their_stars_within_the_frame_and_cover_no_other(page: 
 def test_tab_reaches_every_control_and_shows_where_it_is(page: Any) -> None:
     onto_the_page(page)
     unseen, reached = picture(page), []
-    for _ in range(22):
+    for _ in range(24):
         page.keyboard.press("Tab")
         name, *box = page.evaluate(FOCUSED)
         assert come(partial(differs, page, unseen, box)), name
@@ -442,12 +443,12 @@ def test_a_picture_is_solved_by_the_chosen_detector_and_identifier(page: Any) ->
     panel(page, "Image")
     sky = ROOT / "docs" / "images" / "sky.jpg"
     page.set_input_files("input[type=file]", sky)
-    page.get_by_text(re.compile(r"sky\.jpg: solved\n")).wait_for()
+    page.get_by_text(re.compile(r"sky\.jpg: solved\n")).wait_for(timeout=SLOW_MS)
     field = float(re.search(r"field ([\d.]+)°", page.locator(".lab-panels .mono").last.inner_text())[1])
     chosen(page, "identifier F7", "pyramid")
     page.get_by_label("field of view, deg").fill(str(field))
     page.set_input_files("input[type=file]", sky)
-    page.get_by_text("sky.jpg: solved; identifier pyramid").wait_for()
+    page.get_by_text("sky.jpg: solved; identifier pyramid").wait_for(timeout=SLOW_MS)
     page.get_by_label("field of view, deg").fill("")
     chosen(page, "identifier F7", "default")
     identified(page)
