@@ -119,15 +119,15 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
 
 def prepare(plan: DatasetPlan, storage: Storage) -> None:
     """Write the manifest of a new dataset, or check that the one that is there is the plan's. Raises InputError."""
-    told = {"made_by": "skysim", "format": FORMAT, "skysim": __version__, "code": code_version()}
+    described = {"made_by": "skysim", "format": FORMAT, "skysim": __version__, "code": code_version()}
     there = storage.names()
     if MANIFEST in there:
-        check_manifest(storage, told | {"digest": plan.digest})
+        check_manifest(storage, described | {"digest": plan.digest})
     elif there:
         raise InputError(f"--out {storage.url}: contains {min(there)}; allowed: an empty folder, or this dataset")
     else:
         storage.prepare(())
-        text = json.dumps(told | {"digest": plan.digest} | plan.manifest(), indent=1, default=str)
+        text = json.dumps(described | {"digest": plan.digest} | plan.manifest(), indent=1, default=str)
         storage.write(MANIFEST, text.encode())
     storage.prepare(folders_of(plan))
     if "zarr" in plan.formats and not shards.zarr_is_there(storage):

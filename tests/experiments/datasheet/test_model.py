@@ -69,26 +69,26 @@ def test_all_is_constant_at_rest_but_the_noise(model):
 
 def test_over_many_units_and_fields_the_variance_is_the_sum_of_the_terms(model):
     rng = np.random.default_rng(6)
-    errors = np.array([model.draw(np.full(2, 1.0), 0.1, rng)[1] for _ in range(30_000)])
+    errors = np.array([model.draw(np.full(2, 1.0), 0.1, rng)[1] for _ in range(8000)])
     expected = model.mean**2 + model.unit**2 + model.field**2 + model.pixel**2 + model.noise[1] ** 2
     expected += model.along[1] ** 2 / 2 * np.array([1, 1, 0])
-    assert np.mean(errors**2, axis=0) == pytest.approx(expected, rel=0.05)
+    assert np.mean(errors**2, axis=0) == pytest.approx(expected, rel=0.08)
 
 
 def test_steps_have_the_statistics_of_draws(model):
     """Mean square and correlation from one step to the next at 2 degrees per second."""
     rng, pairs = np.random.default_rng(7), []
-    for _ in range(8000):
+    for _ in range(3000):
         state = model.start(rng, unit=False)
         state, first = model.step(state, 2.0, 0.1, rng)
         pairs.append((first, model.step(state, 2.0, 0.1, rng)[1]))
     stepped = np.array(pairs) - model.mean
-    drawn = np.array([model.draw(np.full(2, 2.0), 0.1, rng, model.start(rng, unit=False)) for _ in range(8000)])
+    drawn = np.array([model.draw(np.full(2, 2.0), 0.1, rng, model.start(rng, unit=False)) for _ in range(3000)])
     drawn -= model.mean
     for one, other in ((0, 0), (0, 1)):
         found, expected = (np.mean(each[:, one] * each[:, other], axis=0) for each in (stepped, drawn))
         spread = np.sqrt(np.mean(stepped[:, 0] ** 2, axis=0) * np.mean(drawn[:, 0] ** 2, axis=0))
-        assert (found - expected) / spread == pytest.approx(np.zeros(3), abs=0.08)
+        assert (found - expected) / spread == pytest.approx(np.zeros(3), abs=0.12)
 
 
 def test_noise_is_larger_about_the_axis_of_the_rate(model):

@@ -15,7 +15,7 @@ from skysim.experiments.datasheet.terms import GROUPS, term_errors
 from skysim.experiments.study.execution import setups, trials
 
 GRID = 60  # correlation angles that are tried
-LEAST_NOISE = 0.05  # of the mean square at a rate: noise below it is not told from the slow terms
+LEAST_NOISE = 0.05  # of the mean square at a rate: noise below it cannot be separated from the slow terms
 
 
 def constants(sheet: Sheet) -> dict[str, Any]:
