@@ -1,4 +1,4 @@
-"""The files of a dataset: what they hold, and that they are the same whoever makes them, and if he is killed."""
+"""The files of a dataset: what they hold, and that they are the same on any engine, also after a kill."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_the_box_of_a_mask_is_about_its_pixels() -> None:
 
 
 class Stopped(Exception):
-    """Whoever makes a dataset was killed."""
+    """The process that makes a dataset was killed."""
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import numpy as np
 
 from skysim.core.types import Floats
 
-# The colors of states, marks and curves are told apart by color-blind eyes too: tests/apps/gui/test_shell.py.
+# Color-blind people can distinguish the colors of states, marks and curves too: tests/apps/gui/test_shell.py.
 DARK = {
     **{"ground": "#0d1015", "panel": "#141922", "line": "#252c38", "text": "#d7dce4", "quiet": "#8b95a5"},
     **{"accent": "#5aa9ff", "good": "#4fdcc0", "warn": "#d9b400", "bad": "#e2567f"},

@@ -122,12 +122,13 @@ def lagged(sheet: Sheet, mean: list[float]) -> tuple[Floats, Floats, Floats]:
     for rate in sheet.levels("sequence", "rate_deg_s"):
         steps, errors = sequences(sheet, rate)
         errors = errors[:2] - np.array(mean)[:2, None, None]
+        square = mean_known(errors**2)
         for first in range(len(steps)):
             for second in range(first + 1, len(steps)):
                 apart = steps[second] - steps[first]
                 angles.append(rate * apart / sheet.scene.exposure.rate_hz)
                 products.append(mean_known(errors[:, first] * errors[:, second]))
-                squares.append(mean_known(errors**2))
+                squares.append(square)
     return np.array(angles), np.array(products), np.array(squares)
 
 

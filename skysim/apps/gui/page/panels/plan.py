@@ -98,17 +98,18 @@ class PlanPanel:
 
     async def survey(self) -> None:
         frames = int(self.frames.value or 0)
-        self.plan = await self.tab.run_task("survey", frames, activity="planning the survey …")
-        if self.plan is None:
+        found: SurveyPlan | None = await self.tab.run_task("survey", frames, activity="planning the survey …")
+        if found is None:
             return
+        self.plan = found
         self.fly.set_enabled(True)
         self.stops.clear()
         with self.stops:
-            ui.label(prediction_text(self.plan))
+            ui.label(prediction_text(found))
             with ui.element("div").classes("lab-stops mono"):
                 for head in ("", "roll °", "pitch °", "yaw °", "LEDs"):
                     ui.label(head).classes("quiet num")
-                for number, (angles, leds) in enumerate(zip(self.plan.angles_deg, self.plan.shown, strict=True), 1):
+                for number, (angles, leds) in enumerate(zip(found.angles_deg, found.shown, strict=True), 1):
                     button = ui.button(str(number), on_click=partial(self.point, number - 1)).props(
                         "dense flat size=sm"
                     )
