@@ -440,6 +440,8 @@ def identified(page: Any) -> None:
 
 
 def test_a_picture_is_solved_by_the_chosen_detector_and_identifier(page: Any) -> None:
+    onto_the_page(page)
+    chosen(page, "identifier F7", "default")
     panel(page, "Image")
     sky = ROOT / "docs" / "images" / "sky.jpg"
     page.set_input_files("input[type=file]", sky)
