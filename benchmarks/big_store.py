@@ -7,11 +7,11 @@ simulated: a tracker with errors of arcseconds that refuses 1 % of the attitudes
 from __future__ import annotations
 
 import os
-import resource
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ figures:
   - {{kind: map, value: refused}}
 """
 ROWS, POINTS = 10_000_000, 10
-REPORT_S, REPORT_BYTES, EXPORT_BYTES = 60.0, 2e9, 1e9
+REPORT_S, REPORT_BYTES, EXPORT_S, EXPORT_BYTES, ROW_BYTES = 60.0, 2e9, 600.0, 1e9, 335.0
 
 
 def build(folder: Path, rows: int, points: int) -> Path:
@@ -108,43 +108,34 @@ def drawn(first: int, count: int, each: int) -> dict[str, NDArray[Any]]:
     return columns
 
 
-def timed(*words: str) -> tuple[float, float, float]:
-    """Seconds, seconds of CPU and greatest memory in bytes of a skysim command."""
-    begin = time.perf_counter()
-    process = subprocess.Popen([sys.executable, "-m", "skysim", *words], stdout=subprocess.DEVNULL)
-    _, status, used = os.wait4(process.pid, 0)
-    if status:
-        raise RuntimeError(f"skysim {' '.join(words)}: status {status}")
-    return time.perf_counter() - begin, used.ru_utime + used.ru_stime, 1024.0 * used.ru_maxrss
-
-
-def measure(rows: int = ROWS, points: int = POINTS) -> list[dict[str, Any]]:
-    """All results."""
+def measure(rows: int = ROWS, points: int = POINTS) -> Iterator[dict[str, Any]]:
+    """All results, as they come."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         path, what = build(folder, rows, points), f"{rows:,} rows of {points} points"
         size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-        found = [verdict("bytes of a row, parts and SQLite", size / rows, "B", what, 335.0)]
-        study = (str(path), "--out", str(folder))
-        for words, most_s, most in (
-            (("report", *study), REPORT_S, REPORT_BYTES),
-            (("export", str(path), str(folder / "rows.parquet"), "--out", str(folder)), 300.0, EXPORT_BYTES),
-            (("export", str(path), str(folder / "rows.csv"), "--out", str(folder)), 600.0, EXPORT_BYTES),
-        ):
-            seconds, cpu_s, memory = timed("study", *words)
-            title = f"study {words[0]} {Path(words[2]).suffix if words[0] == 'export' else ''}".strip()
-            found.append(verdict(title, seconds, "s", f"{what}; {cpu_s:.0f} s of CPU", most_s))
-            found.append(verdict(f"{title}: memory", memory / 1e6, "MB", what, most / 1e6))
-    return found
+        yield verdict("bytes of a row, parts and SQLite", size / rows, "B", what, ROW_BYTES)
+        out = ("--out", str(folder))
+        yield from timed("report", what, REPORT_S, REPORT_BYTES, str(path), *out)
+        for suffix in ("parquet", "csv"):
+            file = str(folder / f"rows.{suffix}")
+            yield from timed("export", f"{suffix}, {what}", EXPORT_S, EXPORT_BYTES, str(path), file, *out)
+
+
+def timed(command: str, what: str, most_s: float, most: float, *words: str) -> Iterator[dict[str, Any]]:
+    """Seconds, with those of CPU, and greatest memory of a command."""
+    begin = time.perf_counter()
+    process = subprocess.Popen([sys.executable, "-m", "skysim", "study", command, *words], stdout=subprocess.DEVNULL)
+    _, status, used = os.wait4(process.pid, 0)
+    if status:
+        raise RuntimeError(f"skysim study {command} {' '.join(words)}: status {status}")
+    cpu_s = used.ru_utime + used.ru_stime
+    yield verdict(f"study {command}", time.perf_counter() - begin, "s", f"{what}; {cpu_s:.0f} s of CPU", most_s)
+    yield verdict(f"study {command}: memory", 1024 * used.ru_maxrss / 1e6, "MB", what, most / 1e6)
 
 
 if __name__ == "__main__":
-    for result in measure(*map(int, sys.argv[1:])):
-        print({key: result[key] for key in ("name", "value", "unit", "bar", "met", "what") if key in result})
-    print(
-        "load",
-        os.getloadavg(),
-        "greatest memory here",
-        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
-        "MB",
-    )
+    for one in measure(*map(int, sys.argv[1:])):
+        load = os.getloadavg()[0]
+        told = f"{one['value']:.4g} {one['unit']} (bar {one['bar']:g}); {one['peer']}; load {load:.1f}"
+        print(f"{one['name']}: {told}", flush=True)

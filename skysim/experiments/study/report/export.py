@@ -15,7 +15,7 @@ from skysim.core.errors import InputError, unknown_name
 from skysim.core.io import files
 from skysim.experiments.study.analysis.table import level_columns, table, to_columns, with_levels
 from skysim.experiments.study.store import COLUMNS, Store
-from skysim.results.files.row_parts import EXTRA, to_arrow
+from skysim.results.files.row_parts import EXTRA, encoding, to_arrow
 
 
 def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
@@ -67,7 +67,7 @@ def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:
     first = next(tables)
     with (
         files.atomic_file(path) as temporary,
-        pyarrow.parquet.ParquetWriter(temporary, first.schema, compression="zstd") as writer,
+        pyarrow.parquet.ParquetWriter(temporary, first.schema, **encoding(first.schema)) as writer,
     ):
         for rows in itertools.chain([first], tables):
             writer.write_table(rows)
