@@ -280,9 +280,9 @@ def occlusion_test(testbed: Testbed, lab_from_body: Rotation, sky: Sky | None) -
     if sky is None:
         return by_parts
 
-    def hidden(sources: Sources) -> NDArray[np.bool_]:
-        below = sky.below_horizon(sources.place[:, :3])
-        return below | by_parts(sources) if by_parts else below
+    def hidden(place: Floats) -> NDArray[np.bool_]:
+        below = sky.below_horizon(place[:, :3])
+        return below | by_parts(place) if by_parts else below
 
     return hidden
 
@@ -299,4 +299,4 @@ def occluded_ids(
     xy_px = project(visible, testbed.optics, pose)[0][0]
     size_px = np.array([testbed.scene.camera.width_px, testbed.scene.camera.height_px])
     on_chip = ((xy_px > -0.5) & (xy_px < size_px - 0.5)).all(axis=1)
-    return visible.id[on_chip & occludes(visible)]
+    return visible.id[on_chip & occludes(visible.place)]
