@@ -172,7 +172,7 @@ class Sources:
         """The chosen sources, by mask or index."""
         rows = np.flatnonzero(which) if which.dtype == bool else which
         columns = (getattr(self, name) for name in Sources.__slots__)
-        return Sources(*(None if column is None else column.take(rows, axis=0) for column in columns))
+        return Sources(*(None if column is None else column.take(rows, axis=0) for column in columns))  # type: ignore[arg-type]
 
 
 class StarSources(Sources):
