@@ -295,7 +295,7 @@ def occluded_ids(
         return np.zeros(0, np.int64)
     cam_from_lab = (testbed.mount.cam_from_body * lab_from_body.inv()).as_matrix()
     pose = Poses(cam_from_lab[None], lab_from_body.apply(testbed.mount.camera_body_m)[None])
-    visible = light.take(in_view(light, testbed.optics, pose))
+    visible = light.take(in_view(light, testbed.optics, pose, reach=0.0))
     xy_px = project(visible, testbed.optics, pose)[0][0]
     size_px = np.array([testbed.scene.camera.width_px, testbed.scene.camera.height_px])
     on_chip = ((xy_px > -0.5) & (xy_px < size_px - 0.5)).all(axis=1)
