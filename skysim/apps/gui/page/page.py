@@ -341,8 +341,9 @@ class Tab:
         await self.show_live(self.session.run("render", self.solving))
 
     def stop_playback(self) -> None:
-        """Stop playback and the live camera, because the sensor view is needed for something else."""
+        """Stop playback, a pushed vehicle and the live camera, because the sensor view is needed for something else."""
         self.run_panel.pause()
+        self.scene_3d.push.stop()
         self.photo.stop()
 
     async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:
