@@ -25,6 +25,7 @@ AREAS = (
     "sky",
     "codes",
     "scale",
+    "lab",
 )
 
 

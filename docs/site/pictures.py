@@ -55,26 +55,38 @@ def screenshots() -> None:
     """Screenshots of the GUI: a sky scene, and the playback of a slew under the dome."""
     from playwright.sync_api import sync_playwright
 
-    from benchmarks.gui import chromium, served
+    from benchmarks.lab import FLAGS, chromium, served
 
-    with served("shefex2") as url, sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
+    with served("shefex2") as server, sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium(), args=list(FLAGS))
         page = browser.new_page(viewport={"width": 1440, "height": 860})
-        page.goto(url)
-        page.locator(".lab-card .good").wait_for(timeout=90_000)
+        page.set_default_timeout(180_000)
+        page.goto(server.url)
+        page.locator(".lab-card .good").wait_for()
         page.wait_for_timeout(3000)  # the first frame clears earlier clicks
-        box = page.locator(".lab-frame canvas").bounding_box()
-        page.mouse.click(box["x"] + 0.71 * box["width"], box["y"] + 0.186 * box["height"])  # Bellatrix
+        page.get_by_role("tab", name="Lights").click()
+        bellatrix = page.locator("tr", has_text="Bellatrix")
+        box, (left, top, scale) = frame_placement(page)
+        x, y = (float(bellatrix.locator("td").nth(column).inner_text()) for column in (3, 4))
+        page.get_by_role("tab", name="Lab").click()
+        page.mouse.click(box["x"] + left + (x + 0.5) * scale, box["y"] + top + (y + 0.5) * scale)
         page.wait_for_timeout(3000)
         page.screenshot(path=IMAGES / "lab_page.jpg", quality=85)
         page.get_by_role("combobox", name="Scene").click()
         page.get_by_role("option", name="simsat_slew").click()
-        page.get_by_text("SimSat slews on its reaction wheels").wait_for(timeout=90_000)
+        page.get_by_text("SimSat slews on its reaction wheels").wait_for()
         page.get_by_role("tab", name="Run").click()
         page.get_by_role("button", name="Simulate").click()
-        page.get_by_text(re.compile(r"^2\d\.\d\d s$")).wait_for(timeout=180_000)
+        page.get_by_text(re.compile(r"^2\d\.\d\d s +\d+/34$")).wait_for()
+        page.wait_for_timeout(300)
         page.screenshot(path=IMAGES / "lab_run.jpg", quality=85)
         browser.close()
+
+
+def frame_placement(page):  # type: ignore[no-untyped-def]
+    """Box of the frame's canvas on the page, and the frame's left and top edge and scale in it."""
+    canvas = page.locator(".lab-frame canvas")
+    return canvas.bounding_box(), [float(value) for value in canvas.get_attribute("data-placement").split()]
 
 
 if __name__ == "__main__":

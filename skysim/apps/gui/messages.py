@@ -117,6 +117,14 @@ class FrameView:
     innovation_arcsec: float = NAN
 
 
+class PushedView(NamedTuple):
+    """A frame of the pushed vehicle, with the torque on it and its rate at the end of the exposure."""
+
+    view: FrameView
+    torque_nm: float
+    rate_deg_s: float
+
+
 @dataclass(frozen=True, slots=True)
 class SceneInfo:
     """Facts about a loaded scene that the page displays.

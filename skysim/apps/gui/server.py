@@ -7,19 +7,21 @@ import re
 import secrets
 import signal
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from nicegui import app, core, ui
 from starlette.datastructures import MutableHeaders
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import HTTPConnection, Request
 from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
 
 from skysim.apps.gui.page.frame.sensor import FRAMES
 from skysim.apps.gui.page.page import Tab
 from skysim.apps.gui.page.panels.photo import LIMIT_BYTES
-from skysim.apps.gui.worker.session import MAX_WORKERS, SpareWorker
+from skysim.apps.gui.worker.session import SpareWorker
 from skysim.apps.gui.worker.study_process import StudyProcess, is_shown
 from skysim.scene.loader import find
 
@@ -34,7 +36,10 @@ REPORT_POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; frame-ancestors 'none'"
 )
 SECURITY_HEADERS = {"x-frame-options": "DENY", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
+# Noise is not compressible: gzip at its default level takes half a second for a frame.
+FRAME_HEADERS = {"cache-control": "no-store", "content-encoding": "identity"}
 USER, USER_BYTES, YEAR_S = "skysim_user", 8, 365 * 86400  # cookie with the number of a browser
+QUEUED = "This page opens when another one has been closed."
 CONNECT_TIMEOUT_S = 50.0  # for a browser to load the page
 RECONNECT_S = 6.0  # for a lost browser to reconnect, before its work ends
 PING_INTERVAL_S, PING_TIMEOUT_S = 5.0, 30.0  # of the connection; a busy machine answers late
@@ -151,9 +156,9 @@ def stop_studies() -> None:
         process.stop(signal.SIGTERM)
 
 
-def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str]) -> None:
+def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers: int) -> None:
     """Register all routes, with a spare worker ready for the next tab."""
-    spare = SpareWorker(str(find(scene).resolve()))
+    spare = SpareWorker(str(find(scene).resolve()), workers)
     app.on_startup(be_patient)
     app.on_startup(spare.start)
     app.on_shutdown(spare.close)
@@ -165,7 +170,7 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str]) -> None:
         data = FRAMES.get(tab, {}).get(number)
         if data is None:
             return Response(status_code=404)
-        return Response(data, media_type="application/octet-stream", headers={"Cache-Control": "no-store"})
+        return Response(data, media_type="application/octet-stream", headers=FRAME_HEADERS)
 
     @app.get("/report/{name}")
     def report(name: str, request: Request) -> Response:
@@ -184,31 +189,37 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str]) -> None:
             await client.connected(timeout=CONNECT_TIMEOUT_S)
         except TimeoutError:  # no browser has connected: start no worker
             return
-        session = spare.take()
-        if session is None:
-            tab.sensor.show_waiting(
-                f"{MAX_WORKERS} of {MAX_WORKERS} workers in use.", "Close another page, then reload this one."
-            )
+        client.on_delete(tab.close)
+        session = await spare.wait(lambda: tab.is_open, lambda text: tab.sensor.show_waiting(text, QUEUED))
+        if session is None:  # the tab was closed while it waited
             return
         tab.session, tab.new_session = session, spare.take
-        client.on_delete(tab.close)
         await tab.start()
         spare.start()
 
 
 def serve(
-    scene: str, host: str, port: int, token: str, folder: Path, out: Path, cameras: Sequence[str], show: bool
+    scene: str,
+    host: str,
+    port: int,
+    token: str,
+    folder: Path,
+    out: Path,
+    cameras: Sequence[str],
+    workers: int,
+    show: bool,
 ) -> None:
     """Serve until Ctrl-C.
 
     token : required of browsers, also of this machine, where other users and other sites' pages are; a random one if
         empty
     cameras : live cameras that the page may watch, see `skysim.core.io.images`
+    workers : greatest number of worker processes; further pages wait for one
     """
     hosts = LOOPBACK if host in LOOPBACK else ("*",)
     token = token or secrets.token_urlsafe(16)
     app.add_middleware(Guard, hosts=hosts, token=token, port=port)
-    routes(scene, folder, out, cameras)
+    routes(scene, folder, out, cameras, workers)
     login = f"/?token={quote(token)}"
     address = f"http://{host}:{port}{login}"
     print(f"skysim gui: {address}   (Ctrl-C ends it)", flush=True)
@@ -221,4 +232,6 @@ def serve(
         reconnect_timeout=RECONNECT_S,
         uvicorn_logging_level="critical",
         storage_secret=None,
+        # To this machine nothing is compressed; to others by the quickest level.
+        gzip_middleware_factory=None if host in LOOPBACK else partial(GZipMiddleware, compresslevel=1),
     )

@@ -15,6 +15,7 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from skysim.apps.gui.page import forms
 from skysim.apps.gui.page.shell import log
+from skysim.apps.gui.page.shell.csv_table import csv_table
 from skysim.apps.gui.worker.tasks import Worker
 from skysim.core.errors import InputError
 from skysim.scene import loader
@@ -40,6 +41,16 @@ def test_the_log_has_attitude_and_error_and_the_noise_keeps_the_attitude() -> No
     first = worker.workbench.frame.image_dn
     worker.render(False)
     np.testing.assert_array_equal(worker.workbench.frame.image_dn, first)
+
+
+def test_a_csv_file_reads_back_with_commas_and_unknown_values() -> None:
+    rows = [("solved, but late", 1 / 3, True, None), ('a "b"', float("nan"), False, 12)]
+    table = Table.read(csv_table(("text", "value", "flag", "count"), rows).decode(), format="ascii.csv")
+    assert list(table["text"]) == ["solved, but late", 'a "b"']
+    assert table["value"][0] == pytest.approx(1 / 3, rel=1e-9)
+    assert table["value"].mask.tolist() == [False, True]
+    assert list(table["flag"]) == ["True", "False"]
+    assert table["count"].mask.tolist() == [True, False]
 
 
 def test_a_field_of_view_is_made_by_the_focal_length() -> None:

@@ -24,6 +24,9 @@ def gui(
         list[str] | None,
         typer.Option(metavar="SOURCE", help="Live camera that the page may watch: index, file or address; repeatable."),
     ] = None,
+    workers: Annotated[
+        int, typer.Option(min=1, help="Most worker processes, one for each page; further pages wait.")
+    ] = 12,
     show: Annotated[bool, typer.Option("--open/--no-open", help="Open a browser.")] = True,
 ) -> None:
     """Open the interactive simulator in the browser (extra `gui`)."""
@@ -36,4 +39,4 @@ def gui(
         from skysim.apps.gui import server
     except ModuleNotFoundError as error:
         raise InputError(f"skysim gui needs {error.name}: pip install 'skysim[gui]'") from None
-    server.serve(scene, host, port, token, folder.resolve(), out.resolve(), camera or [], show)
+    server.serve(scene, host, port, token, folder.resolve(), out.resolve(), camera or [], workers, show)

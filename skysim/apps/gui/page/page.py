@@ -37,7 +37,7 @@ from skysim.apps.gui.state import View
 from skysim.apps.gui.worker import export
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.scene import pointing
-from skysim.apps.gui.worker.session import MAX_WORKERS, Session, WorkerLost
+from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.scene.loader import find, load
@@ -48,7 +48,7 @@ PANELS = ("Lab", "Lights", "Scene", "Plan", "Run", "Monte Carlo", "Image", "Log"
 class Tab:
     """One tab: its worker, its scene, and its page elements.
 
-    session : its worker; set when a browser has connected;  new_session : gives another, None if there are too many
+    session : its worker, set when it has got one;  new_session : gives another, None if there are too many
     folder : where scenes are saved;  out : where studies are;  cameras : live ones that it may watch
     user : its browser, see `server.user_of`
     state : what the page shows;  view : the newest frame of the scene
@@ -77,14 +77,15 @@ class Tab:
         self.is_open = False
         FRAMES.pop(self.id, None)
         self.study_panel.process.stop(signal.SIGTERM)
-        await asyncio.to_thread(self.session.close)
+        if hasattr(self, "session"):
+            await asyncio.to_thread(self.session.close)
 
     async def restart(self) -> None:
         """Show the view again with a new worker after the old one has ended."""
         lost, session = self.session, self.new_session()
         await asyncio.to_thread(lost.close)
         if session is None:
-            self.show_message(f"the worker of this page has stopped; {MAX_WORKERS} of {MAX_WORKERS} workers in use")
+            self.show_message("the worker of this page has stopped, and all others are in use: reload to wait for one")
             return
         self.session, self.view, wanted = session, None, self.state
         self.log("the worker of this page has stopped; a new one shows the view again")
@@ -340,8 +341,9 @@ class Tab:
         await self.show_live(self.session.run("render", self.solving))
 
     def stop_playback(self) -> None:
-        """Stop playback and the live camera, because the sensor view is needed for something else."""
+        """Stop playback, a pushed vehicle and the live camera, because the sensor view is needed for something else."""
         self.run_panel.pause()
+        self.scene_3d.push.stop()
         self.photo.stop()
 
     async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:

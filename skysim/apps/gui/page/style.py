@@ -38,9 +38,9 @@ TOOLTIP = {
 def color_scale(values: Floats) -> Floats:
     """(N, 3) sRGB, 0 to 1, of values from 0 to 1: the map cividis, which is the same to color-blind eyes.
 
-    Its darkest fifth is left out, because it would not be seen on the dark ground.
+    Its darkest third is left out, because it would not be seen on the dark ground.
     """
-    levels = np.rint(51 + 204 * np.clip(values, 0, 1)).astype(np.uint8)
+    levels = np.rint(85 + 170 * np.clip(values, 0, 1)).astype(np.uint8)
     return np.asarray(cv2.applyColorMap(levels[:, None], cv2.COLORMAP_CIVIDIS)[:, 0, ::-1] / 255)
 
 
@@ -104,6 +104,8 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-stops {{ display: grid; grid-template-columns: 40px repeat(4, minmax(0, 1fr)); gap: 0 10px; align-items: center }}
 .lab-stops .num {{ text-align: right }}
 .lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-run > * {{ flex: none }}
+.lab-moment {{ position: absolute; left: 0; top: 0; bottom: 0; width: 1.5px; pointer-events: none;
+  background: {CURVE_COLORS[0]} }} .lab-moment[hidden] {{ display: none }}
 .mono.lab-log {{ white-space: pre-wrap; overflow-wrap: anywhere }}
 .q-uploader__subtitle {{ display: none }} .q-uploader__title {{ font-size: 13px; font-weight: 500 }}
 .lab-space {{ position: relative; overflow: hidden }}
@@ -112,6 +114,8 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-tag {{ position: absolute; left: 0; top: 0; pointer-events: none; color: #fff; background: #0d1015b0 }}
 .lab-looks {{ position: absolute; right: 20px; top: 14px; display: flex; gap: 4px }}
 .lab-looks > .q-btn {{ color: #9cc4ff !important; background: #0d1015b0 !important }}
+.lab-push {{ position: absolute; right: 20px; top: 46px; display: flex; gap: 10px; align-items: center;
+  color: #d7dce4; background: #0d1015b0 }} .lab-push > .q-btn {{ color: #9cc4ff !important }}
 .lab-lights {{ width: 100%; border-collapse: collapse; cursor: default; text-align: right }}
 .lab-lights th {{ position: sticky; top: -10px; font-weight: normal; color: {COLORS["quiet"]};
   background: {COLORS["panel"]} }}
@@ -173,7 +177,8 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   .lab-head {{ flex-wrap: wrap; row-gap: 0; min-height: 44px }} .lab-title, .lab-split {{ display: none }}
   .lab-said {{ text-align: left; flex-basis: 200px }}
   .lab-keys {{ flex-wrap: wrap; padding: 6px 14px; row-gap: 4px }}
-  .lab-sensor {{ grid-template-rows: auto min(60vh, 100vw) auto }} .lab-bar {{ flex-wrap: wrap; padding: 4px 14px }}
+  .lab-sensor {{ grid-template-rows: auto calc(min(70vh, 75vw) + 200px) }}
+  .lab-bar {{ flex-wrap: wrap; padding: 4px 14px }}
   .lab-side {{ grid-template-rows: auto auto 620px; border-left: 0 }}
   .lab-run > .row:first-child {{ flex-wrap: wrap }}
 }}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import multiprocessing
 import signal
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from typing import Any, ClassVar
@@ -13,7 +14,7 @@ from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
 from skysim.experiments.study.execution.workers import environment, one_thread
 
-MAX_WORKERS = 12  # at once, the spare one included
+QUEUE_S = 0.2  # between two looks for a free worker
 OPENCV_LIMITS = {"OPENCV_IO_MAX_IMAGE_PIXELS": str(2**27)}  # environment: OpenCV refuses larger images
 
 
@@ -90,25 +91,45 @@ class SpareWorker:
     """Keeps a worker ready for the next tab, because its imports and compilation take seconds.
 
     scene : file from which it solves a frame to warm up
+    limit : of workers at once, the spare one included
+    queue : of the tabs that wait for one, the first first
     """
 
-    def __init__(self, scene: str) -> None:
-        self.scene = scene
+    def __init__(self, scene: str, limit: int) -> None:
+        self.scene, self.limit = scene, limit
         self.next: Session | None = None
+        self.queue = list[object]()
 
     def start(self) -> None:
-        if self.next is None and len(Session.alive) < MAX_WORKERS:
+        if self.next is None and not self.queue and len(Session.alive) < self.limit:
             self.next = Session()
             self.next.thread.submit(self.next.call, "warm_up", (self.scene,))
 
     def take(self) -> Session | None:
-        """Return the spare worker, or else a new one; None if there are MAX_WORKERS already."""
+        """Return the spare worker, or else a new one; None if there are as many as the limit already."""
         session, self.next = self.next, None
         if session and session.process.is_alive():
             return session
         if session:
             session.close()
-        return Session() if len(Session.alive) < MAX_WORKERS else None
+        return Session() if len(Session.alive) < self.limit else None
+
+    async def wait(self, wanted: Callable[[], bool], tell: Callable[[str], None]) -> Session | None:
+        """`take`, once it is this tab's turn; None if none is wanted any more. tell : gets what it waits for"""
+        ticket = object()
+        self.queue.append(ticket)
+        try:
+            while wanted():
+                place = self.queue.index(ticket)
+                session = None if place else self.take()
+                if session:
+                    return session
+                before = f"; {place} before this page" if place else ""
+                tell(f"{self.limit} of {self.limit} workers in use{before}.")
+                await asyncio.sleep(QUEUE_S)
+            return None
+        finally:
+            self.queue.remove(ticket)
 
     def close(self) -> None:
         if self.next:

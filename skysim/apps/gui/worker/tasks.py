@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import (
@@ -13,12 +15,14 @@ from skysim.apps.gui.messages import (
     FlightStep,
     FrameView,
     PlanCheck,
+    PushedView,
     SceneInfo,
     SurveyPlan,
     Triple,
 )
 from skysim.apps.gui.worker import export, photo, playback
 from skysim.apps.gui.worker.scene import planning, pointing
+from skysim.apps.gui.worker.scene.push import Grip, Push
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core.errors import InputError
 from skysim.core.io import images
@@ -28,11 +32,13 @@ from skysim.core.io import images
 class Worker:
     """State between tasks: the workbench, its flight, and the other image if the page shows one.
 
+    pushed : the motion of the pushed vehicle, as long as the workbench has its attitude
     other, image : an image that is not of the scene, and its (H, W) pixels;  camera : an open live camera
     """
 
     current: Workbench | None = None
     flight: playback.Flight | None = None
+    pushed: Push | None = None
     other: photo.Photo | None = None
     image: NDArray | None = None
     scene: str = ""
@@ -70,7 +76,7 @@ class Worker:
         if angles_deg is not None:
             bench.lab_from_body = pointing.from_angles(bench.scene, bench.testbed.mount, angles_deg)
         self.current = bench
-        self.scene, self.overrides, self.flight = scene, dict(overrides), None
+        self.scene, self.overrides, self.flight, self.pushed = scene, dict(overrides), None, None
         return bench.scene_info, self.render(solve)
 
     def render(self, solve: bool) -> FrameView:
@@ -85,6 +91,20 @@ class Worker:
         bench = self.workbench
         bench.lab_from_body = pointing.moved(bench.scene, bench.testbed.mount, bench.lab_from_body, right, up, roll_deg)
         return self.render(solve)
+
+    def push(self, grip: Grip | None, elapsed_s: float, solve: bool) -> PushedView:
+        """Integrate the motion of the pushed vehicle for a time, and render the frame whose exposure ends then.
+
+        The motion begins at rest, also if the camera was moved in another way meanwhile. Raises InputError.
+        """
+        bench = self.workbench
+        if self.pushed is None or self.pushed.lab_from_body is not bench.lab_from_body:
+            self.pushed = Push(bench.testbed, bench.lab_from_body)
+        self.pushed.advance(grip, elapsed_s)
+        bench.lab_from_body = self.pushed.lab_from_body
+        view = self.show_frame(bench.render(self.pushed.seen(bench.next_run()), solve))
+        rate_rad_s = np.linalg.norm(self.pushed.simulation.rate_body_rad_s)
+        return PushedView(view, float(np.linalg.norm(self.pushed.torque_nm)), math.degrees(rate_rad_s))
 
     def check(self) -> PlanCheck:
         return planning.check(self.workbench.testbed)

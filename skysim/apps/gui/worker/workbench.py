@@ -100,9 +100,12 @@ class Workbench:
 
     def render_at_rest(self, solve: bool = False) -> FrameView:
         """Render a frame at the current attitude at rest, with independent noise; solve it if `solve`."""
+        return self.render(self.next_run().at_rest(self.lab_from_body), solve)
+
+    def next_run(self) -> Testbed:
+        """The test bed in a run with its own noise."""
         self.rendered_count += 1
-        testbed = self.testbed.in_run(self.scene.seed + self.rendered_count)
-        return self.render(testbed.at_rest(self.lab_from_body), solve)
+        return self.testbed.in_run(self.scene.seed + self.rendered_count)
 
     @property
     def result(self) -> TrackerResult | None:

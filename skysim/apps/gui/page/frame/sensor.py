@@ -6,6 +6,7 @@ import asyncio
 import base64
 import functools
 import itertools
+import json
 import math
 from collections.abc import Collection
 from dataclasses import asdict
@@ -36,7 +37,7 @@ COLOR_MAPS = {
     **{"inferno": cv2.COLORMAP_INFERNO, "hot": cv2.COLORMAP_HOT},
 }
 FRAME_NUMBERS = itertools.count(1)  # of frames, so that each has its own address
-FRAMES: dict[str, dict[int, bytes]] = {}  # encoded pixels by tab and number, the newest KEPT
+FRAMES: dict[str, dict[int, bytes]] = {}  # responses by tab and number, the newest KEPT
 KEPT_FRAMES = 3
 DRAW_TIMEOUT_S = 1.0  # for the browser to report a drawn frame
 
@@ -125,9 +126,9 @@ class Sensor:
             self.wait.set_visibility(False)
         self.sent_number = next(FRAME_NUMBERS)
         frames = FRAMES.setdefault(self.tab.id, {})
-        frames[self.sent_number] = data
+        frames[self.sent_number] = with_fields(data, self.fields())
         frames.pop(min(frames) if len(frames) > KEPT_FRAMES else -1, None)
-        self.update_marks()
+        self.canvas.run_method("show", {"src": self.source})
 
     def drawn(self, event: Any) -> None:
         """The browser reports a drawn frame."""
@@ -170,17 +171,25 @@ class Sensor:
         at = self.hover_px
         self.hover.set_text(self.light_text(*self.nearest(*at)) if at else self.statistics)
 
-    def update_marks(self) -> None:
-        """Send the frame's address, its pointing and its marks to the canvas; not as properties, which would be sent
-        again whole with each change of any of them."""
+    @property
+    def source(self) -> str:
+        """Address of the newest frame."""
+        return f"/frame/{self.tab.id}/{self.sent_number}"
+
+    def fields(self) -> dict[str, Any]:
+        """What frame.js needs beside the pixels: pointing and marks."""
         view = {
-            "src": f"/frame/{self.tab.id}/{self.sent_number}",
             "size": self.size_px,
             "saturation": self.saturation_dn if math.isfinite(self.saturation_dn) else None,
             "pose": pose_fields(self.pose) if self.pose else None,
             "label": self.description(),
         }
-        self.canvas.run_method("show", view | overlay.marks(self.lights, self.result, self.shown, self.name))
+        return view | overlay.marks(self.lights, self.result, self.shown, self.name)
+
+    def update_marks(self) -> None:
+        """Send other marks of the newest frame; not as properties, which would be sent again whole with each change
+        of any of them."""
+        self.canvas.run_method("show", {"src": self.source} | self.fields())
 
     def description(self) -> str:
         """Text alternative of the view for screen readers."""
@@ -230,6 +239,13 @@ class Sensor:
             if light:
                 lines += [f"           error {math.hypot(detection.x - light.x, detection.y - light.y):.3f} px"]
         return "\n".join(lines)
+
+
+def with_fields(pixels: bytes, fields: dict[str, Any]) -> bytes:
+    """A frame's response: its pixels, then the fields as JSON, then the length of that as an unsigned integer of 32
+    bits. So a frame comes with its marks, and little goes over the websocket, whose messages are compiled as code."""
+    text = json.dumps(fields, separators=(",", ":")).encode()
+    return b"".join((pixels, text, len(text).to_bytes(4, "little")))
 
 
 def pose_fields(pose: Pose) -> dict[str, Any]:

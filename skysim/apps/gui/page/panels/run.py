@@ -13,7 +13,8 @@ from nicegui import ui
 from skysim.apps.gui.messages import FlightStep, FrameRow, MotionLog
 from skysim.apps.gui.page import keys
 from skysim.apps.gui.page.forms import FEEDBACKS, loop_overrides
-from skysim.apps.gui.page.panels.strips import StripChart, csv, rms_line, strips
+from skysim.apps.gui.page.panels.strips import StripChart, rms_line, strips
+from skysim.apps.gui.page.shell.csv_table import csv_table
 
 if TYPE_CHECKING:
     from skysim.apps.gui.page.page import Tab
@@ -279,7 +280,7 @@ class RunPanel:
             if not self.dragging:
                 self.seek.set_value(index)
             self.clock.set_text(f"{view.t_s:.2f} s  {index + 1}/{len(self.rows)}")
-            self.strips.set_cursor(view.t_s)
+            self.strips.set_moment(view.t_s)
             self.tab.set_state(kind="flight", t_s=view.t_s)
             self.tab.display_frame(view)
             await self.tab.sensor.wait_drawn()
@@ -287,4 +288,4 @@ class RunPanel:
             self.busy = False
 
     def download(self) -> None:
-        ui.download(csv(self.rows), f"{Path(self.tab.scene).stem}_flight.csv")
+        ui.download(csv_table(FrameRow._fields, self.rows), f"{Path(self.tab.scene).stem}_flight.csv")

@@ -15,18 +15,35 @@ from skysim.apps.gui.page.style import CURVE_COLORS, TOOLTIP, chart_color
 BAND_COLOR = "#8b95a5"
 STRIP_PX, HEAD_PX, AXIS_PX = 118, 22, 24  # height of a strip, of its title and legend, of the time axis
 Points = list[list[float]]
-CLICK_JS = """() => {
+LEFT_PX, RIGHT_PX = 52, 12  # of a strip, to the edges of the chart
+# A click on a strip, and the line of the shown moment over all strips. The line is an element of its own, because the
+# chart would draw all curves again for it.
+CHART_JS = """() => {
   const chart = getElement(%d).chart;
-  if (chart.skysimClicks) return;
-  chart.skysimClicks = true;
-  chart.getZr().on("click", event => {
-    const at = [event.offsetX, event.offsetY];
-    chart.getOption().grid.forEach((_, gridIndex) => {
-      if (!chart.containPixel({ gridIndex }, at)) return;
-      emitEvent("moment", chart.convertFromPixel({ gridIndex }, at)[0]);
+  if (!chart.skysim) {
+    const line = document.createElement("div");
+    line.className = "lab-moment";
+    chart.getDom().append(line);
+    chart.skysim = { line, t_s: 0 };
+    chart.getZr().on("click", event => {
+      const at = [event.offsetX, event.offsetY];
+      chart.getOption().grid.forEach((_, gridIndex) => {
+        if (!chart.containPixel({ gridIndex }, at)) return;
+        emitEvent("moment", chart.convertFromPixel({ gridIndex }, at)[0]);
+      });
     });
-  });
+  }
+  skysimMoment(chart, chart.skysim.t_s);
 }"""
+MOMENT_JS = f"""
+window.skysimMoment = (chart, t_s) => {{
+  if (!chart?.skysim) return;
+  const x = chart.convertToPixel({{ xAxisIndex: 0 }}, t_s), {{ line }} = chart.skysim;
+  chart.skysim.t_s = t_s;
+  line.hidden = !(x >= {LEFT_PX} && x <= chart.getWidth() - {RIGHT_PX});
+  line.style.transform = `translateX(${{x}}px)`;
+}};
+"""
 
 
 @dataclass(frozen=True)
@@ -109,7 +126,8 @@ class StripChart:
     def __init__(self) -> None:
         self.strips: list[Strip] = []
         self.chart = ui.echart({"series": []}).classes("w-full").mark("strips")
-        self.chart.on("chart:finished", js_handler=CLICK_JS % self.chart.id)
+        ui.add_body_html(f"<script>{MOMENT_JS}</script>")
+        self.chart.on("chart:finished", js_handler=CHART_JS % self.chart.id)
         self.chart.set_visibility(False)
 
     def draw(self, drawn: list[Strip], end_s: float) -> None:
@@ -121,12 +139,10 @@ class StripChart:
         self.chart.options.update(options(drawn, end_s) if drawn else {"series": []})
         self.chart.update()
 
-    def set_cursor(self, t_s: float) -> None:
-        """Move the line of the shown moment in all strips, without sending their curves again."""
-        cursors = [cursor(n, t_s) for n in range(len(self.strips))]
-        if cursors:
-            self.chart.options["series"][-len(cursors) :] = cursors  # for the next time that all is sent
-            self.chart.run_chart_method("setOption", {"series": cursors})
+    def set_moment(self, t_s: float) -> None:
+        """Move the line of the shown moment."""
+        if self.strips:
+            self.chart.client.run_javascript(f"skysimMoment(getElement({self.chart.id})?.chart, {t_s:.4f})")
 
 
 def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
@@ -136,7 +152,7 @@ def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
     title = {"padding": 0, "left": 0, "textStyle": title_text}
     legend = {"textStyle": text, "itemWidth": 14, "itemHeight": 7, "itemGap": 10, "right": 10, "padding": 0}
     tops = [n * STRIP_PX for n in range(len(drawn))]
-    grid = {"left": 52, "right": 12, "height": STRIP_PX - HEAD_PX - 8}
+    grid = {"left": LEFT_PX, "right": RIGHT_PX, "height": STRIP_PX - HEAD_PX - 8}
     x_axis = {"type": "value", "min": 0, "max": round(end_s, 3), "splitLine": {"show": False}}
     last = len(drawn) - 1
     return {
@@ -161,7 +177,6 @@ def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
         "yAxis": [y_axis(one, n) | {"axisLabel": text, "splitLine": rule} for n, one in enumerate(drawn)],
         "series": [
             *(series(curve, n, k) for n, one in enumerate(drawn) for k, curve in enumerate(one.drawn)),
-            *(cursor(n, 0.0) for n in range(len(drawn))),
         ],
     }
 
@@ -190,14 +205,6 @@ def series(curve: Curve, n: int, k: int) -> dict[str, Any]:
     return {"name": curve.name, "type": kind, "data": curve.points, "animation": False} | look | line | in_strip(n)
 
 
-def cursor(n: int, t_s: float) -> dict[str, Any]:
-    """ECharts series of a vertical line in a strip at a time."""
-    style = {"color": CURVE_COLORS[0], "width": 1.5, "type": "solid"}
-    mark = {"silent": True, "symbol": "none", "animation": False, "label": {"show": False}, "lineStyle": style}
-    line = {"id": f"cursor{n}", "type": "line", "data": [], "animation": False}
-    return line | {"markLine": mark | {"data": [{"xAxis": t_s}]}} | in_strip(n)
-
-
 def in_strip(n: int) -> dict[str, int]:
     return {"xAxisIndex": n, "yAxisIndex": n}
 
@@ -212,9 +219,3 @@ def rms_line(rows: Sequence[FrameRow]) -> str:
         for values in ([row.cross_arcsec for row in solved], [row.roll_arcsec for row in solved])
     )
     return f"{len(solved)} of {len(rows)} frames solved; rms: cross {cross:.3g}″, roll {roll:.3g}″"
-
-
-def csv(rows: Sequence[FrameRow]) -> bytes:
-    """The frames' numbers as a table; an empty cell is an unknown value."""
-    lines = (",".join("" if value != value else f"{value:.9g}" for value in row) for row in rows)
-    return ("\n".join([",".join(FrameRow._fields), *lines]) + "\n").encode()

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo
+from skysim.apps.gui.page.shell.csv_table import csv_table
 
 if TYPE_CHECKING:
     from skysim.apps.gui.page.page import Tab
@@ -25,7 +26,7 @@ class LogPanel:
     """The log, the newest line first. rows : of the identifications, with the cells of COLUMNS"""
 
     def __init__(self, tab: Tab) -> None:
-        self.tab, self.lines, self.rows = tab, list[str](), list[tuple[str, ...]]()
+        self.tab, self.lines, self.rows = tab, list[str](), list[tuple[Any, ...]]()
         self.button = ui.button("CSV of the identifications", on_click=self.download).props("dense flat size=sm")
         self.button.mark("log-csv").set_enabled(False)
         self.label = ui.label("Nothing yet.").classes("mono lab-log").mark("log")
@@ -41,7 +42,7 @@ class LogPanel:
         self.button.set_enabled(True)
 
     def download(self) -> None:
-        ui.download(csv(self.rows), f"{Path(self.tab.scene).stem}_log.csv")
+        ui.download(csv_table(COLUMNS, self.rows), f"{Path(self.tab.scene).stem}_log.csv")
 
 
 def line(view: FrameView, info: SceneInfo) -> str:
@@ -55,19 +56,12 @@ def line(view: FrameView, info: SceneInfo) -> str:
     return f"identify {noise} noise: {result.status}, {counts}; {angles}; {errors}"
 
 
-def row(view: FrameView, info: SceneInfo) -> tuple[str, ...]:
-    """An identification as cells of COLUMNS; unknown values are empty."""
+def row(view: FrameView, info: SceneInfo) -> tuple[Any, ...]:
+    """An identification as values of COLUMNS; None where there is no solution."""
     result = view.result
     assert result is not None
-    found = result.angles_deg or ("", "", "")
-    errors = (result.cross_arcsec, result.roll_arcsec, *result.sigma_arcsec) if result.solved else ("",) * 4
+    found = result.angles_deg or (None,) * 3
+    errors = (result.cross_arcsec, result.roll_arcsec, *result.sigma_arcsec) if result.solved else (None,) * 4
     counts = len(result.detections), result.identified
     names = info.scene, info.noise, info.stages["detector"], info.stages["identifier"], result.status
-    cells = (time.strftime("%H:%M:%S"), *names, *counts, *view.angles_deg, *found, *errors, result.wrong)
-    return tuple(f"{cell:.9g}" if isinstance(cell, float) else str(cell) for cell in cells)
-
-
-def csv(rows: list[tuple[str, ...]]) -> bytes:
-    """The table; a comma in a cell, as in a status, becomes a semicolon."""
-    lines = (",".join(cell.replace(",", ";") for cell in one) for one in (COLUMNS, *rows))
-    return ("\n".join(lines) + "\n").encode()
+    return (time.strftime("%H:%M:%S"), *names, *counts, *view.angles_deg, *found, *errors, result.wrong)

@@ -10,6 +10,7 @@ from nicegui import ui
 from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo
+from skysim.apps.gui.page.space.push import PushControl
 from skysim.apps.gui.page.style import DARK, color_scale
 from skysim.core.types import Floats
 from skysim.dynamics.multibody import Shape
@@ -43,7 +44,9 @@ class Scene3D:
             for name, text in VIEWS.items():
                 button = ui.button(name, on_click=lambda name=name: self.look(name)).props("dense outline size=xs")
                 button.props(f'title="look {text}"').mark(f"look-{name}")
-        ui.label("drag: rotate · right drag: pan · wheel: zoom").classes("lab-turn quiet")
+        hint = ui.label("drag: rotate · drag the vehicle: push it · right drag: pan · wheel: zoom")
+        hint.classes("lab-turn quiet")
+        self.push = PushControl(tab, self.canvas)
         ui.timer(UPDATE_S, self.update)
 
     def look(self, name: str) -> None:

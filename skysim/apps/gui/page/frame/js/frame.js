@@ -35,7 +35,8 @@ export default {
   created() {
     // Not reactive: Vue must not watch arrays of a million pixels.
     Object.assign(this, {
-      wanted: null, // the newest view: src, size, saturation, pose, marks, names, lights, label
+      wanted: null, // the newest view: src, and other marks than those that come with it: size, saturation, pose, label,
+      // marks, names, lights
       drawn: null, // the view on the canvas, with pixels and their sample
       lens: null,
       zoom: null, // { scale, x, y }: screen pixels per pixel, and the pixel in the middle; null: the whole frame
@@ -96,12 +97,11 @@ export default {
       try {
         while (this.wanted && this.wanted !== this.drawn?.view) {
           const view = this.wanted, lens = this.lens, same = view.src === this.drawn?.src;
-          const pixels = same ? this.drawn.pixels : await this.fetchPixels(view);
-          if (!pixels && view === this.wanted) break;
-          if (!pixels) continue;
-          const sampled = same ? this.drawn.sampled : sample(pixels);
-          if (String(view.size) !== String(this.drawn?.size)) this.zoom = this.cut = this.pinned = null;
-          this.drawn = { ...view, view, lens, pixels, sampled };
+          const fetched = same ? this.drawn : await this.fetchFrame(view.src);
+          if (!fetched && view === this.wanted) break;
+          if (!fetched) continue;
+          if (String(fetched.size) !== String(this.drawn?.size)) this.zoom = this.cut = this.pinned = null;
+          this.drawn = { ...fetched, ...view, view, lens };
           if (same) this.paint();
           else this.recolor();
           this.$emit("drawn", { src: view.src });
@@ -110,11 +110,14 @@ export default {
         this.fetching = false;
       }
     },
-    // Pixels of a frame; null if the server is unreachable or holds only newer frames, which it will announce.
-    async fetchPixels(view) {
+    // A frame's pixels with their sample, its pointing and its marks; null if the server is unreachable or holds only
+    // newer frames, which it will announce.
+    async fetchFrame(src) {
       try {
-        const response = await fetch((window.path_prefix || "") + view.src);
-        return response.ok ? decode(await response.arrayBuffer(), view.size) : null;
+        const response = await fetch((window.path_prefix || "") + src);
+        if (!response.ok) return null;
+        const { fields, pixels } = decode(await response.arrayBuffer());
+        return { ...fields, pixels, sampled: sample(pixels) };
       } catch {
         return null;
       }

@@ -1,6 +1,6 @@
 // Pixels of a frame: decoding, display limits, histogram and colors.
 
-const HEADER_BYTES = 16;
+const HEADER_BYTES = 16, LENGTH_BYTES = 4;
 const ZSCALE = { samples: 1000, contrast: 0.25, maxReject: 0.5, minPixels: 5, krej: 2.5, iterations: 5 };
 const STRIDE = 8; // in rows and columns, of the sample for limits and histogram
 export const CURVES = {
@@ -9,13 +9,17 @@ export const CURVES = {
   logarithm: (fraction) => Math.log1p(200 * fraction) / Math.log1p(200),
 };
 
-// Two float64 (offset, step), then an unsigned integer n per pixel, of 8 or 16 bits: its value is offset + step n.
-export function decode(buffer, [width, height]) {
-  const [offset, step] = new Float64Array(buffer, 0, 2);
-  const Kind = buffer.byteLength - HEADER_BYTES === width * height ? Uint8Array : Uint16Array;
-  const data = new Kind(buffer, HEADER_BYTES);
+// Two float64 (offset, step), then an unsigned integer n per pixel, of 8 or 16 bits: its value is offset + step n. Then
+// the frame's fields as JSON, and the length of that, 32 bits.
+export function decode(buffer) {
+  const length = new DataView(buffer).getUint32(buffer.byteLength - LENGTH_BYTES, true);
+  const end = buffer.byteLength - LENGTH_BYTES - length;
+  const fields = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, end, length)));
+  const [width, height] = fields.size, [offset, step] = new Float64Array(buffer, 0, 2);
+  const Kind = end - HEADER_BYTES === width * height ? Uint8Array : Uint16Array;
+  const data = new Kind(buffer, HEADER_BYTES, (end - HEADER_BYTES) / Kind.BYTES_PER_ELEMENT);
   if (data.length !== width * height) throw new Error("the pixels do not fit the frame's size");
-  return { data, offset, step, width, height };
+  return { fields, pixels: { data, offset, step, width, height } };
 }
 
 // Sorted sample of the pixels, with the extreme values of all of them.

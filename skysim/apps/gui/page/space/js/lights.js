@@ -2,7 +2,7 @@
 import { THREE } from "nicegui-scene";
 
 const COLORS = { dark: 0x3a4250, lit: 0xfff3dc, seen: 0xffab1a, identified: 0x1fc9a0, ringed: 0xffffff };
-const SIZES = { dark: 0.7, lit: 1, seen: 1.8, identified: 2.2, ringed: 4 }; // over a light's own radius
+const SIZES = { dark: 0.7, lit: 1, seen: 1.8, identified: 2.2, colored: 3.2, ringed: 4 }; // over a light's own radius
 const LEAST_PX = 1.5, MOST_PX = 40; // diameter on the screen
 const FORWARD_M = 0.03; // towards the eye, so that the dome's skin does not cover a part of them
 const SHADERS = {
@@ -42,7 +42,7 @@ export class Lights {
     const { size, tint } = this.points.geometry.attributes, color = new THREE.Color();
     this.states.forEach((state, n) => {
       const id = this.lights.id[n], shown = id === marked ? "ringed" : state, own = this.colors.get(id);
-      size.array[n] = SIZES[own && shown !== "ringed" ? "identified" : shown] * this.lights.radius[n];
+      size.array[n] = SIZES[own && shown !== "ringed" ? "colored" : shown] * this.lights.radius[n];
       color.set(shown === "ringed" ? COLORS.ringed : own ?? COLORS[shown]).convertLinearToSRGB().toArray(tint.array, 3 * n);
     });
     size.needsUpdate = tint.needsUpdate = true;

@@ -69,6 +69,14 @@ export function axes(length) {
   return group;
 }
 
+// A line between two points, drawn over everything; its points are set later.
+export function band() {
+  const material = new THREE.LineBasicMaterial({ color: 0xffe27a, depthTest: false });
+  const line = new THREE.Line(new THREE.BufferGeometry().setFromPoints([new THREE.Vector3(), new THREE.Vector3()]), material);
+  line.frustumCulled = line.visible = false;
+  return line;
+}
+
 function letter(text, color) {
   const canvas = document.createElement("canvas"), pen = canvas.getContext("2d");
   canvas.width = canvas.height = 64;

@@ -3,22 +3,26 @@
 import { OrbitControls, THREE } from "nicegui-scene";
 import { drawNames } from "skysim-frame/marks.js";
 import { Lights } from "skysim-space/lights.js";
-import { axes, solid } from "skysim-space/solids.js";
+import { axes, band, solid } from "skysim-space/solids.js";
 
 const BUSY_MS = 400, SMOOTH_MS = 33; // between pictures without a graphics card, and with one or under the mouse
 const REACH_PX = 12;
+const PULL_MS = 40; // between two messages of a drag
 const NEAR_M = 0.02, FAR_M = 60;
 const INSIDE = ["camera", "bearing"]; // views in which vehicle and axes would be in the way
 
 export default {
   template: `
     <div class="lab-space" @pointerenter="inside = true" @pointerleave="leave">
-      <canvas ref="canvas" role="img" aria-label="The laboratory" @pointermove="move"></canvas>
+      <canvas ref="canvas" role="img" aria-label="The laboratory" @pointerdown="hold" @pointermove="move"
+        @pointerup="letGo" @pointercancel="letGo"></canvas>
       <canvas ref="names" class="lab-names"></canvas>
       <div ref="label" class="lab-tag mono"></div>
     </div>`,
   created() {
     // Not reactive: Vue must not watch the objects of three.js.
+    // held: what the user drags: { body: its place in body axes, plane: in which it is pulled, wanted: to where }
+    Object.assign(this, { held: null, telling: null });
     Object.assign(this, { inside: false, hovered: null, ringed: null, preset: "outside", named: [], drawnAt: 0, drawings: 0 });
   },
   mounted() {
@@ -58,9 +62,9 @@ export default {
       this.world.add(new THREE.HemisphereLight(0xcfdcff, 0x20242c, 1.6));
       const lamp = new THREE.DirectionalLight(0xffffff, 1.8);
       lamp.position.set(2, -2.5, 3);
-      [this.vehicle, this.axes] = [new THREE.Group(), axes(lab.axis)];
+      [this.vehicle, this.axes, this.band] = [new THREE.Group(), axes(lab.axis), band()];
       this.lights = new Lights(lab.lights);
-      this.world.add(lamp, this.vehicle, this.axes, this.lights.points);
+      this.world.add(lamp, this.vehicle, this.axes, this.lights.points, this.band);
       for (const shape of lab.shapes) (shape.on_vehicle ? this.vehicle : this.world).add(solid(shape));
       this.named = [];
       this.paintLights();
@@ -75,6 +79,7 @@ export default {
       this.named = identified.filter(([id]) => index.has(id)).map(([id, name]) => [index.get(id), name]);
       this.paintLights();
       if (this.preset === "camera") this.look("camera");
+      this.placeBand();
       this.draw();
     },
     // Give some lights a color of their own: [number, color] each.
@@ -154,6 +159,53 @@ export default {
       return [((at.x + 1) / 2) * this.$el.clientWidth, ((1 - at.y) / 2) * this.$el.clientHeight];
     },
 
+    // Pushing the vehicle: a drag that begins on it pulls at that point, in the plane that faces the eye.
+
+    ray(event) {
+      const { clientWidth, clientHeight } = this.$el, caster = new THREE.Raycaster();
+      const at = new THREE.Vector2((2 * event.offsetX) / clientWidth - 1, 1 - (2 * event.offsetY) / clientHeight);
+      caster.setFromCamera(at, this.camera);
+      return caster;
+    },
+    hold(event) {
+      if (!this.vehicle?.visible || event.button !== 0) return;
+      const solids = this.vehicle.children.filter(({ name }) => !name.startsWith("stage"));
+      const [hit] = this.ray(event).intersectObjects(solids);
+      if (!hit) return;
+      const away = this.camera.getWorldDirection(new THREE.Vector3());
+      const plane = new THREE.Plane().setFromNormalAndCoplanarPoint(away, hit.point);
+      const body = hit.point.clone().applyQuaternion(this.vehicle.quaternion.clone().invert());
+      this.held = { body, plane, wanted: hit.point };
+      this.controls.enabled = false;
+      this.$refs.canvas.setPointerCapture(event.pointerId);
+      this.pull(event);
+    },
+    pull(event) {
+      this.held.wanted = this.ray(event).ray.intersectPlane(this.held.plane, new THREE.Vector3()) ?? this.held.wanted;
+      this.placeBand();
+      this.draw();
+      this.telling ??= setTimeout(this.tell, PULL_MS);
+    },
+    tell() {
+      this.telling = null;
+      if (this.held) this.$emit("grip", { held: this.held.body.toArray(), wanted: this.held.wanted.toArray() });
+    },
+    letGo() {
+      if (!this.held) return;
+      this.held = null;
+      this.controls.enabled = true;
+      this.$emit("release");
+      this.placeBand();
+      this.draw(true);
+    },
+    // The line from the held point to where it is pulled.
+    placeBand() {
+      this.band.visible = Boolean(this.held);
+      if (!this.held) return;
+      const from = this.held.body.clone().applyQuaternion(this.vehicle.quaternion);
+      this.band.geometry.setFromPoints([from, this.held.wanted]);
+    },
+
     // Hovered lights, here and elsewhere on the page.
 
     ring({ detail: { id } }) {
@@ -163,6 +215,7 @@ export default {
       this.draw(true);
     },
     move(event) {
+      if (this.held) this.pull(event);
       if (!this.lights || event.buttons) return;
       const { clientWidth, clientHeight } = this.$el, at = [event.offsetX, event.offsetY];
       const found = this.lights.nearest(this.camera, at, [clientWidth, clientHeight], REACH_PX);

@@ -1,0 +1,331 @@
+"""The lab in the browser: frames per second, latency, traffic, memory and the twentieth tab, in Chromium.
+
+`python -m benchmarks lab` serves shefex2 with a detector of 1024 x 1024 pixels and 90 frames at 30 Hz; every frame is
+solved. A browser without a graphics card draws on the same cores that render the frames, so the processor time of
+server and browser is measured too: it depends less on what else the machine does. `SKYSIM_BENCH_TABS` is the number of
+tabs that are opened and closed for the memory, 20 by default.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import psutil
+
+from benchmarks.timing import verdict
+from skysim.core.types import Floats
+
+SCENE = """schema: 1
+base: shefex2
+title: SHEFEX-2 with a square megapixel
+camera: {width_px: 1024, height_px: 1024}
+exposure: {time: "20 ms", rate_hz: 30, frames: 90, first: "0.1 s"}
+"""
+SIZES = ((1280, 800), (1920, 1080))
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+FLAGS = ("--no-sandbox", "--enable-unsafe-swiftshader")
+TOKEN, WORKERS_LIMIT = "bench", 4
+HELD_S, PRESSES, TABS, CROWD = 6.0, 30, int(os.environ.get("SKYSIM_BENCH_TABS", "20")), 20
+IDLE_S = 0.1  # processor time in a second of a server that waits
+WARM_S = 180.0  # for compiling and loading on a busy machine
+# When a frame was drawn and a key went down, by the page's clock.
+WATCH = """() => { window.drawn = []; window.pressed = [];
+ new MutationObserver(() => window.drawn.push(performance.now())).observe(
+   document.querySelector('.lab-frame canvas'), {attributeFilter: ['data-frame']});
+ document.addEventListener('keydown', event => window.pressed.push(event.timeStamp), true); }"""
+
+
+class Traffic:
+    """Bytes that a page has received: over its websocket before compression, and of frames over HTTP."""
+
+    def __init__(self, page: Any) -> None:
+        self.websocket = self.http = 0
+        page.on("websocket", lambda opened: opened.on("framereceived", self.count_message))
+        page.on("response", self.count_frame)
+
+    def count_message(self, message: Any) -> None:
+        self.websocket += len(message)
+
+    def count_frame(self, response: Any) -> None:
+        if "/frame/" in response.url:
+            self.http += int(response.headers.get("content-length", 0))
+
+
+class Server:
+    """A process that serves the page of a scene, with a limit on its workers."""
+
+    def __init__(self, scene: str, folder: str, workers: int = 12) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        command = [sys.executable, "-m", "skysim", "gui", scene, "--no-open", "--port", str(port), "--token", TOKEN]
+        places = ["--out", folder, "--folder", folder, "--workers", str(workers)]
+        self.process = psutil.Popen([*command, *places], start_new_session=True, stdout=subprocess.DEVNULL)
+        self.url = f"http://127.0.0.1:{port}/?token={TOKEN}"
+
+    def workers(self) -> list[psutil.Process]:
+        """Its worker processes, the oldest first."""
+        found = [one for one in self.process.children() if "spawn_main" in " ".join(one.cmdline())]
+        return sorted(found, key=psutil.Process.create_time)
+
+    def cpu_s(self) -> float:
+        """Processor time of it and its workers."""
+        return sum(cpu_s(one) for one in [self.process, *self.process.children()])
+
+    def settle(self, workers: int) -> None:
+        """Wait until it has so many workers, and all of them wait for work."""
+        end, idle = time.monotonic() + WARM_S, False
+        while not idle and time.monotonic() < end:
+            before = self.cpu_s()
+            time.sleep(1.0)
+            idle = len(self.workers()) == workers and self.cpu_s() - before < IDLE_S
+
+    def memory_mb(self) -> float:
+        """Its own memory, without that which it shares with others."""
+        return float(self.process.memory_full_info().uss) / 1e6
+
+
+@contextmanager
+def served(scene: str, workers: int = 12) -> Iterator[Server]:
+    """Start a GUI server for a scene."""
+    with tempfile.TemporaryDirectory() as folder:
+        server = Server(scene, folder, workers)
+        try:
+            reached(server.url)
+            yield server
+        finally:
+            os.killpg(server.process.pid, signal.SIGTERM)
+            server.process.wait(30)
+
+
+def cpu_s(process: psutil.Process) -> float:
+    """Processor time of a process; 0 if it has ended."""
+    try:
+        times = process.cpu_times()
+        return float(times.user + times.system)
+    except psutil.Error:
+        return 0.0
+
+
+def browser_cpu_s() -> float:
+    """Processor time of the browser that this process has started."""
+    children = psutil.Process().children(recursive=True)
+    return sum(cpu_s(one) for one in children if "chrom" in one.name())
+
+
+def reached(url: str) -> None:
+    """Wait until a server responds at the address. Raises TimeoutError."""
+    opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())  # the token is passed on as a cookie
+    end = time.monotonic() + WARM_S
+    while time.monotonic() < end:
+        with suppress(OSError):
+            opener.open(url, timeout=2).read()
+            return
+        time.sleep(0.1)
+    raise TimeoutError(url)
+
+
+def chromium() -> str:
+    """Path of the browser. Raises StopIteration if there is none."""
+    return next(path for name in BROWSERS if (path := shutil.which(name)))
+
+
+def measure() -> list[dict[str, Any]]:
+    """Speed on two sizes of screen, then memory over tabs, then a crowd of tabs."""
+    from playwright.sync_api import sync_playwright
+
+    rows = []
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
+        scene = Path(folder) / "square.yaml"
+        scene.write_text(SCENE)
+        browser = driver.chromium.launch(executable_path=chromium(), args=list(FLAGS))
+        with served(str(scene)) as server:
+            opened(browser, server).close()  # compiles what is not in the cache
+            for size in SIZES:
+                rows += speed(browser, server, size)
+            rows += memory(browser, server)
+        with served("shefex2", WORKERS_LIMIT) as server:
+            rows += crowd(browser, server)
+        browser.close()
+    return rows
+
+
+def say(text: str) -> None:
+    """Progress, as a run takes minutes."""
+    print(f"lab: {text}", file=sys.stderr, flush=True)
+
+
+def opened(browser: Any, server: Server, size: tuple[int, int] = SIZES[0]) -> Any:
+    """A new page that shows a solved frame."""
+    page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+    page.goto(server.url)
+    shown(page)
+    return page
+
+
+def shown(page: Any) -> None:
+    page.locator(".lab-frame canvas[data-frame]").wait_for(timeout=1e3 * WARM_S)
+    page.locator(".lab-card .good").wait_for(timeout=1e3 * WARM_S)
+
+
+def speed(browser: Any, server: Server, size: tuple[int, int]) -> list[dict[str, Any]]:
+    """Opening, keys and playing on a screen of a size."""
+    screen = f"{size[0]} x {size[1]}"
+    say(screen)
+    server.settle(1)
+    page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+    traffic, begin = Traffic(page), time.monotonic()
+    page.goto(server.url)
+    shown(page)
+    open_s = time.monotonic() - begin
+    server.settle(2)
+    page.evaluate(WATCH)
+    held = measured(page, server, traffic, partial(hold, page))
+    page.wait_for_timeout(500)
+    delays = delays_ms(page, PRESSES)
+    simulate(page)
+    played = measured(page, server, traffic, partial(play, page))
+    page.close()
+    middle, most = np.quantile(delays, [0.5, 0.9])
+    return [
+        verdict(f"page opened and shown, {screen}", open_s, "s", "a worker is ready", 3.0),
+        verdict(f"key to picture, median, {screen}", middle, "ms", f"{PRESSES} presses", 60.0),
+        verdict(f"key to picture, 90 %, {screen}", most, "ms", f"{PRESSES} presses", 90.0),
+        *held.rows(f"key held, {screen}"),
+        *played.rows(f"playing, {screen}"),
+    ]
+
+
+class Measured(NamedTuple):
+    """Frames that were drawn in a time, and what they took: bytes, processor time of the server and of the browser."""
+
+    frames: int
+    seconds: float
+    websocket: int
+    http: int
+    server_s: float
+    browser_s: float
+
+    def rows(self, what: str) -> list[dict[str, Any]]:
+        count = max(self.frames, 1)
+        return [
+            verdict(f"{what}: frames shown", self.frames / self.seconds, "/s", "1024 x 1024, solved", 30.0, least=True),
+            verdict(f"{what}: websocket", self.websocket / 1e3 / count, "kB/frame", "before compression", 20.0),
+            plain(f"{what}: HTTP", self.http / 1e3 / count, "kB/frame", "16-bit pixels"),
+            plain(f"{what}: processor, server", 1e3 * self.server_s / count, "ms/frame", "with its workers"),
+            plain(f"{what}: processor, browser", 1e3 * self.browser_s / count, "ms/frame", "without a graphics card"),
+        ]
+
+
+def plain(name: str, value: float, unit: str, what: str) -> dict[str, Any]:
+    """A result without a bar."""
+    return verdict(name, value, unit, what, math.inf) | {"bar": None, "met": None}
+
+
+def measured(page: Any, server: Server, traffic: Traffic, action: Callable[[], None]) -> Measured:
+    """What an action on a page takes."""
+    page.evaluate("() => { window.drawn = [] }")
+    traffic.websocket = traffic.http = 0
+    before, begin = (server.cpu_s(), browser_cpu_s()), time.monotonic()
+    action()
+    seconds, after = time.monotonic() - begin, (server.cpu_s(), browser_cpu_s())
+    frames = int(page.evaluate("window.drawn.length"))
+    return Measured(frames, seconds, traffic.websocket, traffic.http, after[0] - before[0], after[1] - before[1])
+
+
+def hold(page: Any) -> None:
+    """Hold an arrow key."""
+    end = time.monotonic() + HELD_S
+    while time.monotonic() < end:
+        page.keyboard.down("ArrowLeft")
+        time.sleep(0.03)  # a keyboard's repeat interval
+    page.keyboard.up("ArrowLeft")
+
+
+def simulate(page: Any) -> None:
+    """Compute the flight and let it play to its end."""
+    page.get_by_role("tab", name="Run").click()
+    page.get_by_role("button", name="Simulate").click()
+    clock = page.get_by_text(re.compile(r"90/90$"))
+    clock.wait_for(timeout=1e3 * WARM_S)
+    page.locator(".lab-frame").click(position={"x": 5, "y": 5})  # keys are the page's again
+
+
+def play(page: Any) -> None:
+    """Play the flight from its start to its end, in real time."""
+    page.keyboard.press("p")
+    page.get_by_text(re.compile(r" [1-9]/90$")).wait_for(timeout=1e3 * WARM_S)
+    page.get_by_text(re.compile(r"90/90$")).wait_for(timeout=1e3 * WARM_S)
+
+
+def delays_ms(page: Any, presses: int) -> Floats:
+    """(presses,) milliseconds from a key press to the next picture, by the page's clock."""
+    found = []
+    for _ in range(presses):
+        page.evaluate("() => { window.drawn = []; window.pressed = [] }")
+        page.keyboard.press("ArrowRight")
+        page.wait_for_function("window.drawn.length > 0", polling=20, timeout=1e3 * WARM_S)
+        found.append(page.evaluate("window.drawn[0] - window.pressed[0]"))
+        page.wait_for_timeout(150)
+    return np.array(found)
+
+
+def memory(browser: Any, server: Server) -> list[dict[str, Any]]:
+    """Growth of the server's own memory over tabs that are opened and closed."""
+    levels = []
+    for tab in range(TABS + 3):
+        opened(browser, server).close()
+        server.settle(1)
+        levels.append(server.memory_mb())
+        say(f"tab {tab + 1}: {levels[-1]:.1f} MB")
+    settled, last = levels[2], levels[-1]  # the first three load code
+    growth = 100 * (last - settled) / settled
+    return [verdict(f"memory over {TABS} tabs", growth, "%", f"{settled:.0f} to {last:.0f} MB of the server", 2.0)]
+
+
+def crowd(browser: Any, server: Server) -> list[dict[str, Any]]:
+    """Keys on one tab while many others wait for a worker, and the time until one of them opens."""
+    first = opened(browser, server)
+    first.evaluate(WATCH)
+    alone = float(np.median(delays_ms(first, PRESSES)))
+    others = [browser.new_page(viewport={"width": SIZES[0][0], "height": SIZES[0][1]}) for _ in range(CROWD - 1)]
+    during: list[float] = []
+    for page in others:
+        page.goto(server.url, wait_until="commit")
+        during += delays_ms(first, 2).tolist()
+    for page in others[: WORKERS_LIMIT - 1]:
+        shown(page)
+    for page in others[WORKERS_LIMIT - 1 :]:
+        page.get_by_text("workers in use").wait_for(timeout=1e3 * WARM_S)
+    say(f"{CROWD} tabs on {WORKERS_LIMIT} workers")
+    during += delays_ms(first, PRESSES).tolist()
+    before = server.workers()
+    others[0].close()
+    while before[1].is_running():  # that of the closed tab
+        time.sleep(0.02)
+    begin = time.monotonic()
+    shown(others[WORKERS_LIMIT - 1])
+    waited_s = time.monotonic() - begin
+    for page in (first, *others[1:]):
+        page.close()
+    worst = float(np.max(during)) - alone
+    return [
+        verdict("a waiting tab opened after a worker is free", waited_s, "s", f"{CROWD} tabs", 5.0),
+        verdict("greatest delay of a key while they open", worst, "ms", f"beyond {alone:.0f} ms alone", 200.0),
+    ]

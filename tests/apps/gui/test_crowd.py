@@ -1,0 +1,99 @@
+"""More tabs than workers: those who are too many wait in their order, and keep nobody else waiting."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+from labpage import CHROMIUM, NARROW, QUICK_MS, Server, changed, come, opened, pictured, source, status
+
+pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
+
+from skysim.apps.gui.worker import session
+
+pytest_plugins = ["labpage"]
+TABS, WORKERS = 20, 2
+
+
+class Hand:
+    """In place of a worker process."""
+
+    alive: ClassVar[set[Any]] = set()
+
+    def __init__(self) -> None:
+        self.alive.add(self)
+        self.process = self
+
+    def is_alive(self) -> bool:
+        return True
+
+    def close(self) -> None:
+        self.alive.discard(self)
+
+
+def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While twenty tabs wait the event loop goes on: it counts between any two of their looks."""
+    monkeypatch.setattr(session, "Session", Hand)
+    monkeypatch.setattr(session, "QUEUE_S", 0.001)
+    monkeypatch.setattr(Hand, "alive", set())
+    spare, served, told = session.SpareWorker("scene", WORKERS), list[tuple[int, Hand | None]](), dict[int, str]()
+    gone = set[int]()
+
+    async def tab(number: int) -> None:
+        served.append((number, await spare.wait(lambda: number not in gone, lambda text: told.update({number: text}))))
+
+    async def story() -> None:
+        tabs = [asyncio.create_task(tab(number)) for number in range(TABS)]
+        for _ in range(50):
+            await asyncio.sleep(0)
+        assert [number for number, _ in served] == [0, 1]
+        await asyncio.sleep(0.02)
+        assert told[2] == "2 of 2 workers in use."
+        assert told[TABS - 1] == f"2 of 2 workers in use; {TABS - 3} before this page."
+        gone.add(2)  # it is closed while it waits
+        await tabs[2]
+        assert served[-1] == (2, None)
+        for next_one in range(3, TABS):
+            hand = served[-2 if next_one == 3 else -1][1]
+            assert hand is not None
+            hand.close()
+            await tabs[next_one]
+            assert served[-1][0] == next_one
+            assert len(Hand.alive) == WORKERS
+        assert spare.queue == []
+
+    asyncio.run(asyncio.wait_for(story(), 60))
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+def test_twenty_tabs_on_two_workers(browser: Any, tmp_path: Path) -> None:
+    with Server(tmp_path, "--workers", str(WORKERS)) as server, opened(browser, server.login, NARROW) as first:
+        with opened(browser, server.login, NARROW) as second:
+            waiting = []
+            for _ in range(TABS - WORKERS):
+                waiting.append(browser.new_page(viewport=NARROW))
+                waiting[-1].goto(server.login, wait_until="commit")
+                frame = source(first)
+                first.keyboard.press("ArrowRight")
+                changed(first, frame)  # keys of others go on
+            for page in waiting:
+                page.set_default_timeout(QUICK_MS)
+                page.get_by_text("This page opens when another one has been closed.").wait_for()
+            assert come(lambda: sorted(map(place, waiting)) == list(range(TABS - WORKERS)))
+            pictured(waiting[-1], "test_twenty_tabs_on_two_workers")
+            status(second, "solved")
+            waiting.sort(key=place)
+        status(waiting[0], "solved")  # the second is closed
+        assert come(lambda: list(map(place, waiting[1:])) == list(range(TABS - WORKERS - 1)))
+        for page in reversed(waiting):
+            page.close()
+
+
+def place(page: Any) -> int:
+    """How many wait before a page; -1 if it does not wait."""
+    found = re.search(r"2 of 2 workers in use(?:; (\d+) before this page)?\.", page.locator(".lab-wait").inner_text())
+    return int(found[1] or 0) if found else -1
