@@ -12,18 +12,23 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
+import yaml
 
 from benchmarks import coordination
 from benchmarks.studies import CENTROIDS, run_study
 from benchmarks.timing import verdict, versus
 from skysim.camera.detector.added_charge import AddedCharge
+from skysim.core.errors import InputError
 from skysim.experiments.dataset import plan, run, shards
 from skysim.experiments.dataset.labels import LabelledFrame, label_frame
+from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study.execution import engines, trials
+from skysim.experiments.study.plan import Plan
 from skysim.scene import loader
 from skysim.simulation.run import prepare, simulate_motion
 
@@ -41,7 +46,16 @@ DASK_S, DASK_CHUNKS = 1.0, 12
 
 def measure() -> list[dict[str, Any]]:
     """All results."""
-    return [*frames(), *parts(), writing(), *centroids(), *closed_loop(), dask_overhead(), *coordination.measure()]
+    return [
+        *frames(),
+        *parts(),
+        writing(),
+        *centroids(),
+        *closed_loop(),
+        *worker_cost(),
+        dask_overhead(),
+        *coordination.measure(),
+    ]
 
 
 def figure(name: str, value: float, unit: str, what: str) -> dict[str, Any]:
@@ -170,6 +184,51 @@ def closed_loop() -> list[dict[str, Any]]:
     speed = flown_s / (row["value"] / 1e3)
     limit = f"mj_step alone: {flown_s / (row['peer_value'] / 1e3):.0f}x"
     return [row, verdict("closed loop on wheels", speed, "x real time", limit, 100.0, True)]
+
+
+def worker_cost() -> list[dict[str, Any]]:
+    """Start of a worker after the first, and its memory with as many setups as it keeps, of the worst shipped scene."""
+    started_s, held_mb = {}, {}
+    for name in loader.list_scenes():
+        try:
+            study = four_exposures(name)
+        except InputError:  # its lights are not solved frame by frame
+            continue
+        engines.start_pool(1, trials.TrialJob(study.spec)).shutdown()
+        begin_s = time.perf_counter()
+        with engines.start_pool(1, trials.TrialJob(study.spec)) as pool:
+            started_s[name] = time.perf_counter() - begin_s
+            for n, point in enumerate(study.points):
+                pool.submit(engines.run_chunk, (trials.Segment(n, point.settings, n, range(1)),)).result()
+            held_mb[name] = private_mb(next(iter(pool._processes)))
+    slowest, largest = max(started_s, key=started_s.__getitem__), max(held_mb, key=held_mb.__getitem__)
+    return [
+        verdict("start of a worker after the first", started_s[slowest], "s", slowest, 1.0),
+        verdict("memory of a worker with four setups", held_mb[largest], "MB", largest, 350.0),
+    ]
+
+
+def four_exposures(name: str) -> Plan:
+    """A study of a scene with four exposure times, each of which is a setup of its own."""
+    scene = loader.load(name)
+    kind = "centroids" if scene.tracker.decoder else "frames"
+    times = [f"{1e3 * scene.exposure.time_s * share:.6g} ms" for share in (1.0, 0.99, 0.98, 0.97)]
+    tree = {
+        "scene": name,
+        "seed": 1,
+        "trial": {"kind": kind},
+        "factors": {"time": {"key": "exposure.time", "values": times}},
+    }
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml") as file:
+        yaml.safe_dump(tree | {"schema": 1, "title": "memory", "replicates": 1, "responses": ["identified"]}, file)
+        file.flush()
+        return study_loader.load(Path(file.name))
+
+
+def private_mb(pid: int) -> float:
+    """Memory that a process shares with no other, which is what a further worker takes."""
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    return sum(int(line.split()[1]) for line in lines if line.startswith("Private_")) / 1024
 
 
 def dask_overhead() -> dict[str, Any]:

@@ -34,6 +34,10 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, on_sphere, on_surface, project
 from estimator.attitude.solvers import quest
 from estimator.core.arrays import Floats
+from estimator.core.jit import jit
+from estimator.core.least_squares import cholesky_solve, normal_equations
+from estimator.core.least_squares import step as least_squares_step
+from estimator.core.vectors import quaternion_xyzw, rotate, rotate_in_place, row
 
 __all__ = [
     "SOLVERS",
@@ -50,6 +54,7 @@ __all__ = [
 # Largest number of iterations of tappe and ray_on_surface, and the rotation below which they stop.
 MAX_UPDATES = 20
 CONVERGED_RAD = 1e-13
+CONVERGED_STEP_RAD = 1e-14  # of rotation_only, which converges in a few steps
 
 
 def rotation_only(
@@ -87,30 +92,72 @@ def _fit_rotation(
     rays_cam: Floats, sigma_rad: Floats, position_m: Floats, lever: Lever, body_from_lab: Rotation, with_focal: bool
 ) -> tuple[Rotation, float, Floats]:
     """body_from_lab, the focal ratio (1 unless it is fitted), and the covariance of both in camera axes."""
-    measured = rays_cam[:, :2] / rays_cam[:, 2:]
-    weight, ratio = np.repeat(1 / sigma_rad, 2), 1.0
-    cam_from_body = lever.cam_from_body
+    R_cam_from_lab = (lever.cam_from_body * body_from_lab).as_matrix()
+    lever_cam_m = lever.cam_from_body.apply(lever.camera_body_m)
+    ratio, step_rad, covariance_cam = _fitted_rotation(
+        rays_cam, sigma_rad, np.ascontiguousarray(position_m), lever_cam_m, R_cam_from_lab, with_focal
+    )
+    if np.isnan(step_rad):
+        raise ValueError(
+            f"{len(rays_cam)} rays do not determine a rotation; two LEDs in different directions are needed"
+        )
+    if not step_rad < 1e-9:
+        raise ValueError(f"rotation_only: not converged, last step {step_rad:.1e} rad")
+    cam_from_lab = Rotation.from_quat(quaternion_xyzw(R_cam_from_lab))
+    return lever.cam_from_body.inv() * cam_from_lab, ratio, covariance_cam
+
+
+@jit
+def _fitted_rotation(
+    rays_cam: Floats, sigma_rad: Floats, position_m: Floats, lever_cam_m: Floats, R: Floats, with_focal: bool
+) -> tuple[float, float, Floats]:
+    """The focal ratio, the length of the last step, and the covariance of rotation and logarithm of the ratio.
+
+    R : (3, 3) cam_from_lab, updated in place
+    The step's length is NaN if the rays do not determine the unknowns: the LEDs lie in one direction from the bearing,
+    about which any rotation fits.
+    """
+    unknowns = 4 if with_focal else 3
+    normal, rows = np.empty((unknowns + 1, unknowns + 1)), np.empty((unknowns + 1, 2 * len(rays_cam)))
+    weight, step, covariance = np.repeat(1 / sigma_rad**2, 2), np.empty(unknowns), np.empty((unknowns, unknowns))
+    log_ratio, length = 0.0, np.nan
     for _ in range(30):
-        b = cam_from_body.apply(body_from_lab.apply(position_m))
-        q = b - cam_from_body.apply(lever.camera_body_m)
-        tangent = ratio * q[:, :2] / q[:, 2:]
-        jacobian = ratio * tangent_jacobian(b, q) * weight[:, None]
+        _residual_rows(rays_cam, position_m, lever_cam_m, R, np.exp(log_ratio), rows)
+        normal_equations(rows, weight, rows.shape[1], normal)
+        if np.isnan(least_squares_step(normal, step)):
+            return 1.0, np.nan, covariance
+        rotate_in_place(step[:3], R)
         if with_focal:
-            jacobian = np.column_stack([jacobian, tangent.ravel() * weight])
-        residual = (measured - tangent).ravel() * weight
-        step, _, rank, _ = np.linalg.lstsq(jacobian, residual, rcond=None)
-        # Rank 2: the LEDs lie in one direction from the bearing, about which any rotation fits.
-        if rank < jacobian.shape[1]:
-            raise ValueError(
-                f"{len(rays_cam)} rays do not determine a rotation; two LEDs in different directions are needed"
-            )
-        body_from_lab = cam_from_body.inv() * Rotation.from_rotvec(step[:3]) * cam_from_body * body_from_lab
-        ratio *= float(np.exp(np.clip(step[3], -1, 1))) if with_focal else 1.0
-        if np.linalg.norm(step) < 1e-15:
+            log_ratio += min(max(step[3], -1.0), 1.0)
+        length = np.sqrt(np.sum(step**2))
+        if length < CONVERGED_STEP_RAD:
             break
-    if not np.linalg.norm(step) < 1e-9:
-        raise ValueError(f"rotation_only: not converged, last step {np.linalg.norm(step):.1e} rad")
-    return body_from_lab, ratio, np.asarray(np.linalg.inv(jacobian.T @ jacobian))
+    factor = normal[:unknowns, :unknowns]
+    for i in range(unknowns):
+        for j in range(unknowns):
+            covariance[i, j] = 1.0 if i == j else 0.0
+        cholesky_solve(factor, covariance[i])
+    return np.exp(log_ratio), length, covariance
+
+
+@jit
+def _residual_rows(
+    rays_cam: Floats, position_m: Floats, lever_cam_m: Floats, R: Floats, ratio: float, rows: Floats
+) -> None:
+    """Fill rows (4 or 5, 2 N) with the derivatives of the tangents by rotation (and log ratio), then the residuals."""
+    last = len(rows) - 1
+    for n in range(len(rays_cam)):
+        bx, by, bz = rotate(R, row(position_m, n))
+        qx, qy, qz = bx - lever_cam_m[0], by - lever_cam_m[1], bz - lever_cam_m[2]
+        x, y, scale = ratio * qx / qz, ratio * qy / qz, ratio / qz
+        # The derivative of a tangent by w is b x d, with d its derivative by q.
+        rows[0, 2 * n], rows[0, 2 * n + 1] = -by * x / qz, -by * y / qz - bz * scale
+        rows[1, 2 * n], rows[1, 2 * n + 1] = bz * scale + bx * x / qz, bx * y / qz
+        rows[2, 2 * n], rows[2, 2 * n + 1] = -by * scale, bx * scale
+        if last == 4:
+            rows[3, 2 * n], rows[3, 2 * n + 1] = x, y
+        rows[last, 2 * n] = rays_cam[n, 0] / rays_cam[n, 2] - x
+        rows[last, 2 * n + 1] = rays_cam[n, 1] / rays_cam[n, 2] - y
 
 
 def tangent_gradients(q: Floats) -> Floats:

@@ -40,7 +40,7 @@ MIN_TREE_STARS = 20_000  # below, a pass over all takes less than 50 us
 MAX_TREE_SHARE = 0.1  # of the sky, up to which a search tree finds a field's stars sooner than a pass over all
 MAX_PATCH_PIXELS = 1 << 20  # pixels of patches held in memory at once, or as many as the frame has
 
-OcclusionTest = Callable[[Sources], NDArray[np.bool_]]  # (N,) which of N sources are occluded
+OcclusionTest = Callable[[Floats], NDArray[np.bool_]]  # (N,) which of N sources at `Sources.place` are occluded
 
 
 class Window(NamedTuple):
@@ -111,7 +111,7 @@ def render(
     few_poses = Poses(*(samples[:: len(t_s) // 8] for samples in all_poses))
     candidates = sources.take(in_view(sources, optics, few_poses)) if sources.motion is None else sources
     if occluded:
-        candidates = candidates.take(~occluded(candidates))
+        candidates = candidates.take(~occluded(candidates.place))
     emitter, middle = emitter or Emitter(), len(t_s) // 2
     tracks, distance_m, cos_in = image_tracks(candidates, optics, all_poses, t_s, emitter)
     mid_px = tracks.xy_px[middle]
@@ -191,18 +191,25 @@ def image_tracks(
 ) -> tuple[Tracks, Floats, Floats]:
     """The tracks of N sources, their mean distances (N,) in m (1 for stars) and mean field-angle cosines (N,)."""
     xy, distance_m, cos_out, cos_in = project(sources, optics, poses, t_s - t_s[len(t_s) // 2])
-    throughput = optics.throughput(cos_in)
-    rate = np.where(
-        sources.place[:, 3] > 0,
-        irradiance_e_s_m2(sources.strength, emitter, cos_out, throughput, distance_m),
-        sources.strength * throughput,
-    )
+    rate_e_s = rates_e_s(sources, optics, emitter, distance_m, cos_out, cos_in)
     pulse_s = np.column_stack([sources.period_s, sources.start_s, sources.on_s])
-    tracks = Tracks(float(t_s[0]), float(t_s[1] - t_s[0]), xy, rate * optics.collecting_m2, pulse_s)
+    tracks = Tracks(float(t_s[0]), float(t_s[1] - t_s[0]), xy, rate_e_s, pulse_s)
     return tracks, distance_m.mean(axis=0), cos_in.mean(axis=0)
 
 
+def rates_e_s(
+    sources: Sources, optics: Optics, emitter: Emitter, distance_m: Floats, cos_out: Floats, cos_in: Floats
+) -> Floats:
+    """(..., N) photo-electrons a second of N lit sources, from what `project` returns."""
+    throughput = optics.throughput(cos_in)
+    rate, is_led = sources.strength * throughput, sources.place[:, 3] > 0
+    if is_led.any():
+        rate = np.where(is_led, irradiance_e_s_m2(sources.strength, emitter, cos_out, throughput, distance_m), rate)
+    return rate * optics.collecting_m2
+
+
 NOW = np.zeros(1)
+NO_MOTION = np.empty((0, 2, 3))
 
 
 def project(
@@ -212,16 +219,50 @@ def project(
 
     Returns (K, N, 2) pixels, (K, N) distances in m (1 for stars), (K, N) cosines at the emitter and at the aperture.
     """
-    offset = sources.places_at(after_s) - sources.place[None, :, 3:] * poses.camera_m[:, None, :]
-    distance = np.sqrt(np.einsum("knj,knj->kn", offset, offset))
-    offset /= distance[:, :, None]
-    cos_out = -np.einsum("knj,nj->kn", offset, sources.normal)
-    direction_cam = offset @ poses.cam_from_lab.transpose(0, 2, 1)
+    motion = NO_MOTION if sources.motion is None else sources.motion
+    cam_from_lab, camera_m = map(np.ascontiguousarray, poses)
+    direction_cam, distance, cos_out = _directions(
+        sources.place, motion, after_s, sources.normal, cam_from_lab, camera_m
+    )
     xy_px = optics.project(direction_cam)
     if sources.chromatic is not None:
         camera = optics.camera
         xy_px += (xy_px - camera.center_px) * (sources.chromatic[:, 2:3] / camera.corner_px)
     return xy_px, distance, cos_out, direction_cam[:, :, 2]
+
+
+@jit
+def _directions(
+    place: Floats, motion: Floats, after_s: Floats, normal: Floats, cam_from_lab: Floats, camera_m: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """(K, N, 3) unit directions in camera axes, (K, N) distances in m and cosines at the emitters.
+
+    motion : as of `Sources`, or of length 0 where nothing moves;  after_s : (K,), or (1,) for all poses
+    """
+    poses, count, moves = len(cam_from_lab), len(place), len(motion) > 0
+    direction, distance, cosine = np.empty((poses, count, 3)), np.empty((poses, count)), np.empty((poses, count))
+    offset = np.empty(3)
+    for k in range(poses):
+        t = after_s[min(k, len(after_s) - 1)]
+        for n in range(count):
+            square = 0.0
+            for i in range(3):
+                offset[i] = place[n, i] - place[n, 3] * camera_m[k, i]
+                if moves:
+                    offset[i] += t * (motion[n, 0, i] + t / 2 * motion[n, 1, i])
+                square += offset[i] * offset[i]
+            distance[k, n] = math.sqrt(square)
+            outward = 0.0
+            for i in range(3):
+                offset[i] /= distance[k, n]
+                outward += offset[i] * normal[n, i]
+            cosine[k, n] = -outward
+            for i in range(3):
+                turned = 0.0
+                for j in range(3):
+                    turned += cam_from_lab[k, i, j] * offset[j]
+                direction[k, n, i] = turned
+    return direction, distance, cosine
 
 
 def led_images(sources: Sources, optics: Optics, pose: Poses, emitter: Emitter) -> DiskImages | None:
@@ -240,17 +281,16 @@ def led_images(sources: Sources, optics: Optics, pose: Poses, emitter: Emitter) 
     return full
 
 
-def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]:
+def in_view(sources: Sources, optics: Optics, poses: Poses, reach: float = 0.25) -> NDArray[np.int64]:
     """Rows of the sources within a cone about the boresight at any of these poses.
 
-    The cone's half-angle is the field's circle, a quarter more for images that reach in from outside, and half of
+    The cone's half-angle is the field's circle, `reach` of it more for images that reach in from outside, and half of
     the largest rotation between two poses for sources that cross the field between them. Stars in a small part of the
     sky are looked up by direction, so the time is that of the stars in the field and not of those in the catalog.
     """
     boresight = np.ascontiguousarray(poses.cam_from_lab[:, 2])
-    rotation_rad = np.arccos(np.clip(np.sum(boresight[1:] * boresight[:-1], axis=1), -1, 1)).max(initial=0.0)
-    half_rad = 1.25 * optics.field_rad + 0.02 + rotation_rad / 2
-    span_rad = float(np.arccos(np.clip(boresight @ boresight[0], -1, 1)).max())
+    rotation_rad, span_rad = _rotations_rad(boresight)
+    half_rad = (1 + reach) * optics.field_rad + 0.02 + rotation_rad / 2
     cos_limit, cos_any = (math.cos(min(angle_rad, math.pi)) for angle_rad in (half_rad, half_rad + span_rad))
     place, camera_m = sources.place, np.ascontiguousarray(poses.camera_m)
     by_tree = len(sources) >= MIN_TREE_STARS and (1 - cos_any) / 2 <= MAX_TREE_SHARE
@@ -258,6 +298,20 @@ def in_view(sources: Sources, optics: Optics, poses: Poses) -> NDArray[np.int64]
         near = sources.within(boresight[0], half_rad + span_rad)
         return near[_in_cone(place[near], boresight, camera_m, cos_limit, cos_any)]
     return np.flatnonzero(_in_cone(place, boresight, camera_m, cos_limit, cos_any))
+
+
+@jit
+def _rotations_rad(boresight: Floats) -> tuple[float, float]:
+    """The greatest angles of K boresights between one and the next, and between any and the first."""
+    next_rad, first_rad = 0.0, 0.0
+    for k in range(1, len(boresight)):
+        to_last, to_first = 0.0, 0.0
+        for i in range(3):
+            to_last += boresight[k, i] * boresight[k - 1, i]
+            to_first += boresight[k, i] * boresight[0, i]
+        next_rad = max(next_rad, math.acos(min(max(to_last, -1.0), 1.0)))
+        first_rad = max(first_rad, math.acos(min(max(to_first, -1.0), 1.0)))
+    return next_rad, first_rad
 
 
 @jit

@@ -60,6 +60,17 @@ def apply(a_from_b: Floats, v_b: Floats) -> Floats:
 
 
 @jit
+def to_matrix(a_from_b: Floats) -> Floats:
+    """(3, 3) a_from_b."""
+    w, x, y, z = a_from_b[0], a_from_b[1], a_from_b[2], a_from_b[3]
+    matrix = np.empty((3, 3))
+    matrix[0, 0], matrix[0, 1], matrix[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    matrix[1, 0], matrix[1, 1], matrix[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    matrix[2, 0], matrix[2, 1], matrix[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return matrix
+
+
+@jit
 def from_rotvec(rotvec_rad: Floats) -> Floats:
     """The rotation by |turn_rad| about turn_rad (3,): (cos(a / 2), sin(a / 2) axis)."""
     angle = math.sqrt(rotvec_rad[0] ** 2 + rotvec_rad[1] ** 2 + rotvec_rad[2] ** 2)

@@ -170,16 +170,9 @@ class Sources:
 
     def take(self, which: NDArray[Any]) -> Sources:
         """The chosen sources, by mask or index."""
+        rows = np.flatnonzero(which) if which.dtype == bool else which
         columns = (getattr(self, name) for name in Sources.__slots__)
-        return Sources(*(None if column is None else column[which] for column in columns))  # type: ignore[arg-type]
-
-    def places_at(self, after_s: Floats) -> Floats:
-        """(K, N, 3) places at K times after mid-exposure, (1, N, 3) where nothing moves; directions of any length."""
-        place = self.place[None, :, :3]
-        if self.motion is None:
-            return place
-        t = after_s[:, None, None]
-        return np.asarray(place + t * (self.motion[:, 0] + t / 2 * self.motion[:, 1]))
+        return Sources(*(None if column is None else column.take(rows, axis=0) for column in columns))  # type: ignore[arg-type]
 
 
 class StarSources(Sources):

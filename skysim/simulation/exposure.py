@@ -280,9 +280,9 @@ def occlusion_test(testbed: Testbed, lab_from_body: Rotation, sky: Sky | None) -
     if sky is None:
         return by_parts
 
-    def hidden(sources: Sources) -> NDArray[np.bool_]:
-        below = sky.below_horizon(sources.place[:, :3])
-        return below | by_parts(sources) if by_parts else below
+    def hidden(place: Floats) -> NDArray[np.bool_]:
+        below = sky.below_horizon(place[:, :3])
+        return below | by_parts(place) if by_parts else below
 
     return hidden
 
@@ -295,8 +295,8 @@ def occluded_ids(
         return np.zeros(0, np.int64)
     cam_from_lab = (testbed.mount.cam_from_body * lab_from_body.inv()).as_matrix()
     pose = Poses(cam_from_lab[None], lab_from_body.apply(testbed.mount.camera_body_m)[None])
-    visible = light.take(in_view(light, testbed.optics, pose))
+    visible = light.take(in_view(light, testbed.optics, pose, reach=0.0))
     xy_px = project(visible, testbed.optics, pose)[0][0]
     size_px = np.array([testbed.scene.camera.width_px, testbed.scene.camera.height_px])
     on_chip = ((xy_px > -0.5) & (xy_px < size_px - 0.5)).all(axis=1)
-    return visible.id[on_chip & occludes(visible)]
+    return visible.id[on_chip & occludes(visible.place)]

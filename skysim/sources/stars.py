@@ -128,7 +128,7 @@ def steady_points(
     zeros, ones = np.zeros(count), np.ones(count)
     return StarSources(
         id=ids,
-        place=np.column_stack([direction, zeros]),
+        place=np.ascontiguousarray(np.column_stack([direction, zeros])),  # rows are taken from it
         normal=np.zeros((count, 3)),
         radius_m=zeros,
         strength=flux_e_s_m2,

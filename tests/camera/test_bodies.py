@@ -160,10 +160,10 @@ def test_a_star_behind_the_moon_is_hidden() -> None:
     stars = points_of(moon, np.array([[0.0, 0.0], [0.7, 0.7], [0.0, 1.01]]))
     hidden = drawing.behind([moon], None)
     assert hidden is not None
-    assert hidden(stars).tolist() == [True, True, False]
-    by_both = drawing.behind([moon], lambda sources: np.array([False, False, True]))
+    assert hidden(stars.place).tolist() == [True, True, False]
+    by_both = drawing.behind([moon], lambda place: np.array([False, False, True]))
     assert by_both is not None
-    assert by_both(stars).all()
+    assert by_both(stars.place).all()
     assert drawing.behind([], None) is None
 
 

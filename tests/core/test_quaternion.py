@@ -32,6 +32,7 @@ def test_products_and_turned_vectors_are_scipys(one: list[float], two: list[floa
     assert (Rotation.from_quat(product, scalar_first=True).inv() * (a * b.inv())).magnitude() < 3e-15
     vector = np.array([0.2, -3.0, 1.1])
     np.testing.assert_allclose(quaternion.apply(wxyz(one), vector), a.apply(vector), rtol=0, atol=2e-15)
+    np.testing.assert_allclose(quaternion.to_matrix(wxyz(one)), a.as_matrix(), rtol=0, atol=1e-15)
 
 
 def test_cross_is_numpys() -> None:

@@ -89,7 +89,9 @@ def test_a_mast_on_the_vehicle_hides_just_the_leds_behind_it(start: str, tmp_pat
     assert len(everything & gone) >= 4
     assert len(seen) >= 10
     assert testbed.obstacles is not None
-    np.testing.assert_array_equal(multibody.occluded(testbed.obstacles, truth.lab_from_body, testbed.sources), behind)
+    np.testing.assert_array_equal(
+        multibody.occluded(testbed.obstacles, truth.lab_from_body, testbed.sources.place), behind
+    )
 
 
 @pytest.mark.slow
@@ -100,7 +102,7 @@ def test_a_beam_of_the_lab_stays_while_the_vehicle_turns(tmp_path: Path) -> None
         testbed = furnished(tmp_path, beam, motion__start=start)
         lab_from_body = testbed.trajectory.lab_from_body[0]
         assert testbed.obstacles is not None
-        found = multibody.occluded(testbed.obstacles, lab_from_body, testbed.sources)
+        found = multibody.occluded(testbed.obstacles, lab_from_body, testbed.sources.place)
         camera_m = lab_from_body.apply(testbed.mount.camera_body_m)
         behind = crosses(camera_m, testbed.sources.place[:, :3], MAST_M)
         np.testing.assert_array_equal(found, behind)
@@ -163,7 +165,7 @@ def test_stars_are_hidden_by_the_body_that_they_are_behind() -> None:
     along = rays @ (center / axes)
     root = along**2 - np.sum(rays**2, axis=1) * (np.sum((center / axes) ** 2) - 1)
     behind = (root >= 0) & (along > 0)
-    np.testing.assert_array_equal(multibody.occluded(testbed.obstacles, turn, testbed.sources), behind)
+    np.testing.assert_array_equal(multibody.occluded(testbed.obstacles, turn, testbed.sources.place), behind)
     assert 100 < behind.sum() < len(behind) / 4
 
 
@@ -188,7 +190,7 @@ def test_a_box_hides_what_is_beyond_its_face_and_within_its_edges() -> None:
     led_z_m = 0.2 + np.array([0.5, 1.9 - 1e-6, 1.9 + 1e-6, 3.0, 1e3, -1.9, -3.0])
     leds = [[0.1, 0.0, z, 1.0] for z in led_z_m]
     np.testing.assert_array_equal(
-        multibody.occluded(obstacles, Rotation.identity(), sources_at(leds)),
+        multibody.occluded(obstacles, Rotation.identity(), sources_at(leds).place),
         [False, False, True, True, True, False, False],
     )
     edge = 0.1 / 1.9  # tangent of the angle to the edge of the face
@@ -196,7 +198,7 @@ def test_a_box_hides_what_is_beyond_its_face_and_within_its_edges() -> None:
         beside = [[0.1 + 3 * tangent, 0.0, 3.2, 1.0]]
         star = np.array([tangent, 0.0, 1.0]) / np.hypot(tangent, 1)
         stars = [[*star, 0.0], [*-star, 0.0]]
-        found = multibody.occluded(obstacles, Rotation.identity(), sources_at(beside + stars))
+        found = multibody.occluded(obstacles, Rotation.identity(), sources_at(beside + stars).place)
         np.testing.assert_array_equal(found, [hidden, hidden, False])
 
 
@@ -220,7 +222,7 @@ def test_no_source_is_no_question() -> None:
     testbed = build_testbed(loader.load("afit_simsat"))
     assert testbed.obstacles is not None
     no_sources = testbed.sources.take(np.zeros(0, np.int64))
-    assert multibody.occluded(testbed.obstacles, Rotation.identity(), no_sources).shape == (0,)
+    assert multibody.occluded(testbed.obstacles, Rotation.identity(), no_sources.place).shape == (0,)
 
 
 # --- the dome's wall ----------------------------------------------------------------------------------------
@@ -281,14 +283,14 @@ def test_a_wall_hides_what_its_scene_says(tmp_path: Path) -> None:
     testbed = furnished_drum(tmp_path, beside, drum, layout)
     assert testbed.obstacles is not None
     # At the near wall, 1/9 of the way over, the sights are 0.36 m and 0.58 m high; the wall begins at 0.6 m.
-    level = multibody.occluded(testbed.obstacles, Rotation.identity(), testbed.sources)
+    level = multibody.occluded(testbed.obstacles, Rotation.identity(), testbed.sources.place)
     np.testing.assert_array_equal(level, [False, False])
     # Farther out, at 1 m, half of the way: 0.55 m and 1.55 m.
     far = SIMSAT.replace('name="star_camera" pos="0 0 0.081"', 'name="star_camera" pos="1.2 0 0.0"')
     testbed = furnished_drum(tmp_path, far, drum, layout)
     assert testbed.obstacles is not None
     np.testing.assert_array_equal(
-        multibody.occluded(testbed.obstacles, Rotation.identity(), testbed.sources), [False, True]
+        multibody.occluded(testbed.obstacles, Rotation.identity(), testbed.sources.place), [False, True]
     )
 
 

@@ -118,9 +118,9 @@ def whole(
 def behind(bodies: Sequence[BodyLight], occluded: OcclusionTest | None) -> OcclusionTest | None:
     """The test for sources that the discs of these bodies or anything else hide; None if nothing can."""
 
-    def hidden(sources: Sources) -> NDArray[np.bool_]:
-        by_discs = [body.hides(sources.place[:, :3]) for body in bodies]
-        return np.any([*by_discs, *([occluded(sources)] if occluded else [])], axis=0)
+    def hidden(place: Floats) -> NDArray[np.bool_]:
+        by_discs = [body.hides(place[:, :3]) for body in bodies]
+        return np.any([*by_discs, *([occluded(place)] if occluded else [])], axis=0)
 
     return hidden if bodies else occluded
 
@@ -133,7 +133,7 @@ def hidden_points(body: BodyLight, nearer: Sequence[BodyLight], occluded: Occlus
     overlapping = [other for other in nearer if body.overlaps(other)]
     axis = (np.arange(COARSE) + 0.5) * (2 / COARSE) - 1
     coarse = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    by_vehicle = occluded(points_of(body, coarse)) if occluded else np.zeros(len(coarse), bool)
+    by_vehicle = occluded(points_of(body, coarse).place) if occluded else np.zeros(len(coarse), bool)
 
     def hidden(xy: Floats) -> NDArray[np.bool_]:
         column, row = np.clip(((xy + 1) * (COARSE / 2)).astype(int), 0, COARSE - 1).T

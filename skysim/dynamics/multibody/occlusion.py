@@ -6,6 +6,7 @@ the start.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core import quaternion
+from skysim.core.jit import jit
 from skysim.core.paths import SCENES
-from skysim.core.types import Floats, Mount, Sources
+from skysim.core.types import Floats, Mount
 from skysim.dynamics.multibody.integrator import member_values
 from skysim.dynamics.multibody.joints import lock_unused
 from skysim.dynamics.multibody.mass import CAMERA
@@ -84,20 +86,38 @@ def camera_housing(model: Any, data: Any, camera_body_m: Floats, is_main: bool) 
     return np.asarray(is_housing)
 
 
-def occluded(obstacles: Obstacles, lab_from_body: Rotation, sources: Sources) -> NDArray[np.bool_]:
-    """(N,) whether an obstacle is on the line from the pupil to each source, LED or star, at that attitude."""
+def occluded(obstacles: Obstacles, lab_from_body: Rotation, place: Floats) -> NDArray[np.bool_]:
+    """(N,) whether an obstacle is on the line from the pupil to each LED or star at that attitude.
+
+    place : (N, 4), as in `Sources`
+    """
     lab_from_body_wxyz = quaternion.from_rotation(lab_from_body)
     camera_m = quaternion.apply(lab_from_body_wxyz, obstacles.camera_body_m)
-    position_m, near = sources.place[:, :3], sources.place[:, 3] > 0
-    rays = position_m - sources.place[:, 3:] * camera_m
-    far_m = np.linalg.norm(rays, axis=1)
+    rays, end_m = _rays(np.ascontiguousarray(place), camera_m)
     obstacles.data.mocap_quat[obstacles.model.body("bus").mocapid[0]] = lab_from_body_wxyz
     mujoco.mj_kinematics(obstacles.model, obstacles.data)
-    free_m = free_distance_m(obstacles.model, obstacles.data, camera_m, rays / far_m[:, None])
-    blocked = free_m < np.where(near, far_m, np.inf)
+    free_m = free_distance_m(obstacles.model, obstacles.data, camera_m, rays)
+    blocked = free_m < end_m
     if obstacles.wall is not None:
-        blocked[near] |= behind_wall(obstacles.wall, camera_m, position_m[near])
+        near = place[:, 3] > 0
+        blocked[near] |= behind_wall(obstacles.wall, camera_m, place[near, :3])
     return np.asarray(blocked)
+
+
+@jit
+def _rays(place: Floats, camera_m: Floats) -> tuple[Floats, Floats]:
+    """(N, 3) unit vectors from the pupil to sources, and (N,) where these rays end: in m, infinity for stars."""
+    rays, end_m = np.empty((len(place), 3)), np.empty(len(place))
+    for n in range(len(place)):
+        square = 0.0
+        for i in range(3):
+            rays[n, i] = place[n, i] - place[n, 3] * camera_m[i]
+            square += rays[n, i] * rays[n, i]
+        length = math.sqrt(square)
+        end_m[n] = length if place[n, 3] > 0 else math.inf
+        for i in range(3):
+            rays[n, i] /= length
+    return rays, end_m
 
 
 def free_distance_m(model: Any, data: Any, from_m: Floats, rays: Floats) -> Floats:

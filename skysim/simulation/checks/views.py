@@ -165,7 +165,7 @@ def view(
     on_chip = ((xy_px > -0.5) & (xy_px < size - 0.5)).all(axis=1)
     if testbed.obstacles is not None:
         seen = np.flatnonzero(on_chip)
-        on_chip[seen[multibody.occluded(testbed.obstacles, lab_from_body, lights.take(near[seen]))]] = False
+        on_chip[seen[multibody.occluded(testbed.obstacles, lab_from_body, lights.place[near[seen]])]] = False
     row = near[on_chip]
     chosen, is_led = lights.take(row), lights.place[row, 3] > 0
     xy_px, distance_m, cos_out, cos_in = (one[on_chip] for one in (xy_px, distance_m, cos_out, cos_in))

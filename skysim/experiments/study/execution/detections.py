@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Centroids
 from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.pipeline import Report
-from skysim.camera.render import Poses, image_tracks, in_view
+from skysim.camera.render import Poses, in_view, project, rates_e_s
 from skysim.core.types import Floats
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
@@ -22,7 +22,6 @@ from skysim.simulation.exposure import occlusion_test
 from skysim.simulation.testbed import Testbed, exposure_window, sky_during
 from skysim.sources.dome.led import lit_moments_s
 
-ANY_TIME_S = np.array([0.0, 1.0])  # the pose does not change, so the times are arbitrary
 FLUX_NOISE = 0.02  # relative, of a light in a frame; above that of rendered ones (benchmarks/codes.py)
 
 
@@ -41,19 +40,20 @@ def visible_rows(
     R_lab_from_body = lab_from_body.as_matrix()
     R_cam_from_lab = testbed.mount.cam_from_body.as_matrix() @ R_lab_from_body.T
     poses = Poses(R_cam_from_lab[None], (R_lab_from_body @ testbed.mount.camera_body_m)[None])
-    rows = in_view(testbed.sources, testbed.optics, poses)
+    rows = in_view(testbed.sources, testbed.optics, poses, reach=0.0)
     near, sky = testbed.sources.take(rows), sky_during(testbed, t_s)
     if sky:
         near = sky.stars_seen(near)
-    tracks, _, _ = image_tracks(near, testbed.optics, poses, ANY_TIME_S, testbed.emitter)
-    xy_px, (width_px, height_px) = tracks.xy_px[0], testbed.canvas.shape[::-1]
+    xy_px, distance_m, cos_out, cos_in = (one[0] for one in project(near, testbed.optics, poses))
     x, y = xy_px.T
+    width_px, height_px = testbed.canvas.shape[::-1]
     visible = np.flatnonzero((x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5))
     occludes = occlusion_test(testbed, lab_from_body, sky)
     if occludes:
-        visible = visible[~occludes(near.take(visible))]
+        visible = visible[~occludes(near.place[visible])]
     duty_cycle = np.minimum(near.on_s / near.period_s, 1.0)
-    electrons = tracks.rate_e_s[0] * duty_cycle * testbed.scene.exposure.time_s
+    rate_e_s = rates_e_s(near, testbed.optics, testbed.emitter, distance_m, cos_out, cos_in)
+    electrons = rate_e_s * duty_cycle * testbed.scene.exposure.time_s
     return rows[visible], xy_px[visible], electrons[visible]
 
 

@@ -15,6 +15,7 @@ from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core import quaternion
+from skysim.core.jit import jit
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats, Telemetry, Truth
 from skysim.results import metrics
@@ -187,7 +188,7 @@ def claimed_image_px(
     else:
         assert isinstance(estimator, StarTracker)
         offset_lab = estimator.stars.vectors[match.star]
-    return testbed.optics.project(quaternion.to_rotation(cam_from_lab).apply(offset_lab))
+    return testbed.optics.project(offset_lab @ quaternion.to_matrix(cam_from_lab).T)
 
 
 def count_wrong_matches(observed_px: Floats, claimed_px: Floats, lights: TrueLights, reach_px: float) -> int:
@@ -213,12 +214,18 @@ def centroid_error_px(centroids_px: Floats, true_px: Floats, reach_px: float) ->
     return rms(distance_px) / math.sqrt(2)
 
 
+@jit
 def nearest_light(xy_px: Floats, lights_px: Floats) -> tuple[NDArray[np.int64], Floats]:
     """(K,) row of the light nearest to each position, and its distance."""
-    distance_px2 = np.sum((xy_px[:, None] - lights_px) ** 2, axis=2)
-    distance_px2 = np.where(np.isnan(distance_px2), np.inf, distance_px2)  # a position behind the camera
-    nearest = distance_px2.argmin(axis=1)
-    return nearest, np.sqrt(distance_px2[np.arange(len(nearest)), nearest])
+    nearest, distance_px = np.zeros(len(xy_px), np.int64), np.full(len(xy_px), math.inf)
+    for k in range(len(xy_px)):
+        least_px2 = math.inf
+        for n in range(len(lights_px)):
+            away_px2 = (xy_px[k, 0] - lights_px[n, 0]) ** 2 + (xy_px[k, 1] - lights_px[n, 1]) ** 2
+            if away_px2 < least_px2:  # never for a position behind the camera, which is NaN
+                nearest[k], least_px2 = n, away_px2
+        distance_px[k] = math.sqrt(least_px2)
+    return nearest, distance_px
 
 
 # Attitudes.

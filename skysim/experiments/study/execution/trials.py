@@ -41,7 +41,7 @@ from skysim.experiments.study.execution.outcomes import (
     summarize_flight,
     true_lights,
 )
-from skysim.experiments.study.execution.setups import Setup, code_version, prepared_setup, seed_of
+from skysim.experiments.study.execution.setups import Setup, code_version, prepared_setup, seed_of, setup_key
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.plan import (
     AxisConfig,
@@ -110,18 +110,22 @@ class TrialJob:
 def run_segments(spec: TrialSpec, segments: tuple[Segment, ...]) -> list[Row]:
     """Run all trials of some segments, in order."""
     return [
-        run_trial(spec, segment, segment.first + n, replicate)
+        run_trial(spec, segment, segment.first + n, replicate, key)
         for segment in segments
+        for key in [setup_key(spec, segment.settings)]
         for n, replicate in enumerate(segment.replicates)
     ]
 
 
-def run_trial(spec: TrialSpec, segment: Segment, trial: int, replicate: int) -> Row:
-    """Run one trial; an exception is stored in its row as a traceback."""
+def run_trial(spec: TrialSpec, segment: Segment, trial: int, replicate: int, key: str = "") -> Row:
+    """Run one trial; an exception is stored in its row as a traceback.
+
+    key : `setup_key` of the segment, if it is known
+    """
     seed = seed_of(spec, segment.point, replicate)
     scene, outcome, error, start_s = "", FAILED, None, time.perf_counter()
     try:
-        setup = prepared_setup(spec, segment.settings)
+        setup = prepared_setup(spec, segment.settings, key)
         scene, start_s = setup.scene_hash, time.perf_counter()
         outcome = TRIALS[setup.trial.kind](setup, seed)
     except Exception:
