@@ -30,7 +30,7 @@ test: $(READY)
 
 # The tests that CI runs beside those of `make test`.
 test-slow: $(READY)
-	$(PIP) -e '.[s3]'
+	$(PIP) -e '.[s3,query]'
 	$(PYTEST) -m "slow and not long and not browser"
 
 test-long: $(READY)
@@ -84,7 +84,7 @@ test-browser: $(READY)
 
 # Versions that resolve today, for CI; and the tests on the lowest that pyproject.toml allows.
 lock: $(READY)
-	$(BIN)/pip install --quiet --upgrade --upgrade-strategy eager -e '.[dev,catalog,browser,docs,s3]'
+	$(BIN)/pip install --quiet --upgrade --upgrade-strategy eager -e '.[dev,catalog,browser,docs,s3,query]'
 	$(BIN)/pip freeze --exclude-editable > requirements.lock
 
 test-lowest:

@@ -51,6 +51,7 @@ LONG = {
     "explanation/error_budget.md",
     "howto/stream.md",
 }
+NEEDS = {"howto/query_results.md": "duckdb"}  # of the extra that `make test-slow` installs
 LANGUAGES = {
     "sh",
     "python",
@@ -106,6 +107,8 @@ def folder(tmp_path: Path) -> Iterator[Path]:
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # a reader sees them too
 @pytest.mark.parametrize("name", walked())
 def test_a_page_s_blocks_run_in_their_order(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if name in NEEDS:
+        pytest.importorskip(NEEDS[name])
     monkeypatch.setenv("PATH", os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]))
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     session: dict[str, Any] = {}

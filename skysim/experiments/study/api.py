@@ -38,7 +38,7 @@ class StudyResult:
         from astropy.table import Table
 
         with store.open_store(self.path) as kept:
-            return Table(tables.trial_columns(kept))
+            return Table(dict(tables.trial_columns(kept)))
 
     def to_pandas(self) -> pd.DataFrame:
         """`table` as a data frame; needs pandas."""

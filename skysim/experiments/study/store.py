@@ -2,6 +2,13 @@
 
 Tables `trials` and `points` depend only on the study; engine, time and speed are in `timings` and `runs`. Every batch
 of rows is one transaction of a write-ahead log, so a killed run leaves only complete batches.
+
+Beyond MOST_ROWS rows in all, every PART_ROWS of them move to a Parquet file in a folder beside it, `study.parts`, those
+of the lowest trial numbers first; SQLite keeps the list of the files and the failed trials, which may be run again. A
+part is written and synced under a temporary name and renamed; then one transaction lists it and deletes its rows. A run
+that is killed before leaves a file that is not listed, which the next run removes. Parts are never changed: they hold
+point and replicate, from which the trial's number follows, since that changes when a study grows. All methods of
+`Store` take the rows of both for one table.
 """
 
 from __future__ import annotations
@@ -10,7 +17,7 @@ import json
 import math
 import sqlite3
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from operator import attrgetter
 from pathlib import Path
@@ -20,13 +27,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.io.files import make_folder
+from skysim.core.io.files import make_folder, remove
 from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.execution.trials import Row
+from skysim.results.files import row_parts
+from skysim.results.files.row_parts import Part, Rows, Source
 
 STORE = "study.sqlite"  # file name in a study's results folder
 FORMAT = 4  # raised when the columns of `trials` change
+FORMAT_OF_PARTS = 5  # of a store with parts, which an earlier skysim would not see
+MOST_ROWS = 1_000_000  # of a store without parts; beyond, rows move to them
+PART_ROWS = 250_000  # of a part: some 50 MB in memory
+EVERY = (0, 2**62)  # range of all trials
+BLOCK_TRIALS = 100_000  # numbers of trials of a block of `Store.blocks`
 TEXT_FIELDS = {"status"}
 INTEGER_FIELDS = {"frames", "solved", "wrong", "ambiguous"}
 
@@ -43,22 +57,30 @@ CREATE TABLE IF NOT EXISTS trials (
   scene TEXT NOT NULL, code TEXT NOT NULL,
   {OUTCOME_COLUMNS},
   error TEXT);
-CREATE INDEX IF NOT EXISTS trials_of_point ON trials (point);
 CREATE TABLE IF NOT EXISTS timings (trial INTEGER PRIMARY KEY, time_ms REAL NOT NULL);
 CREATE TABLE IF NOT EXISTS runs (
   run INTEGER PRIMARY KEY, began REAL NOT NULL, engine TEXT NOT NULL, workers INTEGER NOT NULL,
   trials INTEGER NOT NULL, seconds REAL NOT NULL);
+CREATE TABLE IF NOT EXISTS parts (
+  part INTEGER PRIMARY KEY, rows INTEGER NOT NULL, wrong INTEGER NOT NULL, first INTEGER NOT NULL,
+  last INTEGER NOT NULL);
 """
 
 values_of = attrgetter(*FIELDS)  # of an outcome; `astuple` takes twenty times longer
 INSERT = f"INSERT OR REPLACE INTO trials VALUES ({', '.join('?' * (7 + len(FIELDS)))})"
 
 
+NONE_NEAR = (range(0), Rows((), (), ()))
+
+
 class Store:
     """An open store of one study. `open_store` opens one for reading, `writing` makes or opens one for writing."""
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
-        self.path, self.db = path, connection
+        self.path, self.db, self.parts_folder = path, connection, path.with_suffix(".parts")
+        self._room = 0  # rows that SQLite takes until rows move; 0 before they are counted
+        self._parts: dict[int, Part] = {}  # by number
+        self._near = NONE_NEAR  # points that were read together with the last one
 
     def meta(self, key: str) -> str:
         """The value of a metadata key; empty if it is not set."""
@@ -85,6 +107,7 @@ class Store:
             self.db.execute("DELETE FROM points")
             self._insert_points(points)
             self.db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
+        self._near = NONE_NEAR
 
     def _renumber(self, replicates: int, more: int) -> None:
         number = f"trial / {replicates} * {more} + trial % {replicates}"
@@ -98,7 +121,12 @@ class Store:
         query = (
             "SELECT point, replicate, scene FROM trials WHERE scene != '' AND error IS NULL ORDER BY trial {} LIMIT 1"
         )
-        return [row for order in ("ASC", "DESC") for row in self.db.execute(query.format(order))]
+        with self.snapshot():
+            found = [row for order in ("ASC", "DESC") for row in self.db.execute(query.format(order))]
+            for part in self.parts():
+                columns = [row_parts.read_column(part.path, name)[[0, -1]] for name in ("point", "replicate", "scene")]
+                found += zip(*(column.tolist() for column in columns), strict=True)
+        return [min(found), max(found)] if found else []
 
     def delete_failed(self) -> None:
         """Delete the failed trials, so that they are run again."""
@@ -130,6 +158,75 @@ class Store:
             self.db.executemany(INSERT, values)
             times = [(row.trial, 1e3 * row.seconds) for row in rows]
             self.db.executemany("INSERT OR REPLACE INTO timings VALUES (?, ?)", times)
+        self._near = NONE_NEAR
+        self._room -= len(rows)
+        if self._room < 0:
+            self.move_rows()
+
+    def move_rows(self) -> None:
+        """Move rows without an error to parts, as many as fill one, if there are too many for SQLite.
+
+        None move without pyarrow, or before the study is known.
+        """
+        in_parts = sum(part.rows for part in self.parts())
+        count, moved = self.db.execute("SELECT COUNT(*) FROM trials").fetchone()[0], PART_ROWS
+        able = row_parts.can_write_parts() and bool(self.meta("replicates"))
+        while able and in_parts + count > MOST_ROWS and count >= PART_ROWS == moved:
+            moved = self._move_part()
+            count, in_parts = count - moved, in_parts + moved
+        self._room = MOST_ROWS - in_parts - count
+        if self._room < 0:
+            self._room = PART_ROWS - count if count < PART_ROWS else PART_ROWS
+
+    def _move_part(self) -> int:
+        """Move the rows of the lowest trial numbers, and return how many; 0 if there are too few without an error."""
+        where = "trial IN (SELECT trial FROM trials WHERE error IS NULL ORDER BY trial LIMIT ?)"
+        columns = self._kept_columns(where, (PART_ROWS,))
+        trial = columns.pop("trial")
+        if len(trial) < PART_ROWS:
+            return 0
+        number = 1 + self.db.execute("SELECT COALESCE(MAX(part), 0) FROM parts").fetchone()[0]
+        make_folder(self.parts_folder)
+        row_parts.write_part(self.part_path(number), columns)
+        last = (int(trial[-1]),)
+        with self.db:
+            ends = [int(columns["point"][row]) for row in (0, -1)]
+            row = (number, len(trial), int(columns["wrong"].sum()), *ends)
+            self.db.execute("INSERT INTO parts VALUES (?, ?, ?, ?, ?)", row)
+            self.db.execute("DELETE FROM trials WHERE trial <= ? AND error IS NULL", last)
+            self.db.execute("DELETE FROM timings WHERE trial <= ? AND trial NOT IN (SELECT trial FROM trials)", last)
+            self.db.execute("UPDATE meta SET value = ? WHERE key = 'format'", (str(FORMAT_OF_PARTS),))
+        return len(trial)
+
+    def part_path(self, number: int) -> Path:
+        """The file of a part."""
+        return self.parts_folder / f"{number:06d}.parquet"
+
+    def remove_unlisted_parts(self) -> None:
+        """Remove files of a run that was killed before it listed them."""
+        listed = {part.path for part in self.parts()}
+        for path in self.parts_folder.glob("*"):
+            if path not in listed:
+                remove(path)
+
+    def parts(self) -> list[Part]:
+        """All parts, in the order in which they were written."""
+        if self.meta("format") != str(FORMAT_OF_PARTS):  # a store of an earlier skysim has no such table
+            return []
+        rows = self.db.execute("SELECT part, rows, first, last FROM parts ORDER BY part")
+        return [self._parts.setdefault(number, Part(self.part_path(number), *others)) for number, *others in rows]
+
+    @contextmanager
+    def snapshot(self) -> Iterator[None]:
+        """Within this context all queries see the rows of one instant, however a run goes on meanwhile."""
+        if self.db.in_transaction:
+            yield
+            return
+        self.db.execute("BEGIN")
+        try:
+            yield
+        finally:
+            self.db.rollback()
 
     def record_run(self, engine: str, workers: int, trials: int, seconds: float) -> None:
         """Record a finished run."""
@@ -145,14 +242,23 @@ class Store:
     def done(self, count: int) -> NDArray[np.bool_]:
         """(count,) mask of the trials in the store, failed ones included."""
         mask = np.zeros(count, bool)
-        for (trial,) in self.db.execute("SELECT trial FROM trials WHERE trial < ?", (count,)):
-            mask[trial] = True
+        with self.snapshot():
+            rows = self.db.execute("SELECT trial FROM trials WHERE trial < ?", (count,))
+            mask[np.fromiter((trial for (trial,) in rows), np.int64)] = True
+            for part in self.parts():
+                numbers = part.trials(self._replicates())
+                mask[numbers[: np.searchsorted(numbers, count)]] = True
         return mask
 
     def counts(self) -> dict[str, int]:
         """Number of trials in the store, of failed trials, and of wrong attitudes."""
         query = "SELECT COUNT(*), COALESCE(SUM(error IS NOT NULL), 0), COALESCE(SUM(wrong), 0) FROM trials"
-        return dict(zip(("done", "failed", "wrong"), self.db.execute(query).fetchone(), strict=True))
+        with self.snapshot():
+            done, failed, wrong = self.db.execute(query).fetchone()
+            if self.parts():
+                more = self.db.execute("SELECT SUM(rows), SUM(wrong) FROM parts").fetchone()
+                done, wrong = done + more[0], wrong + more[1]
+        return {"done": done, "failed": failed, "wrong": wrong}
 
     def failures(self) -> list[tuple[int, str]]:
         """Number of each failed trial and the last line of its traceback. Raises InputError."""
@@ -162,32 +268,86 @@ class Store:
 
     def trial(self, number: int) -> dict[str, Any]:
         """One row by column name. Raises InputError if the trial is not in the store."""
-        cursor = self.db.execute("SELECT * FROM trials WHERE trial = ?", (number,))
-        row = cursor.fetchone()
-        if row is None:
+        rows = self._rows([(number, number + 1)])
+        if not len(rows["trial"]):
             raise InputError(f"trial {number}: not in {self.path}; allowed: {self.trial_range()}")
-        return dict(zip((column[0] for column in cursor.description), row, strict=True))
+        return {name: to_sql(rows[name].tolist()[0]) for name in rows if name != "time_ms"}
 
     def trial_range(self) -> str:
         """Range of the trial numbers in the store, as text for messages."""
-        low, high = self.db.execute("SELECT MIN(trial), MAX(trial) FROM trials").fetchone()
-        return "none yet" if low is None else f"{low} to {high}"
+        ends = self._ends()
+        return f"{min(ends)} to {max(ends)}" if ends else "none yet"
 
-    def columns(self, where: str = "1", values: tuple[Any, ...] = ()) -> dict[str, NDArray[Any]]:
-        """Every column of `trials`, and `timings.time_ms`, as arrays in trial order; NaN for missing values."""
-        query = f"SELECT trials.*, time_ms FROM trials LEFT JOIN timings USING (trial) WHERE {where} ORDER BY trial"
-        cursor = self.db.execute(query, values)
-        names = [column[0] for column in cursor.description]
-        lists: list[list[Any]] = [[] for _ in names]
-        while batch := cursor.fetchmany(10_000):
-            for column, more in zip(lists, zip(*batch, strict=True), strict=True):
-                column.extend(more)
+    def columns(self, failed: bool = True) -> Rows:
+        """Every column of `trials`, and `timings.time_ms`, as arrays in trial order; NaN for missing values.
+
+        failed : whether failed trials are among them
+        """
+        return self._rows([EVERY], "1" if failed else "error IS NULL")
+
+    def point_columns(self, *points: int) -> Rows:
+        """The columns of the trials of some points."""
+        if len(points) > 1 or not (parts := self.parts()):
+            return self._rows(ranges_of(points, self._replicates()))
+        # To read one point of a part takes as long as to read all of them.
+        (point,), (near, rows) = points, self._near
+        if point not in near:
+            last = min((part.last for part in parts if part.first <= point <= part.last), default=point)
+            near, rows = range(point, last + 1), self._rows(ranges_of(range(point, last + 1), self._replicates()))
+            self._near = near, rows
+        if len(near) == 1:
+            return rows
+        first, end = np.searchsorted(rows["point"], [point, point + 1]).tolist()
+        return row_parts.subset(rows, slice(first, end))
+
+    def blocks(self) -> Iterator[Rows]:
+        """The columns of all trials, so many trial numbers after another; one block at least."""
+        for first in range(0, 1 + max(self._ends(), default=0), BLOCK_TRIALS):
+            yield self._rows([(first, first + BLOCK_TRIALS)])
+
+    def _ends(self) -> list[int]:
+        """First and last trial number of SQLite and of each part."""
+        with self.snapshot():
+            ends = [*self.db.execute("SELECT MIN(trial), MAX(trial) FROM trials").fetchone()]
+            for part in self.parts():
+                ends += part.trials(self._replicates())[[0, -1]].tolist()
+        return [end for end in ends if end is not None]
+
+    def _rows(self, ranges: Sequence[tuple[int, int]], where: str = "1") -> Rows:
+        """The columns of the trials in some ranges of numbers, in their order.
+
+        where : what else holds of those in SQLite
+        """
+        sources, numbers = list[Source](), list[NDArray[np.int64]]()
+        with self.snapshot():
+            for part in self.parts():
+                if (source := part.source(ranges, self._replicates())) is not None:
+                    sources.append(source)
+                    numbers.append(source("trial"))
+            for one in ranges:
+                kept = self._kept_columns(f"trial >= ? AND trial < ? AND {where}", one)
+                sources.append(kept.__getitem__)
+                numbers.append(kept["trial"])
+        trial = np.concatenate(numbers)
+        in_order = bool(np.all(trial[1:] > trial[:-1]))
+        order = None if in_order else np.argsort(trial, kind="stable")
+        return Rows(COLUMNS, sources, list(map(len, numbers)), order)
+
+    def _replicates(self) -> int:
+        """Trials of a point."""
         with self.corruption_as_input_error():
-            return {name: to_array(name, column) for name, column in zip(names, lists, strict=True)}
+            return int(self.meta("replicates"))
 
-    def point_columns(self, point: int) -> dict[str, NDArray[Any]]:
-        """The columns of the trials of one point."""
-        return self.columns("point = ?", (point,))
+    def _kept_columns(self, where: str, values: Sequence[int]) -> dict[str, NDArray[Any]]:
+        """The columns of rows in SQLite, in trial order."""
+        query = f"SELECT {', '.join(COLUMNS)} FROM trials LEFT JOIN timings USING (trial) WHERE {where} ORDER BY trial"
+        cursor, texts = self.db.execute(query, values), dict[Any, Any]()
+        batches: list[list[NDArray[Any]]] = [[to_array(name, (), texts)] for name in COLUMNS]
+        with self.corruption_as_input_error():
+            while rows := cursor.fetchmany(10_000):
+                for name, arrays, column in zip(COLUMNS, batches, zip(*rows, strict=True), strict=True):
+                    arrays.append(to_array(name, column, texts))
+            return {name: np.concatenate(arrays) for name, arrays in zip(COLUMNS, batches, strict=True)}
 
     @contextmanager
     def corruption_as_input_error(self) -> Iterator[None]:
@@ -205,13 +365,21 @@ def to_sql(value: Any) -> Any:
     return value
 
 
-def to_array(name: str, column: list[Any]) -> NDArray[Any]:
-    """A column as an array: objects for text, int64 for integers, otherwise floats with NaN for null."""
+def to_array(name: str, column: Sequence[Any], texts: dict[Any, Any]) -> NDArray[Any]:
+    """A column as an array: objects for text, int64 for integers, otherwise floats with NaN for null.
+
+    texts : texts so far, each of which is kept once
+    """
     if name in TEXT_FIELDS or name in ("scene", "code", "error"):
-        return np.array(column, dtype=object)
-    if name in INTEGER_FIELDS or name in ("trial", "point", "replicate", "seed"):
-        return np.array(column, dtype=np.int64)
-    return np.array([math.nan if value is None else value for value in column], dtype=float)
+        return np.array([texts.setdefault(text, text) for text in column], dtype=object)
+    return np.array(column, dtype=np.int64 if name in INTEGER_FIELDS or name in COLUMNS[:4] else float)
+
+
+def ranges_of(points: Sequence[int], replicates: int) -> list[tuple[int, int]]:
+    """The ranges (first, end) of the trials of some points."""
+    ordered = np.array(sorted(points))
+    runs = np.split(ordered, np.flatnonzero(np.diff(ordered) != 1) + 1)
+    return [(int(run[0]) * replicates, (int(run[-1]) + 1) * replicates) for run in runs]
 
 
 @contextmanager
@@ -236,8 +404,8 @@ def check_format(store: Store) -> None:
             f"{store.path}: written by an earlier skysim, without the attitudes of the trials; allowed: run the study"
             " again, with another --out"
         )
-    if stored != str(FORMAT):
-        raise InputError(f"{store.path}: format {stored!r}; allowed: {FORMAT}")
+    if stored not in (str(FORMAT), str(FORMAT_OF_PARTS)):
+        raise InputError(f"{store.path}: format {stored!r}; allowed: {FORMAT}, {FORMAT_OF_PARTS}")
 
 
 @contextmanager
@@ -279,4 +447,6 @@ def writing(path: Path) -> Iterator[Store]:
                     db.execute(statement)
                 db.execute("INSERT OR IGNORE INTO meta VALUES ('format', ?)", (str(FORMAT),))
             check_format(store)
+            store.remove_unlisted_parts()
+            store.move_rows()
             yield store

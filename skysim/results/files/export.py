@@ -21,8 +21,8 @@ from skysim.results import stretch
 from skysim.results.files import ccsds_aem
 from skysim.results.files import frames as frame_files
 from skysim.results.files.recording import FrameTruth, Recording
+from skysim.results.files.row_parts import EXTRA
 
-EXTRA = "needs optional packages: pip install 'skysim[export]'"
 BATCH_ROWS = 1 << 16  # rows buffered before a Parquet row group is written
 SAMPLED_FRAMES = 9  # about this many frames determine the black and white levels of a video
 FOURCC = "mp4v"  # MPEG-4 part 2, which every wheel of OpenCV can write

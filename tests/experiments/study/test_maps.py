@@ -194,7 +194,8 @@ def test_a_map_without_trials_is_empty() -> None:
 
 
 def test_dome_and_sky_are_not_drawn_in_one_map() -> None:
-    both = worst.joined([columns(50), columns(50, True)])
+    dome, sky = columns(50), columns(50, True)
+    both = {name: np.concatenate([dome[name], sky[name]]) for name in dome}
     with pytest.raises(InputError, match="map of wrong: trials under a dome and under the stars; allowed: where"):
         maps.direction_map("", both, "wrong")
 

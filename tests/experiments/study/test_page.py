@@ -62,7 +62,7 @@ def filled(
         told = Outcome("failed") if error else outcome(point, replicate)
         rows.append(Row(trial, point, replicate, trial, "scene", "cafe", told, error, 0.001))
     with store.writing(path) as kept:
-        kept.begin(kept.points(), study="title: Which <dome>?", code="cafe0123")
+        kept.begin(kept.points(), study="title: Which <dome>?", code="cafe0123", replicates=str(asked.replicates))
         kept.set_points(tried)
         kept.add(rows)
         kept.record_run("pool", 2, len(rows), 4.0)

@@ -123,7 +123,7 @@ class StudyProcess:
             return None
         try:
             with store.open_store(path) as stored:
-                counts, columns, raised = stored.counts(), stored.columns("error IS NULL"), stored.failures()
+                counts, columns, raised = stored.counts(), stored.columns(failed=False), stored.failures()
         except InputError:
             return None
         if not counts["done"]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from skysim.experiments.study.store import Store
 from skysim.results import metrics
+from skysim.results.files.row_parts import Rows
 from skysim.results.metrics import Summary
 
 LONG_QUANTITY = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
@@ -110,10 +111,27 @@ def to_columns(rows: Sequence[PointRow]) -> dict[str, list[Any]]:
     return columns
 
 
-def trial_columns(store: Store) -> dict[str, NDArray[Any]]:
+def trial_columns(store: Store) -> Rows:
     """All trials: the columns of the store, and a column for the levels of each factor."""
-    columns, points = store.columns(), store.points()
-    for name in points[0].levels if points else ():
-        levels = [points[number].levels[name] for number in columns["point"]]
-        columns[name] = np.array([format_level(one) if isinstance(one, list) else one for one in levels])
-    return columns
+    return with_levels(store.columns(), level_columns(store))
+
+
+def level_columns(store: Store) -> dict[str, NDArray[Any]]:
+    """(P,) levels of each factor by point: numbers, or texts."""
+    points = store.points()
+    return {name: to_array([one.levels[name] for one in points]) for name in (points[0].levels if points else ())}
+
+
+def to_array(levels: Sequence[Any]) -> NDArray[Any]:
+    """Levels of a factor as an array; those that numpy has no type for as texts."""
+    array = np.array([format_level(one) if isinstance(one, list) else one for one in levels])
+    return array if array.dtype != object else np.array([one if one is None else str(one) for one in levels], object)
+
+
+def with_levels(rows: Rows, levels: dict[str, NDArray[Any]]) -> Rows:
+    """Rows of trials, and the levels of their points."""
+
+    def column(name: str) -> NDArray[Any]:
+        return levels[name][rows["point"]] if name in levels else rows[name]
+
+    return Rows((*rows, *levels), [column], [rows.starts[-1]])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,11 +16,14 @@ from skysim.experiments.study.analysis.table import PointRow
 from skysim.experiments.study.plan import Study
 from skysim.experiments.study.store import Store
 from skysim.results import metrics
+from skysim.results.files.row_parts import row_of, subset
 from skysim.results.metrics import Columns
 
 COUNT = 3  # number of worst trials that a report lists
 DIRECTION = ("body_tilt_deg", "body_azimuth_deg", "boresight_ra_deg", "boresight_dec_deg", "stars")
+FIRST = 1000  # worst trials that are sorted at first
 APART_DEG = 5.0  # least angle between the directions of two of them; nearer ones are one place
+NEAR = math.cos(math.radians(APART_DEG))
 # Column by which a trial counts for a proportion; for `identified` those that do not.
 FLAGS: dict[str, Callable[[Columns], NDArray[Any]]] = {
     "identified": lambda c: c["frames"] - c["solved"] + c["wrong"],
@@ -28,7 +31,7 @@ FLAGS: dict[str, Callable[[Columns], NDArray[Any]]] = {
     "overconfident": lambda c: np.nan_to_num(c["nees"]) > metrics.OVERCONFIDENT_NEES,
     "failed": lambda c: c["frames"] == 0,
 }
-ColumnsOf = Callable[[int], Columns]  # the columns of a point's trials
+ColumnsOf = Callable[..., Columns]  # the columns of the trials of some points
 
 
 class WorstTrial(NamedTuple):
@@ -86,24 +89,45 @@ def worst_trials(columns: Columns, response: str, count: int = COUNT) -> list[Wo
     """
     if not columns:
         return []
-    rank, counted = ranking(columns, response)
-    order = [row for row in np.lexsort(rank[::-1]).tolist() if counted[row]]
-    axis, chosen = unit_directions(columns), list[int]()
-    for row in order:
-        if len(chosen) < count and not np.any(axis[chosen] @ axis[row] > math.cos(math.radians(APART_DEG))):
-            chosen.append(row)
-    errors = {name: metrics.QUANTITIES[name](columns) for name in ("cross_arcsec", "roll_arcsec")}
-    return [
-        WorstTrial(
-            int(columns["trial"][row]),
-            int(columns["point"][row]),
-            "misidentified" if columns["misidentified"][row] > 0 else str(columns["status"][row]),
-            *(float(error[row]) for error in errors.values()),
-            *(float(columns[name][row]) for name in DIRECTION),
-            *body_angles_deg(columns, row),
-        )
-        for row in chosen
-    ]
+    keys, counted = ranking(columns, response)
+    axis, chosen = np.empty((0, 3)), list[WorstTrial]()
+    for rows in worst_first(keys, np.flatnonzero(counted)):
+        directions = unit_directions(subset(columns, rows))
+        left = np.all(directions @ axis.T <= NEAR, axis=1)
+        while len(chosen) < count and left.any():
+            nearest = int(np.argmax(left))
+            chosen.append(worst_trial(row_of(columns, int(rows[nearest]))))
+            left &= directions @ directions[nearest] <= NEAR
+            axis = np.concatenate([axis, directions[nearest : nearest + 1]])
+        if len(chosen) == count:
+            break
+    return chosen
+
+
+def worst_first(keys: Sequence[Floats], rows: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    """Rows in the order of their keys, some at a time: about FIRST, then ten times as many, since few are needed."""
+    most = FIRST
+    while len(rows) and keys:
+        first = keys[0][rows]
+        limit = np.partition(first, most - 1)[most - 1] if most < len(rows) else first.max()
+        below = rows[first < limit]
+        yield below[np.lexsort([key[below] for key in reversed(keys)])]
+        yield from worst_first(keys[1:], rows[first == limit])
+        rows, most = rows[first > limit], 10 * most
+    if len(rows):
+        yield rows
+
+
+def worst_trial(columns: Columns) -> WorstTrial:
+    """The only one of some trials."""
+    return WorstTrial(
+        int(columns["trial"][0]),
+        int(columns["point"][0]),
+        "misidentified" if columns["misidentified"][0] > 0 else str(columns["status"][0]),
+        *(float(metrics.QUANTITIES[name](columns)[0]) for name in ("cross_arcsec", "roll_arcsec")),
+        *(float(columns[name][0]) for name in DIRECTION),
+        *body_angles_deg(columns, 0),
+    )
 
 
 def body_angles_deg(columns: Columns, row: int) -> list[float]:
@@ -143,10 +167,4 @@ def worst_of_levels(
     """The worst trials of the points at some levels. Raises InputError for an unknown factor or level."""
     rows = [PointRow(n, point.levels, {}) for n, point in enumerate(store.points())]
     chosen = points_at(rows, study, levels)
-    return worst_trials(joined(store.point_columns(row.point) for row in chosen), response, count)
-
-
-def joined(columns: Iterable[Columns]) -> Columns:
-    """The columns of several points together."""
-    parts = list(columns)
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
+    return worst_trials(store.point_columns(*(row.point for row in chosen)), response, count)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import csv
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.io import files
-from skysim.experiments.study.analysis.table import table, to_columns, trial_columns
-from skysim.experiments.study.store import Store
-from skysim.results.files.export import EXTRA
+from skysim.experiments.study.analysis.table import level_columns, table, to_columns, with_levels
+from skysim.experiments.study.store import COLUMNS, Store
+from skysim.results.files.row_parts import EXTRA, encoding, to_arrow
 
 
 def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
@@ -21,34 +23,54 @@ def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
 
     Columns without any value are left out: of a study of frames, for example, those of flights.
     """
-    every = trial_columns(store)
-    columns = {name: column for name, column in every.items() if any(map(has_value, column.tolist()))} or every
+    levels, names = level_columns(store), names_with_values(store)
     with files.atomic_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(columns)
-        for row in zip(*(column.tolist() for column in columns.values()), strict=True):
-            writer.writerow([value if has_value(value) else "" for value in row])
+        writer.writerow(names)
+        for block in store.blocks():
+            columns = with_levels(block, levels)
+            writer.writerows(zip(*(texts(columns[name]) for name in names), strict=True))
 
 
-def has_value(value: Any) -> bool:
-    """Whether a value is neither None nor NaN."""
-    return value is not None and value == value
+def names_with_values(store: Store) -> list[str]:
+    """Names of the columns of `trial_columns` that are not empty; all of a store without trials."""
+    every = [*COLUMNS, *level_columns(store)]
+    empty, some = set(COLUMNS), False
+    for block in store.blocks():
+        some |= bool(len(block["trial"]))
+        empty -= {name for name in empty if has_values(block[name])}
+    return [name for name in every if name not in empty] if some else every
+
+
+def has_values(column: NDArray[Any]) -> bool:
+    """Whether any value is neither None nor NaN."""
+    return any(value is not None for value in column) if column.dtype == object else bool(np.any(column == column))
+
+
+def texts(column: NDArray[Any]) -> list[Any]:
+    """Values for CSV: an empty string for None and NaN."""
+    values = column.tolist()
+    return [value if value is not None and value == value else "" for value in values]
 
 
 def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:
-    """Write one row per trial; title, code version and study file are in the file's metadata.
+    """Write one row per trial, missing values null; title, code version and study file are in the file's metadata.
 
     Raises InputError if pyarrow is not installed.
     """
     try:
-        import pyarrow
         import pyarrow.parquet
     except ImportError:
         raise InputError(f"{path}: Parquet {EXTRA}") from None
-    columns = {name: pyarrow.array(column.tolist()) for name, column in trial_columns(store).items()}
-    meta = {key: store.meta(key) for key in ("title", "code", "study")}
-    with files.atomic_file(path) as temporary:
-        pyarrow.parquet.write_table(pyarrow.table(columns).replace_schema_metadata(meta), temporary)
+    levels, meta = level_columns(store), {key: store.meta(key) for key in ("title", "code", "study")}
+    tables = (to_arrow(with_levels(block, levels)).replace_schema_metadata(meta) for block in store.blocks())
+    first = next(tables)
+    with (
+        files.atomic_file(path) as temporary,
+        pyarrow.parquet.ParquetWriter(temporary, first.schema, **encoding(first.schema)) as writer,
+    ):
+        for rows in itertools.chain([first], tables):
+            writer.write_table(rows)
 
 
 def dataset(store: Store, responses: tuple[str, ...], path: Path) -> Any:

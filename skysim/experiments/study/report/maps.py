@@ -9,16 +9,18 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.study.analysis.axes import axis, group_points, shown_points
 from skysim.experiments.study.analysis.table import PointRow
-from skysim.experiments.study.analysis.worst import ColumnsOf, WorstTrial, joined, worst_trials
+from skysim.experiments.study.analysis.worst import ColumnsOf, WorstTrial, worst_trials
 from skysim.experiments.study.plan import Map, Study
 from skysim.experiments.study.report.layout import caption_title, fixed_text
 from skysim.experiments.study.report.scales import HATCHED, add_color_bar, color_scale, halo
 from skysim.results import metrics
+from skysim.results.files.row_parts import subset
 from skysim.results.metrics import Columns
 from skysim.results.plots import png
 
@@ -73,7 +75,7 @@ def direction_maps(lines: Sequence[PointRow], figure: Map, study: Study, columns
         groups = group_points(chosen, axis(study, lines, figure.by), figure.by, study)
     panels = []
     for label, group in groups.items():
-        columns = joined(columns_of(line.point) for line in group)
+        columns = columns_of(*(line.point for line in group))
         panels.append(direction_map(label, columns, figure.value))
     return panels
 
@@ -92,11 +94,14 @@ def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
     radial_deg, around_deg = columns[radial], columns[around]
     summarize, cells, least = metrics.response(response), [], least_values(response)
     count = int(known.sum() * min(CELL_TRIALS / (SPARE * least), 1.0))
-    for low, high, left, right in partition(*radial_range(radial_deg[known], sky), count, sky):
-        inside = (radial_deg >= low) & (radial_deg < high) & ((around_deg - left) % 360 < right - left)
-        summary = summarize({name: column[inside] for name, column in columns.items()})
+    ranges = list(partition(*radial_range(radial_deg[known], sky), count, sky))
+    number = cell_numbers(ranges, radial_deg, around_deg)
+    order = np.argsort(number, kind="stable")
+    ends = np.searchsorted(number[order], np.arange(len(ranges) + 1))
+    for one, (first, end) in zip(ranges, itertools.pairwise(ends.tolist()), strict=True):
+        summary = summarize(subset(columns, order[first:end]))
         value = summary.value if summary.trials >= least else math.nan
-        cells.append(Cell(low, high, left, right, value, summary.trials))
+        cells.append(Cell(*one, value, summary.trials))
     return DirectionMap(label, sky, cells, worst_trials(columns, response))
 
 
@@ -136,6 +141,20 @@ def partition(low_deg: float, high_deg: float, trials: int, sky: bool) -> Iterat
         # A cell of the sky begins at RA 180 deg, where the projection is cut.
         bounds = np.linspace(180 if sky else 0, 540 if sky else 360, sectors + 1).tolist()
         yield from ((low, high, left, right) for left, right in itertools.pairwise(bounds))
+
+
+def cell_numbers(
+    ranges: Sequence[tuple[float, float, float, float]], radial_deg: Floats, around_deg: Floats
+) -> NDArray[np.int16]:
+    """(N,) number of the cell that each trial is in, by the ranges of `partition`; -1 for none."""
+    number, first = np.full(len(radial_deg), -1, np.int16), 0
+    for (low, high), group in itertools.groupby(ranges, key=lambda one: one[:2]):
+        lefts = [left for _, _, left, _ in group]
+        ring = np.flatnonzero((radial_deg >= low) & (radial_deg < high))
+        sector = (around_deg[ring] - lefts[0]) % 360 * (len(lefts) / 360)
+        number[ring] = first + np.minimum(sector, len(lefts) - 1).astype(np.int16)
+        first += len(lefts)
+    return number
 
 
 # Drawing.

@@ -1,0 +1,188 @@
+"""Columns of trials that may be too many for memory: each is read when it is asked for, also from Parquet files.
+
+A part is a Parquet file of some hundred thousand trials, written once and never changed. Missing values are null there,
+NaN or None in arrays. Trials are in the order of point and replicate, from which their numbers follow.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
+from skysim.core.io.files import atomic_file
+
+EXTRA = "needs optional packages: pip install 'skysim[export]'"
+KEPT_BYTES = 250_000_000  # columns that are kept for the next one who asks, the oldest are dropped first
+
+Array = NDArray[Any]
+Source = Callable[[str], Array]  # the column of some rows by its name
+
+
+class Rows(Mapping[str, Array]):
+    """Columns of some rows by name; a column is read when it is asked for.
+
+    names   : of the columns, in order
+    sources : of the rows, one after another;  counts : of the rows of each
+    order   : (N,) places of the rows in those of the sources; None for their own order
+    """
+
+    def __init__(
+        self, names: Sequence[str], sources: Sequence[Source], counts: Sequence[int], order: Array | None = None
+    ) -> None:
+        self.names, self.sources, self.order = tuple(names), tuple(sources), order
+        self.starts = np.cumsum([0, *counts])
+        self._kept: dict[str, Array] = {}
+
+    def __getitem__(self, name: str) -> Array:
+        if name not in self.names:
+            raise KeyError(name)
+        if name not in self._kept:
+            columns = [source(name) for source in self.sources]
+            column = columns[0] if len(columns) == 1 else np.concatenate(columns)
+            del columns
+            self._keep(name, column if self.order is None else column[self.order])
+        return self._kept[name]
+
+    def _keep(self, name: str, column: Array) -> None:
+        while self._kept and sum(one.nbytes for one in self._kept.values()) + column.nbytes > KEPT_BYTES:
+            del self._kept[next(iter(self._kept))]
+        self._kept[name] = column
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def row(self, number: int) -> dict[str, Array]:
+        """The columns of one row, read from its source alone."""
+        place = number if self.order is None else int(self.order[number])
+        source = int(np.searchsorted(self.starts, place, side="right")) - 1
+        here = place - int(self.starts[source])
+        return {name: self.sources[source](name)[here : here + 1] for name in self.names}
+
+
+def row_of(columns: Mapping[str, Array], number: int) -> Mapping[str, Array]:
+    """The columns of one row."""
+    one = slice(number, number + 1)
+    return columns.row(number) if isinstance(columns, Rows) else {name: columns[name][one] for name in columns}
+
+
+def subset(columns: Mapping[str, Array], rows: Array | slice) -> Rows:
+    """Some rows of a table, by their numbers or from one to another."""
+    count = rows.stop - rows.start if isinstance(rows, slice) else len(rows)
+    return Rows(tuple(columns), [lambda name: columns[name][rows]], [count])
+
+
+# Parquet.
+
+
+def can_write_parts() -> bool:
+    """Whether pyarrow is installed."""
+    return importlib.util.find_spec("pyarrow") is not None
+
+
+def to_arrow(columns: Mapping[str, Array]) -> Any:
+    """An Arrow table; missing values (NaN, None) are null."""
+    import pyarrow
+
+    return pyarrow.table(
+        {
+            name: pyarrow.array(column, pyarrow.string() if column.dtype == object else None, from_pandas=True)
+            for name, column in columns.items()
+        }
+    )
+
+
+def write_part(path: Path, columns: Mapping[str, Array]) -> None:
+    """Write a part. It appears whole and on the disk, or not at all."""
+    import pyarrow.parquet
+
+    table = to_arrow(columns)
+    with atomic_file(path) as temporary:
+        pyarrow.parquet.write_table(table, temporary, row_group_size=table.num_rows, **encoding(table.schema))
+        sync(temporary)
+    sync(path.parent)
+
+
+def encoding(schema: Any) -> dict[str, Any]:
+    """How columns are written: of a float the bytes of the exponent compress, those of the fraction do not, so bytes of
+    one place are put together, which takes less space and time than a dictionary of numbers that are all different.
+    """
+    floats = [field.name for field in schema if str(field.type) == "double"]
+    others = [field.name for field in schema if field.name not in floats]
+    return {"compression": "zstd", "use_dictionary": others, "use_byte_stream_split": floats}
+
+
+def sync(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk; other systems than POSIX sync no folders."""
+    if path.is_dir() and os.name != "posix":
+        return
+    descriptor = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+class Part:
+    """A part: its file, its number of rows, and the points of its first and its last row."""
+
+    def __init__(self, path: Path, rows: int, first: int, last: int) -> None:
+        self.path, self.rows, self.first, self.last = path, rows, first, last
+        self._trials: tuple[int, Array] = (0, np.empty(0, np.int64))
+
+    def trials(self, replicates: int) -> Array:
+        """(N,) numbers of its trials, where a point has so many."""
+        if self._trials[0] != replicates:
+            point, replicate = (read_column(self.path, name) for name in ("point", "replicate"))
+            self._trials = replicates, point * replicates + replicate
+        return self._trials[1]
+
+    def source(self, ranges: Sequence[tuple[int, int]], replicates: int) -> Source | None:
+        """The columns of the trials in some ranges of numbers; None if there are none."""
+        near = np.array(ranges)
+        near = near[(near[:, 0] < (self.last + 1) * replicates) & (near[:, 1] > self.first * replicates)]
+        if not len(near):
+            return None
+        trials = self.trials(replicates)
+        rows = [slice(first, end) for first, end in np.searchsorted(trials, near).tolist() if end > first]
+
+        def column(name: str) -> Array:
+            whole = trials if name == "trial" else read_column(self.path, name)
+            return whole[rows[0]] if len(rows) == 1 else np.concatenate([whole[one] for one in rows])
+
+        return column if rows else None
+
+
+def read_column(path: Path, name: str) -> Array:
+    """A column of a part: numbers, or objects for text. Raises InputError if it cannot be read."""
+    with part_errors(path):
+        import pyarrow.parquet
+
+        # Texts are read as numbers of distinct texts, since there are few of them.
+        column = pyarrow.parquet.ParquetFile(path).read([name]).column(name)
+        if not pyarrow.types.is_string(column.type):
+            return np.asarray(column.to_numpy())
+        coded = column.combine_chunks().dictionary_encode()
+        texts = np.array([*coded.dictionary.to_pylist(), None], dtype=object)
+        return np.asarray(texts[coded.indices.fill_null(len(texts) - 1).to_numpy()])
+
+
+@contextmanager
+def part_errors(path: Path) -> Iterator[None]:
+    """Raise InputError for a part that is missing or damaged, or without pyarrow."""
+    try:
+        yield
+    except ImportError:
+        raise InputError(f"{path}: Parquet {EXTRA}") from None
+    except (OSError, ValueError, KeyError, NotImplementedError, MemoryError) as error:  # pyarrow's are among them
+        raise InputError(f"{path}: not a valid part of a study store: {' '.join(str(error).split())[:120]}") from None

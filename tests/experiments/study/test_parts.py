@@ -1,0 +1,441 @@
+"""Rows beyond a million: in Parquet parts and SQLite together they are the same table, whenever a run is killed."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import sqlite3
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from study_stores import done
+
+from skysim.core.errors import InputError
+from skysim.experiments.study import loader, plan, store
+from skysim.experiments.study.analysis import table, worst
+from skysim.experiments.study.designs import Point
+from skysim.experiments.study.execution import engines
+from skysim.experiments.study.execution.outcomes import Outcome
+from skysim.experiments.study.execution.trials import Row
+from skysim.experiments.study.report import export
+from skysim.results.files import row_parts
+
+pytest.importorskip("pyarrow")
+POINTS, EACH, BATCH = 3, 40, 10
+POINT = [Point({"strays": n}, {"trial.false_lights": n}) for n in range(POINTS)]
+STUDY = """
+schema: 1
+title: strays
+scene: shefex2
+seed: 1
+set: {light.limit_mag: 5.0}
+trial: {kind: centroids, lights: 15}
+factors: {strays: {key: trial.false_lights, values: [0, 5, 9]}}
+replicates: 40
+responses: [identified]
+"""
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, size in {"MOST_ROWS": 50, "PART_ROWS": 20, "BLOCK_TRIALS": 30}.items():
+        monkeypatch.setattr(store, name, size)
+
+
+def row(trial: int, failed: bool = False, each: int = EACH) -> Row:
+    """A row with a number, or none, in every column, and directions all over the sky."""
+    point, replicate = divmod(trial, each)
+    rng = np.random.default_rng([point, replicate])
+    if failed:
+        return Row(trial, point, replicate, 7 * replicate, "", "code", Outcome("failed"), f"Traceback\nat {trial}", 0.1)
+    errors = rng.normal(size=3).tolist() if replicate % 7 else [np.nan] * 3
+    told = Outcome("solved" if replicate % 7 else "refused", 1, int(replicate % 7 > 0), int(replicate == 8), *errors)
+    for name in ("boresight_ra_deg", "boresight_dec_deg", "stars", "centroid_px"):
+        setattr_frozen(told, name, float(rng.uniform(0, 60)))
+    return Row(trial, point, replicate, 7 * replicate, f"scene {point}", "code", told, None, 1e-3 * (1 + replicate))
+
+
+def setattr_frozen(outcome: Outcome, name: str, value: float) -> None:
+    object.__setattr__(outcome, name, value)
+
+
+def begun(path: Path, each: int = EACH) -> Any:
+    """A store for writing, of POINTS points."""
+    opened = store.writing(path)
+
+    class Begun:
+        def __enter__(self) -> store.Store:
+            self.kept = opened.__enter__()
+            self.kept.begin(POINT, replicates=str(each), title="strays", code="code", study="title: strays")
+            return self.kept
+
+        def __exit__(self, *error: Any) -> None:
+            opened.__exit__(*error)
+
+    return Begun()
+
+
+def add_all(kept: store.Store, rows: list[Row]) -> None:
+    for first in range(0, len(rows), BATCH):
+        kept.add(rows[first : first + BATCH])
+
+
+def filled(path: Path, rows: list[Row], parts: bool = True) -> Path:
+    with pytest.MonkeyPatch.context() as patch:
+        if not parts:
+            patch.setattr(row_parts, "can_write_parts", lambda: False)
+        with begun(path) as kept:
+            add_all(kept, rows)
+    return path
+
+
+def whole(path: Path) -> dict[str, list[Any]]:
+    """Every column as values, for comparison: NaN as None, with their types."""
+    with store.open_store(path) as kept:
+        columns = kept.columns()
+        return {name: [store.to_sql(value) for value in columns[name].tolist()] for name in columns}
+
+
+def in_sqlite(path: Path) -> int:
+    db = sqlite3.connect(path)
+    try:
+        return int(db.execute("SELECT COUNT(*) FROM trials").fetchone()[0])
+    finally:
+        db.close()
+
+
+ALL = [row(trial) for trial in range(POINTS * EACH)]
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The same rows, out of order and some of them failed, in SQLite alone and with parts."""
+    folder = tmp_path_factory.mktemp("both")
+    rows = [row(trial, failed=trial % 29 == 5) for trial in range(POINTS * EACH)]
+    random.Random(3).shuffle(rows)
+    rows = sorted(rows[:100], key=lambda one: one.trial // 60) + rows[100:]
+    with pytest.MonkeyPatch.context() as patch:
+        for name, size in {"MOST_ROWS": 50, "PART_ROWS": 20}.items():
+            patch.setattr(store, name, size)
+        return filled(folder / "one.sqlite", rows, parts=False), filled(folder / "parts.sqlite", rows)
+
+
+# One table.
+
+
+def test_rows_beyond_the_limit_are_in_parts(tmp_path: Path) -> None:
+    path = filled(tmp_path / "s.sqlite", ALL)
+    files = sorted((tmp_path / "s.parts").iterdir())
+    assert [file.name for file in files] == [f"{n:06d}.parquet" for n in range(1, 6)]
+    assert in_sqlite(path) == 20
+    assert all(len(row_parts.read_column(file, "seed")) == 20 for file in files)
+    few = filled(tmp_path / "few.sqlite", ALL[:50])
+    assert (in_sqlite(few), (tmp_path / "few.parts").exists()) == (50, False)
+    assert whole(path)["trial"] == list(range(POINTS * EACH))
+
+
+def test_both_are_one_table(both: tuple[Path, Path]) -> None:
+    one, other = both
+    assert (in_sqlite(one), in_sqlite(other)) == (120, 20)
+    assert whole(one) == whole(other)
+    with store.open_store(one) as kept, store.open_store(other) as parted:
+        assert parted.counts() == kept.counts() == {"done": 120, "failed": 4, "wrong": 3}
+        assert parted.done(130).tolist() == kept.done(130).tolist() == [True] * 120 + [False] * 10
+        assert parted.failures() == kept.failures()
+        assert parted.scenes() == kept.scenes()
+        assert parted.trial_range() == kept.trial_range() == "0 to 119"
+        for trial in range(0, 120, 7):
+            assert parted.trial(trial) == kept.trial(trial)
+            assert list(map(type, parted.trial(trial).values())) == list(map(type, kept.trial(trial).values()))
+        with pytest.raises(InputError, match=r"trial 120: not in .*; allowed: 0 to 119"):
+            parted.trial(120)
+        for points in [(0,), (1,), (2,), (0, 2), (0, 1, 2), (1,), (3,)]:
+            same(parted.point_columns(*points), kept.point_columns(*points))
+        columns = parted.columns()
+        for number in range(0, 120, 7):
+            same(columns.row(number), row_parts.subset(columns, slice(number, number + 1)))
+        same(parted.columns(failed=False), kept.columns(failed=False))
+        assert len(parted.columns(failed=False)["trial"]) == 116
+
+
+def same(columns: Any, others: Any) -> None:
+    assert list(columns) == list(others)
+    for name in columns:
+        np.testing.assert_array_equal(columns[name], others[name])
+        assert columns[name].dtype == others[name].dtype
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_exports_have_the_same_bytes(both: tuple[Path, Path], tmp_path: Path, suffix: str) -> None:
+    for path in both:
+        with store.open_store(path) as kept:
+            export.export(kept, ("identified",), tmp_path / f"{path.stem}.{suffix}")
+    one, parts = ((tmp_path / f"{path.stem}.{suffix}").read_bytes() for path in both)
+    assert one == parts
+    assert len(one) > 4000
+
+
+def test_an_export_reads_some_trials_at_a_time(both: tuple[Path, Path], tmp_path: Path) -> None:
+    pyarrow = pytest.importorskip("pyarrow.parquet")
+    with store.open_store(both[1]) as kept, pytest.MonkeyPatch.context() as patch:
+        patch.delattr(store.Store, "columns")
+        assert [len(block["trial"]) for block in kept.blocks()] == [30, 30, 30, 30]
+        export.export(kept, ("identified",), tmp_path / "rows.parquet")
+        export.export(kept, ("identified",), tmp_path / "rows.csv")
+    assert pyarrow.ParquetFile(tmp_path / "rows.parquet").num_row_groups == 4
+    found = pyarrow.read_table(tmp_path / "rows.parquet").to_pydict()
+    assert {name: found[name] for name in store.COLUMNS} == whole(both[1])
+    assert found["strays"] == np.repeat([0, 1, 2], EACH).tolist()
+
+
+def test_tables_and_worst_trials_are_the_same(both: tuple[Path, Path]) -> None:
+    asked = plan.Study.model_validate(
+        {"schema": 1, "title": "strays", "scene": "shefex2", "seed": 1, "trial": {"kind": "centroids"}}
+        | {"factors": {"strays": {"key": "trial.false_lights", "values": [0, 1, 2]}}, "responses": ["identified"]}
+    )
+    names, found = ("identified", "cross_arcsec_rms", "roll_arcsec_p90", "failed", "time_ms_mean"), []
+    for path in both:
+        with store.open_store(path) as kept:
+            rows = table.table(kept, names)
+            chosen = [worst.worst_of_levels(asked, kept, "roll_arcsec", {"strays": n}) for n in range(POINTS)]
+            found.append(repr((rows, chosen)))
+    assert found[0] == found[1]
+
+
+# Kept through everything.
+
+
+class Killer:
+    """Ends this process by SIGKILL in the step of a move that is named."""
+
+    def __init__(self, step: str) -> None:
+        self.step, self.listed = step, False
+
+    def __call__(self, step: str) -> None:
+        if step == self.step:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def trace(self, sql: str) -> None:
+        """A statement of the writer's connection, before it is executed."""
+        for start in ("INSERT INTO parts", "DELETE FROM trials", "DELETE FROM timings"):
+            if sql.startswith(start):
+                self.listed = True
+                self(start)
+        if self.listed and sql.startswith("COMMIT"):
+            self("COMMIT")
+        if self.listed and sql.startswith("INSERT OR REPLACE INTO trials"):
+            self("next batch")
+
+
+STEPS = ["arrow", "written", "rename", "renamed"]
+STEPS += ["INSERT INTO parts", "DELETE FROM trials", "DELETE FROM timings", "COMMIT", "next batch"]
+
+
+def die_in_step(path: Path, step: str) -> None:
+    """Add rows until the step of a move in which this process is killed."""
+    kill, sync, to_arrow, replace = Killer(step), row_parts.sync, row_parts.to_arrow, os.replace
+
+    def dying(before: str, does: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *arguments: (kill(before), does(*arguments))[1]
+
+    row_parts.to_arrow = dying("arrow", to_arrow)
+    row_parts.sync = lambda path: dying("renamed" if path.is_dir() else "written", sync)(path)
+    os.replace = dying("rename", replace)
+    with begun(path) as kept:
+        kept.db.set_trace_callback(kill.trace)
+        add_all(kept, ALL)
+
+
+def forked(does: Callable[[], object]) -> int:
+    """The status of a process of its own that does something."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            does()
+        finally:
+            os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_a_kill_in_any_step_of_a_move_loses_nothing_and_doubles_nothing(step: str, tmp_path: Path) -> None:
+    path = tmp_path / "s.sqlite"
+    assert forked(partial(die_in_step, path, step)) == -signal.SIGKILL
+    files = sorted((tmp_path / "s.parts").iterdir())
+    assert len(files) == {"arrow": 0, "next batch": 3}.get(step, 1)
+    kept_rows = 0 if step == "next batch" else 60
+    assert in_sqlite(path) == kept_rows
+    expected = {name: values[:60] for name, values in whole(filled(tmp_path / "whole.sqlite", ALL)).items()}
+    assert whole(path) == expected
+    with store.writing(path) as kept:
+        # What is not listed is gone, and the move that was cut off is made up for.
+        assert sorted(part.path for part in kept.parts()) == sorted((tmp_path / "s.parts").iterdir())
+        assert kept.db.execute("SELECT COUNT(*) FROM timings").fetchone()[0] == in_sqlite(path) < 50
+        assert kept.counts()["done"] == 60
+        add_all(kept, ALL[60:])
+    assert whole(path) == whole(tmp_path / "whole.sqlite")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["serial", "pool"])
+def test_killed_at_any_instant_a_study_ends_with_the_same_rows(engine: str, tmp_path: Path) -> None:
+    """Six kills of the process that stores, while it moves rows every few milliseconds."""
+    (tmp_path / "strays.yaml").write_text(STUDY)
+    told, draw = loader.load(tmp_path / "strays.yaml"), random.Random(2)
+    done(told, tmp_path / "whole.sqlite")
+    often, killed = tmp_path / "often.sqlite", 0
+
+    def run() -> None:
+        runs = engines.Serial() if engine == "serial" else engines.Pool(2)
+        done(told, often, runs, resume=often.is_file() and len(whole(often)["trial"]) > 0)
+
+    for _ in range(6):
+        pid = os.fork()
+        if pid == 0:
+            try:
+                run()
+            finally:
+                os._exit(0)
+        time.sleep(draw.uniform(0.3, 1.0) + 2.0 * (engine == "pool"))
+        os.kill(pid, signal.SIGKILL)
+        killed += os.waitpid(pid, 0)[1] == signal.SIGKILL
+        if often.is_file():
+            numbers = whole(often)["trial"]
+            assert len(numbers) == len(set(numbers))
+    assert killed
+    if len(whole(often)["trial"]) < told.trials:
+        run()
+    without_time = [
+        {k: v for k, v in whole(path).items() if k != "time_ms"} for path in (tmp_path / "whole.sqlite", often)
+    ]
+    assert without_time[0] == without_time[1]
+    assert len(list((tmp_path / "often.parts").iterdir())) >= 4
+
+
+def test_files_that_are_not_listed_are_removed(tmp_path: Path) -> None:
+    """Those of a run that was killed, and those of a study whose store was deleted."""
+    path = filled(tmp_path / "s.sqlite", ALL)
+    stray = tmp_path / "s.parts/000009.parquet"
+    stray.write_bytes((tmp_path / "s.parts/000001.parquet").read_bytes())
+    with store.open_store(path) as kept:  # who only reads removes nothing
+        assert kept.counts()["done"] == len(kept.columns()["trial"]) == 120
+        assert stray.is_file()
+    with store.writing(path) as kept:
+        assert not stray.exists()
+        assert kept.counts()["done"] == len(kept.columns()["trial"]) == 120
+    path.unlink()
+    with store.writing(path) as kept:
+        assert not list((tmp_path / "s.parts").iterdir())
+        assert len(kept.columns()["trial"]) == 0
+
+
+def test_a_study_with_parts_grows(tmp_path: Path) -> None:
+    """Trials get new numbers, those in parts too."""
+    rows = [row(point * 50 + n, each=50) for point in range(POINTS) for n in range(50)]
+    with begun(tmp_path / "whole.sqlite", 50) as kept:
+        add_all(kept, rows)
+    path = filled(tmp_path / "s.sqlite", ALL)
+    with store.writing(path) as kept:
+        kept.point_columns(1)
+        kept.begin(POINT, (EACH, 50), replicates="50")
+        numbers = kept.columns()["trial"].tolist()
+        assert numbers == [point * 50 + n for point in range(POINTS) for n in range(EACH)]
+        assert np.flatnonzero(kept.done(150)).tolist() == numbers
+        assert kept.point_columns(1)["replicate"].tolist() == list(range(EACH))
+        add_all(kept, [one for one in rows if one.replicate >= EACH])
+    assert whole(path) == whole(tmp_path / "whole.sqlite")
+
+
+def test_failed_trials_are_run_again(tmp_path: Path) -> None:
+    rows = [row(trial, failed=trial % 10 == 3) for trial in range(POINTS * EACH)]
+    path = filled(tmp_path / "s.sqlite", rows)
+    with store.writing(path) as kept:
+        kept.delete_failed()
+        missing = np.flatnonzero(~kept.done(POINTS * EACH)).tolist()
+        assert missing == list(range(3, POINTS * EACH, 10))
+        kept.add([ALL[trial] for trial in missing])
+    assert whole(path) == whole(filled(tmp_path / "whole.sqlite", ALL))
+
+
+def test_failed_trials_alone_never_move(tmp_path: Path) -> None:
+    path = filled(tmp_path / "s.sqlite", [row(trial, failed=True) for trial in range(POINTS * EACH)])
+    assert in_sqlite(path) == POINTS * EACH
+    assert not list(tmp_path.glob("s.parts/*"))
+
+
+def test_a_reader_sees_one_instant(tmp_path: Path) -> None:
+    """Rows that move while it reads are seen once: neither twice nor not at all."""
+    path = filled(tmp_path / "s.sqlite", ALL[:50])
+    with store.writing(path) as kept, store.open_store(path) as reader:
+
+        def move(sql: str) -> None:
+            if "LEFT JOIN timings" in sql and in_sqlite(path) == 50:
+                kept.add(ALL[50:60])
+
+        reader.db.set_trace_callback(move)
+        before = reader.columns()
+        reader.db.set_trace_callback(None)
+        assert in_sqlite(path) < 50
+        assert before["trial"].tolist() == list(range(50))
+        assert reader.columns()["trial"].tolist() == list(range(60))
+        assert reader.point_columns(0)["replicate"].tolist() == list(range(EACH))
+
+
+def test_search_reads_the_rows_that_it_has_just_added(tmp_path: Path) -> None:
+    """Points are read together with their neighbors, but never from before the last rows."""
+    with begun(tmp_path / "s.sqlite") as kept:
+        add_all(kept, ALL[:90])
+        assert len(kept.point_columns(2)["trial"]) == 10
+        kept.add(ALL[90:100])
+        assert len(kept.point_columns(2)["trial"]) == 20
+
+
+# What can be wrong with them.
+
+
+def test_a_part_that_is_missing_or_damaged_is_named(tmp_path: Path) -> None:
+    path = filled(tmp_path / "s.sqlite", ALL)
+    part = tmp_path / "s.parts/000002.parquet"
+    data = part.read_bytes()
+    for change in (lambda: part.write_bytes(data[:-9]), lambda: part.write_bytes(b"no"), part.unlink):
+        change()
+        with (
+            store.open_store(path) as kept,
+            pytest.raises(InputError, match=r"000002\.parquet: not a valid part") as found,
+        ):
+            kept.columns()
+        assert "\n" not in str(found.value)
+
+
+def test_an_earlier_skysim_refuses_a_store_with_parts(tmp_path: Path) -> None:
+    """It would not see their rows; a store without parts stays what it was, also without the table of the parts."""
+    with store.open_store(filled(tmp_path / "s.sqlite", ALL)) as kept:
+        assert kept.meta("format") == "5"
+    with store.writing(filled(tmp_path / "few.sqlite", ALL[:20])) as kept:
+        kept.db.execute("DROP TABLE parts")
+    with store.open_store(tmp_path / "few.sqlite") as kept:
+        assert kept.meta("format") == "4"
+        assert kept.counts()["done"] == len(kept.columns()["trial"]) == 20
+
+
+def test_columns_are_dropped_when_they_are_too_many_to_keep(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def source(name: str) -> np.ndarray:
+        asked.append(name)
+        return np.arange(100.0)
+
+    rows = row_parts.Rows(("a", "b", "c"), [source], [100], np.arange(100)[::-1])
+    assert rows["a"] is rows["a"]
+    monkeypatch.setattr(row_parts, "KEPT_BYTES", 1000)
+    for name in ("b", "c", "a", "a"):
+        assert rows[name][0] == 99.0
+    assert asked == ["a", "b", "c", "a"]
+    with pytest.raises(KeyError):
+        rows["d"]
