@@ -60,9 +60,13 @@ def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(monkeypa
             hand = served[-2 if next_one == 3 else -1][1]
             assert hand is not None
             hand.close()
+            if next_one == 3:
+                tabs.append(asyncio.create_task(tab(TABS)))  # a newcomer looks at once, and yet is the last
             await tabs[next_one]
             assert served[-1][0] == next_one
             assert len(Hand.alive) == WORKERS
+        gone.add(TABS)
+        await tabs[TABS]
         assert spare.queue == []
 
     asyncio.run(asyncio.wait_for(story(), 60))

@@ -8,13 +8,10 @@ import signal
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from nicegui import ui
-from nicegui.events import KeyEventArguments
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.page import forms, keys, style
@@ -26,17 +23,17 @@ from skysim.apps.gui.page.panels.photo import PhotoPanel
 from skysim.apps.gui.page.panels.plan import PlanPanel
 from skysim.apps.gui.page.panels.run import RunPanel
 from skysim.apps.gui.page.panels.scene import ScenePanel
+from skysim.apps.gui.page.shell.actions import Actions
 from skysim.apps.gui.page.shell.arrangement import Arrangement
 from skysim.apps.gui.page.shell.help import help_dialog
 from skysim.apps.gui.page.shell.history import History
 from skysim.apps.gui.page.shell.log import LogPanel
-from skysim.apps.gui.page.shell.palette import Command, Palette
+from skysim.apps.gui.page.shell.palette import Palette
 from skysim.apps.gui.page.shell.wording import for_page
 from skysim.apps.gui.page.space.space import Scene3D
 from skysim.apps.gui.state import View
 from skysim.apps.gui.worker import export
 from skysim.apps.gui.worker.photo import Photo
-from skysim.apps.gui.worker.scene import pointing
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
@@ -54,7 +51,6 @@ class Tab:
     state : what the page shows;  view : the newest frame of the scene
     feedback : of the scene's controller; None without a controller
     solving : whether every frame is solved
-    steps : (3,) right, up, roll: movements requested by keys that no frame shows yet
     """
 
     session: Session
@@ -68,7 +64,6 @@ class Tab:
         self.view: FrameView | None = None
         self.feedback: str | None = None
         self.solving, self.is_open, self.restarting = True, True, False
-        self.steps, self.moving = np.zeros(3), False
         self.message_text = ""
         self.editing = asyncio.Lock()
 
@@ -123,9 +118,10 @@ class Tab:
                     if key.description:
                         ui.html(f"<span><kbd>{key.label}</kbd>{key.description}</span>", sanitize=False)
         self.help = help_dialog()
-        ui.keyboard(on_key=self.key, ignore=["input", "textarea"])
+        self.actions = Actions(self, PANELS)
+        ui.keyboard(on_key=self.actions.key, ignore=["input", "textarea"])
         self.history = History(self, self.scene)
-        self.palette = Palette(self.commands)
+        self.palette = Palette(self.actions.commands)
         self.arrangement = Arrangement([self.run_panel.strips.chart, self.study_panel.chart])
 
     def build_header(self) -> None:
@@ -183,24 +179,6 @@ class Tab:
                     self.photo = PhotoPanel(self)
                 with ui.tab_panel("Log"):
                     self.log_panel = LogPanel(self)
-
-    def commands(self) -> list[Command]:
-        """Every action with its key: those of keys, the panels, the exports."""
-        found = [
-            Command(key.help, key.label, partial(self.perform, key.action))
-            for key in keys.KEYS
-            if key.action in keys.PERFORMED
-        ]
-        found += [
-            Command("show the next frame of the flight", ".", partial(self.run_panel.step, 1)),
-            Command("show the previous frame of the flight", ",", partial(self.run_panel.step, -1)),
-            Command("undo the last change", "Ctrl Z", self.history.undo),
-            Command("redo the change that was undone", "Ctrl Shift Z", self.history.redo),
-            Command("compute the flight of the scene, or stop that", "", self.run_panel.simulate),
-            Command("change between the dark and the light theme", "", self.arrangement.toggle),
-        ]
-        found += [Command(f"panel: {name}", "", partial(self.tabs.set_value, name)) for name in PANELS]
-        return found + [Command(f"export: {name}", "", partial(self.export, name)) for name in export.FILE_BY_ITEM]
 
     # Actions.
 
@@ -408,69 +386,3 @@ class Tab:
         else:
             reason = "no solution yet: press 1" if name == "solution.json" else "not known of an image from elsewhere"
             self.show_message(f"{kind}: {reason}")
-
-    # Keys.
-
-    async def key(self, event: KeyEventArguments) -> None:
-        name = event.key.name.lower() if len(event.key.name) == 1 else event.key.name
-        action = keys.ACTION_BY_KEY.get(name)
-        if not event.action.keydown or action is None or event.modifiers.ctrl or event.modifiers.meta:
-            return
-        if self.palette.dialog.value or (self.help.value and action not in ("help", "close")):
-            return
-        if action == "move":
-            right, up, roll_sign = keys.MOVES[name]
-            step = pointing.COARSE if event.modifiers.shift else pointing.FINE
-            roll = pointing.ROLL_COARSE_DEG if event.modifiers.shift else pointing.ROLL_FINE_DEG
-            await self.move(right * step, up * step, roll_sign * roll)
-        elif action == "step":
-            await self.run_panel.step(1 if name == "." else -1)
-        elif not event.action.repeat:
-            await self.perform(action)
-
-    async def move(self, right: float, up: float, roll_deg: float) -> None:
-        """Move the camera; steps requested while a frame is rendered are summed for the next frame."""
-        self.stop_playback()
-        self.show_message("")
-        self.steps += (right, up, roll_deg)
-        if self.moving:
-            return
-        self.moving = True
-        try:
-            while self.steps.any():
-                steps, self.steps = self.steps.tolist(), np.zeros(3)
-                await self.show_live(self.session.run("move", *steps, self.solving))
-                await self.sensor.wait_drawn()
-        finally:
-            self.moving = False
-
-    async def perform(self, action: str) -> None:
-        self.show_message("")
-        if action == "identify":
-            self.stop_playback()
-            await self.show_live(self.session.run("render", True))
-            if self.view and self.view.result and self.scene_info:
-                self.log_panel.identified(self.view, self.scene_info)
-        elif action == "noise":
-            self.noise.set_value(not self.noise.value)
-        elif action == "monte_carlo":
-            self.tabs.set_value("Monte Carlo")
-            await self.study_panel.start()
-        elif action == "play":
-            self.run_panel.toggle()
-        elif action == "live":
-            await self.go_live()
-        elif action == "attitude":
-            self.attitude.inputs[0].run_method("focus")
-            self.attitude.inputs[0].run_method("select")
-        elif action in ("sensor", "identifier"):
-            self.attitude.stages["detector" if action == "sensor" else "identifier"].run_method("showPopup")
-        elif action == "runs":
-            self.tabs.set_value("Monte Carlo")
-            self.study_panel.count.run_method("focus")
-        elif action == "log":
-            self.tabs.set_value("Log")
-        elif action == "help":
-            self.help.set_value(not self.help.value)
-        elif action == "close":
-            self.help.close()

@@ -113,14 +113,15 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-space > .lab-names {{ pointer-events: none }}
 .lab-tag {{ position: absolute; left: 0; top: 0; pointer-events: none; color: #fff; background: #0d1015b0 }}
 .lab-looks {{ position: absolute; right: 20px; top: 14px; display: flex; gap: 4px }}
-.lab-looks > .q-btn {{ color: #9cc4ff !important; background: #0d1015b0 !important }}
+.lab-looks > .q-btn {{ color: #9cc4ff; background: #0d1015b0 }}
 .lab-push {{ position: absolute; right: 20px; top: 46px; display: flex; gap: 10px; align-items: center;
-  color: #d7dce4; background: #0d1015b0 }} .lab-push > .q-btn {{ color: #9cc4ff !important }}
+  color: #d7dce4; background: #0d1015b0 }} .lab-push > .q-btn {{ color: #9cc4ff }}
 .lab-lights {{ width: 100%; border-collapse: collapse; cursor: default; text-align: right }}
 .lab-lights th {{ position: sticky; top: -10px; font-weight: normal; color: {COLORS["quiet"]};
   background: {COLORS["panel"]} }}
 .lab-lights tr > :first-child {{ text-align: left }} .lab-lights tr.ringed {{ background: {COLORS["line"]} }}
-.lab-turn {{ position: absolute; left: 24px; bottom: 16px; font-size: 11px; pointer-events: none }}
+.lab-turn {{ position: absolute; left: 24px; bottom: 16px; font-size: 11px; pointer-events: none; color: #aab3c2;
+  background: #0d1015b0; padding: 0 4px }}
 .stale {{ opacity: .45 }}
 .lab-side {{ display: grid; grid-template: auto auto minmax(0, 1fr) / minmax(0, 1fr);
   border-left: 1px solid {COLORS["line"]}; min-height: 0; min-width: 0; background: {COLORS["panel"]} }}

@@ -33,7 +33,9 @@ class PushControl:
         canvas.on("release", self.released)
         with ui.element("div").classes("lab-push") as self.bar:
             self.label = ui.label().classes("mono").mark("push")
-            button = ui.button("reset", on_click=self.reset).props("dense outline size=xs").mark("push-reset")
+            button = (
+                ui.button("reset", color=None, on_click=self.reset).props("dense outline size=xs").mark("push-reset")
+            )
             button.props('title="back to the attitude before the push"')
         self.bar.set_visibility(False)
 

@@ -42,10 +42,11 @@ class Scene3D:
         self.canvas = Space().classes("w-full h-full").mark("space")
         with ui.element("div").classes("lab-looks"):
             for name, text in VIEWS.items():
-                button = ui.button(name, on_click=lambda name=name: self.look(name)).props("dense outline size=xs")
+                button = ui.button(name, color=None, on_click=lambda name=name: self.look(name))
+                button.props("dense outline size=xs")
                 button.props(f'title="look {text}"').mark(f"look-{name}")
         hint = ui.label("drag: rotate · drag the vehicle: push it · right drag: pan · wheel: zoom")
-        hint.classes("lab-turn quiet")
+        hint.classes("lab-turn")
         self.push = PushControl(tab, self.canvas)
         ui.timer(UPDATE_S, self.update)
 

@@ -100,7 +100,7 @@ export default {
           const fetched = same ? this.drawn : await this.fetchFrame(view.src);
           if (!fetched && view === this.wanted) break;
           if (!fetched) continue;
-          if (String(fetched.size) !== String(this.drawn?.size)) this.zoom = this.cut = this.pinned = null;
+          if (String(fetched.size) !== String(this.drawn?.size)) this.forget();
           this.drawn = { ...fetched, ...view, view, lens };
           if (same) this.paint();
           else this.recolor();
@@ -109,6 +109,11 @@ export default {
       } finally {
         this.fetching = false;
       }
+    },
+    // What was chosen on a frame of another size.
+    forget() {
+      this.zoom = this.cut = this.pinned = null;
+      this.clearLoupe();
     },
     // A frame's pixels with their sample, its pointing and its marks; null if the server is unreachable or holds only
     // newer frames, which it will announce.
@@ -237,7 +242,9 @@ export default {
       this.writeReadout();
     },
     paintLoupe() {
-      const canvas = this.$refs.loupe, at = this.cursor ?? this.pinned, pen = at && this.sized(canvas);
+      const at = this.cursor ?? this.pinned;
+      if (!at) return this.clearLoupe(); // the pixels of an earlier frame must not stay
+      const canvas = this.$refs.loupe, pen = this.sized(canvas);
       if (!pen) return;
       const { width, height, offset, step } = this.drawn.pixels, { across, down } = LOUPE;
       const x = Math.min(Math.max(Math.round(at[0]) - (across >> 1), 0), Math.max(width - across, 0));
@@ -249,6 +256,10 @@ export default {
       const crosses = this.drawn.lights.filter((light) => light[3]);
       drawLoupe(pen, { x, y, across, down, dn }, gray, crosses, [canvas.clientWidth, canvas.clientHeight], CROSS);
       canvas.ariaLabel = `pixels from ${x} ${y}, ${across} by ${down}: ${dn.map((value) => value.toFixed(0)).join(" ")}`;
+    },
+    clearLoupe() {
+      this.$refs.loupe.width = 0;
+      this.$refs.loupe.ariaLabel = "";
     },
     writeReadout() {
       const readout = this.$refs.readout, at = this.cursor ?? this.pinned;
