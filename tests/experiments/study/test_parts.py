@@ -20,7 +20,7 @@ from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan, store
 from skysim.experiments.study.analysis import table, worst
 from skysim.experiments.study.designs import Point
-from skysim.experiments.study.execution import engines
+from skysim.experiments.study.execution import engines, runner
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.report import export
@@ -284,33 +284,44 @@ def test_a_kill_in_any_step_of_a_move_loses_nothing_and_doubles_nothing(step: st
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["serial", "pool"])
-def test_killed_at_any_instant_a_study_ends_with_the_same_rows(engine: str, tmp_path: Path) -> None:
+def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
+    engine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Six kills of the process that stores, while it moves rows every few milliseconds."""
     (tmp_path / "strays.yaml").write_text(STUDY)
     told, draw = loader.load(tmp_path / "strays.yaml"), random.Random(2)
     done(told, tmp_path / "whole.sqlite")
     often, killed = tmp_path / "often.sqlite", 0
+    monkeypatch.setattr(runner, "CHUNK_S", 0.0)  # one trial a chunk
 
-    def run() -> None:
+    def run(pause_s: float = 0.02) -> None:
         runs = engines.Serial() if engine == "serial" else engines.Pool(2)
-        done(told, often, runs, resume=often.is_file() and len(whole(often)["trial"]) > 0)
+        done(told, often, runs, stored() > 0, lambda progress: time.sleep(pause_s))
+
+    def stored() -> int:
+        try:
+            with store.open_store(often) as kept:
+                return kept.counts()["done"]
+        except InputError:  # no store yet
+            return 0
 
     for _ in range(6):
-        pid = os.fork()
+        pid, before, end = os.fork(), stored(), time.monotonic() + 30
         if pid == 0:
             try:
                 run()
             finally:
                 os._exit(0)
-        time.sleep(draw.uniform(0.3, 1.0) + 2.0 * (engine == "pool"))
+        while stored() == before < told.trials and time.monotonic() < end:
+            time.sleep(0.005)
+        time.sleep(draw.uniform(0.0, 0.3))
         os.kill(pid, signal.SIGKILL)
         killed += os.waitpid(pid, 0)[1] == signal.SIGKILL
         if often.is_file():
             numbers = whole(often)["trial"]
             assert len(numbers) == len(set(numbers))
-    assert killed
-    if len(whole(often)["trial"]) < told.trials:
-        run()
+    assert killed >= 3
+    run(0.0)
     without_time = [
         {k: v for k, v in whole(path).items() if k != "time_ms"} for path in (tmp_path / "whole.sqlite", often)
     ]
