@@ -35,6 +35,12 @@ def test_a_trial_is_the_same_whatever_was_tried_before():
     assert [row[:8] for row in again] == [row[:8] for row in (first[13], first[0])]
 
 
+@pytest.mark.parametrize("spec", [SKY, DOME], ids=["sky", "dome"])
+def test_trials_without_noise_are_solved(spec: TrialSpec) -> None:
+    for row in trials.run_segments(spec, (trials.Segment(0, {"trial.noise_px": 0.0}, 0, range(3)),)):
+        assert (row.error, row.outcome.status, row.outcome.wrong) == (None, "solved", 0)
+
+
 def test_pairs_of_points_share_attitude_and_noise_unless_told_otherwise():
     unpaired = replace(SKY, paired=False)
     assert setups.seed_of(SKY, 1, 7) == setups.seed_of(SKY, 2, 7) != setups.seed_of(SKY, 1, 8)

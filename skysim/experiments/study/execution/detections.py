@@ -22,6 +22,7 @@ from skysim.simulation.exposure import occlusion_test
 from skysim.simulation.testbed import Testbed, exposure_window, sky_during
 from skysim.sources.dome.led import lit_moments_s
 
+LEAST_SIGMA_PX = 1e-3
 FLUX_NOISE = 0.02  # relative, of a light in a frame; above that of rendered ones (benchmarks/codes.py)
 
 
@@ -62,9 +63,11 @@ def simulate_detections(
 ) -> Centroids:
     """Simulated detections, brightest first: some true sources missed, all with noise, false detections added.
 
+    Each claims its true error, or LEAST_SIGMA_PX without noise: a tracker takes no detection without an error.
     The flux of a false detection is that of a random true source, including those that `visible_sources` leaves out.
     """
     # Draw noise for all sources, also the missing ones, so that the stream does not depend on which are missing.
+    sigma_px = max(trial.noise_px, LEAST_SIGMA_PX)
     detected = np.flatnonzero(rng.random(len(xy_px)) >= trial.missing)
     flux = electrons / scene.camera.detector.gain_e_dn
     flux = flux * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(xy_px)))
@@ -72,13 +75,13 @@ def simulate_detections(
     detected = detected[np.argsort(-flux[detected], kind="stable")][: trial.lights]
     false = trial.false_lights + round(len(detected) * trial.false_share / (1 - trial.false_share))
     if not false:
-        return Centroids(xy_px[detected], np.full(len(detected), trial.noise_px), flux[detected])
+        return Centroids(xy_px[detected], np.full(len(detected), sigma_px), flux[detected])
     false_px = rng.random((false, 2)) * [scene.camera.width_px, scene.camera.height_px] - 0.5
     false_flux = flux[rng.integers(len(flux), size=false)] if len(flux) else rng.random(false) + 1.0
     all_flux = np.concatenate([flux[detected], false_flux])
     order = np.argsort(-all_flux, kind="stable")
-    sigma_px = np.full(len(order), trial.noise_px)
-    return Centroids(np.concatenate([xy_px[detected], false_px])[order], sigma_px, all_flux[order])
+    all_px = np.concatenate([xy_px[detected], false_px])
+    return Centroids(all_px[order], np.full(len(order), sigma_px), all_flux[order])
 
 
 def solve_coded(
