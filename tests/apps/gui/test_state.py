@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from labpage import (
     status,
 )
 
+from skysim.apps.gui.page.shell import history
 from skysim.apps.gui.state import View
 from skysim.core.errors import InputError
 
@@ -74,6 +76,24 @@ def test_steps_are_told_from_continuous_changes() -> None:
     assert view.same_step(replace(view, t_s=1.0, angles_deg=(1.0, 2.0, 3.0)))
     for other in (replace(view, kind="live"), replace(view, overrides={"a": "b"}), replace(view, trial=3)):
         assert not view.same_step(other)
+
+
+def test_a_movement_is_one_step_and_replaces_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However soon after a page's opening or an edit it begins."""
+    sent: list[str] = []
+    monkeypatch.setattr(history.ui, "run_javascript", sent.append)
+    tab = SimpleNamespace(state=VIEWS[0], view=object(), run_panel=SimpleNamespace(wanted_s=None))
+    written = history.History.__new__(history.History)
+    written.tab, written.home, written.written = tab, "shefex2", None
+    written.showing, written.moving, written.unchanged = False, False, 0
+    turned = [replace(VIEWS[0], angles_deg=(float(n), 0.0, 0.0)) for n in range(3)]
+    edited = replace(turned[2], overrides={"camera.f_number": "2"})
+    after = replace(edited, angles_deg=(9.0, 0.0, 0.0))
+    pushed = []
+    for tab.state in (VIEWS[0], *turned, edited, after):
+        written.write()
+        pushed.append(", true," in sent[-1])
+    assert pushed == [False, True, False, False, True, True]
 
 
 # In the browser.

@@ -52,13 +52,13 @@ class History:
 
     home : the server's scene; a stored view is that of a server for the same one
     written : the view in the address;  pending : the newest query that is asked for while another is being shown
-    unchanged : times of the timer since the last change
+    moving : whether the last change was of attitude or time alone;  unchanged : times of the timer since then
     """
 
     def __init__(self, tab: Tab, home: str) -> None:
         self.tab, self.home = tab, home
         self.written: View | None = None
-        self.showing, self.unchanged = False, 0
+        self.showing, self.moving, self.unchanged = False, False, 0
         self.pending: str | None = None
         ui.add_body_html(f"<script>{JS}</script>")
         ui.on("view", self.asked)
@@ -69,15 +69,17 @@ class History:
         return str(await ui.run_javascript(f"skysimHistory.read({json.dumps(self.home)})", timeout=10) or "")
 
     def write(self) -> None:
-        """Timer: write a changed view; continuous changes replace the address, others add a step."""
+        """Timer: write a changed view; a movement that goes on replaces the address, other changes add a step."""
         view = self.tab.state
         waits = self.showing or self.tab.view is None or self.tab.run_panel.wanted_s is not None
         if view is self.written or waits:
             self.unchanged += 1
             return
         before, self.written = self.written, view
-        push = before is not None and before != view and (self.unchanged >= SETTLED or not view.same_step(before))
-        self.unchanged = 0
+        moves = before is not None and view.same_step(before)
+        goes_on = moves and self.moving and self.unchanged < SETTLED
+        push = before is not None and before != view and not goes_on
+        self.moving, self.unchanged = moves, 0
         arguments = ", ".join(json.dumps(value) for value in (view.query(), push, self.home))
         ui.run_javascript(f"skysimHistory.write({arguments})")
 
@@ -89,7 +91,7 @@ class History:
 
     def adopt(self) -> None:
         """The address names the page's view already."""
-        self.written = self.tab.state
+        self.written, self.moving = self.tab.state, False
 
     async def asked(self, event: Any) -> None:
         """The browser has gone to another address of this page: show its view; of several, the newest."""
