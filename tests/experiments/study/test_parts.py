@@ -9,6 +9,7 @@ import sqlite3
 import time
 from collections.abc import Callable
 from functools import partial
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan, store
 from skysim.experiments.study.analysis import table, worst
 from skysim.experiments.study.designs import Point
-from skysim.experiments.study.execution import engines, runner
+from skysim.experiments.study.execution import engines, runner, workers
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.report import export
@@ -293,6 +294,7 @@ def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
     done(told, tmp_path / "whole.sqlite")
     often, killed = tmp_path / "often.sqlite", 0
     monkeypatch.setattr(runner, "CHUNK_S", 0.0)  # one trial a chunk
+    workers.start_fork_server()  # as an earlier test may have done
 
     def run(pause_s: float = 0.02) -> None:
         runs = engines.Serial() if engine == "serial" else engines.Pool(2)
@@ -309,6 +311,8 @@ def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
         pid, before, end = os.fork(), stored(), time.monotonic() + 30
         if pid == 0:
             try:
+                # The fork server is no child of this process, which needs its own.
+                forkserver._forkserver._forkserver_pid = None  # type: ignore[attr-defined]
                 run()
             finally:
                 os._exit(0)
