@@ -141,5 +141,5 @@ def timed(command: str, what: str, most_s: float, most: float, *words: str) -> I
 if __name__ == "__main__":
     for one in measure(*map(int, sys.argv[1:])):
         load = os.getloadavg()[0]
-        told = f"{one['value']:.4g} {one['unit']} (bar {one['bar']:g}); {one['peer']}; load {load:.1f}"
-        print(f"{one['name']}: {told}", flush=True)
+        text = f"{one['value']:.4g} {one['unit']} (bar {one['bar']:g}); {one['peer']}; load {load:.1f}"
+        print(f"{one['name']}: {text}", flush=True)

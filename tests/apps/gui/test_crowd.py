@@ -1,4 +1,4 @@
-"""More tabs than workers: those who are too many wait in their order, and keep nobody else waiting."""
+"""More tabs than workers: those beyond the limit wait in order, and delay no other tab."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ COAST_S = 60.0  # after a drag, until the vehicle is held
 class PushControl:
     """The drag, and the label and the button that are shown while the vehicle moves.
 
-    grip   : the newest one; None while nobody holds the vehicle;  held_s : when there was one last
+    grip   : the newest one; None while the vehicle is not held;  held_s : when there was one last
     before : attitude before the push, deg;  motion : of which frames are being computed; None if there is none
     """
 
