@@ -119,7 +119,7 @@ def _fitted_rotation(
     """
     unknowns = 4 if with_focal else 3
     normal, rows = np.empty((unknowns + 1, unknowns + 1)), np.empty((unknowns + 1, 2 * len(rays_cam)))
-    weight, step, covariance = np.repeat(1 / sigma_rad**2, 2), np.empty(unknowns), np.empty((unknowns, unknowns))
+    weight, step, covariance = np.repeat(1 / sigma_rad**2, 2), np.empty(unknowns), np.eye(unknowns)
     log_ratio, length = 0.0, np.nan
     for _ in range(30):
         _residual_rows(rays_cam, position_m, lever_cam_m, R, np.exp(log_ratio), rows)
@@ -134,8 +134,6 @@ def _fitted_rotation(
             break
     factor = normal[:unknowns, :unknowns]
     for i in range(unknowns):
-        for j in range(unknowns):
-            covariance[i, j] = 1.0 if i == j else 0.0
         cholesky_solve(factor, covariance[i])
     return np.exp(log_ratio), length, covariance
 

@@ -1,4 +1,4 @@
-"""What tests of studies share: what a store holds, and doing a study into one."""
+"""What tests of studies share: a study, what a store holds, and doing a study into one."""
 
 from __future__ import annotations
 
@@ -8,6 +8,18 @@ from pathlib import Path
 
 from skysim.experiments.study import plan, store
 from skysim.experiments.study.execution import engines, runner
+
+STRAYS = """
+schema: 1
+title: strays
+scene: shefex2
+seed: 1
+set: {light.limit_mag: 5.0}
+trial: {kind: centroids, lights: 15}
+factors: {strays: {key: trial.false_lights, values: [0, 5, 9]}}
+replicates: 40
+responses: [identified]
+"""
 
 
 def contents(path: Path) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from study_stores import done
+from study_stores import STRAYS, done
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan, store
@@ -30,17 +30,6 @@ from skysim.results.files import row_parts
 pytest.importorskip("pyarrow")
 POINTS, EACH, BATCH = 3, 40, 10
 POINT = [Point({"strays": n}, {"trial.false_lights": n}) for n in range(POINTS)]
-STUDY = """
-schema: 1
-title: strays
-scene: shefex2
-seed: 1
-set: {light.limit_mag: 5.0}
-trial: {kind: centroids, lights: 15}
-factors: {strays: {key: trial.false_lights, values: [0, 5, 9]}}
-replicates: 40
-responses: [identified]
-"""
 
 
 @pytest.fixture(autouse=True)
@@ -289,7 +278,7 @@ def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
     engine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Six kills of the process that stores, while it moves rows every few milliseconds."""
-    (tmp_path / "strays.yaml").write_text(STUDY)
+    (tmp_path / "strays.yaml").write_text(STRAYS)
     told, draw = loader.load(tmp_path / "strays.yaml"), random.Random(2)
     done(told, tmp_path / "whole.sqlite")
     often, killed = tmp_path / "often.sqlite", 0

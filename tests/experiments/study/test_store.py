@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from study_stores import contents, done
+from study_stores import STRAYS, contents, done
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan, store
@@ -25,23 +25,11 @@ from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.setups import Setup
 from skysim.experiments.study.execution.trials import Row
 
-STUDY = """
-schema: 1
-title: strays
-scene: shefex2
-seed: 1
-set: {light.limit_mag: 5.0}
-trial: {kind: centroids, lights: 15}
-factors: {strays: {key: trial.false_lights, values: [0, 5, 9]}}
-replicates: 40
-responses: [identified]
-"""
-
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory: pytest.TempPathFactory) -> plan.Plan:
     path = tmp_path_factory.mktemp("study") / "strays.yaml"
-    path.write_text(STUDY)
+    path.write_text(STRAYS)
     return loader.load(path)
 
 

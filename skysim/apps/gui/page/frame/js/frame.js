@@ -100,7 +100,7 @@ export default {
           const fetched = same ? this.drawn : await this.fetchFrame(view.src);
           if (!fetched && view === this.wanted) break;
           if (!fetched) continue;
-          if (String(fetched.size) !== String(this.drawn?.size)) this.forget();
+          if (String(fetched.size) !== String(this.drawn?.size)) this.zoom = this.cut = this.pinned = null;
           this.drawn = { ...fetched, ...view, view, lens };
           if (same) this.paint();
           else this.recolor();
@@ -109,11 +109,6 @@ export default {
       } finally {
         this.fetching = false;
       }
-    },
-    // What was chosen on a frame of another size.
-    forget() {
-      this.zoom = this.cut = this.pinned = null;
-      this.clearLoupe();
     },
     // A frame's pixels with their sample, its pointing and its marks; null if the server is unreachable or holds only
     // newer frames, which it will announce.
