@@ -224,11 +224,25 @@ def project(
     direction_cam, distance, cos_out = _directions(
         sources.place, motion, after_s, sources.normal, cam_from_lab, camera_m
     )
+    return _pixels(sources, optics, direction_cam), distance, cos_out, direction_cam[:, :, 2]
+
+
+def project_each(sources: Sources, optics: Optics, poses: Poses, ends: NDArray[np.int64]) -> tuple[Floats, ...]:
+    """As `project` at mid-exposure, of sources in groups, each at a pose of its own: the results are (N, 2) and (N,).
+
+    ends : (K + 1,) 0, and the number of sources up to the end of each group
+    """
+    direction_cam, distance, cos_out = _directions_each(sources.place, NO_MOTION, NOW, sources.normal, *poses, ends)
+    return _pixels(sources, optics, direction_cam), distance, cos_out, direction_cam[:, 2]
+
+
+def _pixels(sources: Sources, optics: Optics, direction_cam: Floats) -> Floats:
+    """(..., N, 2) pixels of (..., N, 3) directions, each source in its color."""
     xy_px = optics.project(direction_cam)
     if sources.chromatic is not None:
         camera = optics.camera
         xy_px += (xy_px - camera.center_px) * (sources.chromatic[:, 2:3] / camera.corner_px)
-    return xy_px, distance, cos_out, direction_cam[:, :, 2]
+    return xy_px
 
 
 @jit
@@ -262,6 +276,28 @@ def _directions(
                 for j in range(3):
                     turned += cam_from_lab[k, i, j] * offset[j]
                 direction[k, n, i] = turned
+    return direction, distance, cosine
+
+
+@jit
+def _directions_each(
+    place: Floats,
+    motion: Floats,
+    after_s: Floats,
+    normal: Floats,
+    cam_from_lab: Floats,
+    camera_m: Floats,
+    ends: NDArray[np.int64],
+) -> tuple[Floats, Floats, Floats]:
+    """As `_directions` of sources in groups, each at a pose of its own: (N, 3), (N,) and (N,)."""
+    direction, distance, cosine = np.empty((len(place), 3)), np.empty(len(place)), np.empty(len(place))
+    for k in range(len(ends) - 1):
+        a, b = ends[k], ends[k + 1]
+        own = _directions(place[a:b], motion, after_s, normal[a:b], cam_from_lab[k : k + 1], camera_m[k : k + 1])
+        for n in range(a, b):
+            distance[n], cosine[n] = own[1][0, n - a], own[2][0, n - a]
+            for i in range(3):
+                direction[n, i] = own[0][0, n - a, i]
     return direction, distance, cosine
 
 
