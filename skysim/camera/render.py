@@ -36,8 +36,8 @@ MAX_PIECES = 100_000
 MIN_POSES, MAX_POSES = 9, 32_769  # number of poses in an exposure
 SINGLE_PIECE_STEPS = 0.4  # path length, in steps, up to which one piece is enough: error 1e-4 of the peak
 STILL_PX = 1e-3  # an image that moves less is drawn as one point
-MIN_TREE_STARS = 20_000  # below, a pass over all takes less than 50 us
-MAX_TREE_SHARE = 0.1  # of the sky, up to which a search tree finds a field's stars sooner than a pass over all
+MIN_BAND_STARS = 20_000  # below, a pass over all takes less than 50 us
+MAX_BAND_SHARE = 0.1  # of the sky, up to which a band of it holds a field's stars sooner than a pass over all
 MAX_PATCH_PIXELS = 1 << 20  # pixels of patches held in memory at once, or as many as the frame has
 
 OcclusionTest = Callable[[Floats], NDArray[np.bool_]]  # (N,) which of N sources at `Sources.place` are occluded
@@ -329,8 +329,8 @@ def in_view(sources: Sources, optics: Optics, poses: Poses, reach: float = 0.25)
     half_rad = (1 + reach) * optics.field_rad + 0.02 + rotation_rad / 2
     cos_limit, cos_any = (math.cos(min(angle_rad, math.pi)) for angle_rad in (half_rad, half_rad + span_rad))
     place, camera_m = sources.place, np.ascontiguousarray(poses.camera_m)
-    by_tree = len(sources) >= MIN_TREE_STARS and (1 - cos_any) / 2 <= MAX_TREE_SHARE
-    if by_tree and isinstance(sources, StarSources):
+    by_band = len(sources) >= MIN_BAND_STARS and (1 - cos_any) / 2 <= MAX_BAND_SHARE
+    if by_band and isinstance(sources, StarSources):
         near = sources.within(boresight[0], half_rad + span_rad)
         return near[_in_cone(place[near], boresight, camera_m, cos_limit, cos_any)]
     return np.flatnonzero(_in_cone(place, boresight, camera_m, cos_limit, cos_any))
