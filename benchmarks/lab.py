@@ -182,7 +182,7 @@ def opened(browser: Any, server: Server, size: tuple[int, int] = SIZES[0]) -> An
 
 def shown(page: Any) -> None:
     page.locator(".lab-frame canvas[data-frame]").wait_for(timeout=1e3 * WARM_S)
-    page.locator(".lab-card .good").wait_for(timeout=1e3 * WARM_S)
+    page.locator(".lab-card [data-state=good]").wait_for(timeout=1e3 * WARM_S)
 
 
 def speed(browser: Any, server: Server, size: tuple[int, int]) -> list[dict[str, Any]]:

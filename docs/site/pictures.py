@@ -62,7 +62,7 @@ def screenshots() -> None:
         page = browser.new_page(viewport={"width": 1440, "height": 860})
         page.set_default_timeout(180_000)
         page.goto(server.url)
-        page.locator(".lab-card .good").wait_for()
+        page.locator(".lab-card [data-state=good]").wait_for()
         page.wait_for_timeout(3000)  # the first frame clears earlier clicks
         page.get_by_role("tab", name="Lights").click()
         bellatrix = page.locator("tr", has_text="Bellatrix")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,35 @@ class Light:
     y: float
     electrons: float
     magnitude: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lights(Sequence[Light]):
+    """The true lights of a frame as columns, since objects for hundreds of stars take longer to send than the pixels.
+
+    id, electrons, magnitude : (N,) and xy_px : (N, 2), see `Light`
+    """
+
+    id: NDArray[np.int64]
+    xy_px: Floats
+    electrons: Floats
+    magnitude: Floats
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    @overload
+    def __getitem__(self, n: int) -> Light: ...
+    @overload
+    def __getitem__(self, n: slice) -> Lights: ...
+    def __getitem__(self, n: int | slice) -> Light | Lights:
+        if isinstance(n, slice):
+            return Lights(self.id[n], self.xy_px[n], self.electrons[n], self.magnitude[n])
+        x, y = self.xy_px[n].tolist()
+        return Light(int(self.id[n]), x, y, float(self.electrons[n]), float(self.magnitude[n]))
+
+
+NO_LIGHTS = Lights(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0), np.empty(0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +139,7 @@ class FrameView:
     body_wxyz: tuple[float, ...]
     exposure_s: float
     statistics: stretch.FrameStatistics
-    lights: tuple[Light, ...]
+    lights: Lights
     result: TrackerResult | None
     ms: float
     t_s: float = 0.0

@@ -19,6 +19,7 @@ from starlette.requests import HTTPConnection, Request
 from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
 
 from skysim.apps.gui.page.frame.sensor import FRAMES
+from skysim.apps.gui.page.frame.served import LIMITS
 from skysim.apps.gui.page.page import Tab
 from skysim.apps.gui.page.panels.photo import LIMIT_BYTES
 from skysim.apps.gui.worker.session import SpareWorker
@@ -165,11 +166,13 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
     app.on_shutdown(stop_studies)
 
     @app.get("/frame/{tab}/{number}")
-    def frame(tab: str, number: int) -> Response:
-        """A frame of a tab; 404 if it is no longer among the newest."""
-        data = FRAMES.get(tab, {}).get(number)
-        if data is None:
+    def frame(tab: str, number: int, width: int = 0, limits: str = LIMITS[0], near: str = "") -> Response:
+        """A frame of a tab, see `ServedFrame`; 404 if it is no longer among the newest. near : column,row"""
+        served = FRAMES.get(tab, {}).get(number)
+        if served is None:
             return Response(status_code=404)
+        place = re.fullmatch(r"(\d{1,6}),(\d{1,6})", near)
+        data = served.response(width, limits, (int(place[1]), int(place[2])) if place else None)
         return Response(data, media_type="application/octet-stream", headers=FRAME_HEADERS)
 
     @app.get("/report/{name}")
@@ -193,7 +196,7 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
         session = await spare.wait(lambda: tab.is_open, lambda text: tab.sensor.show_waiting(text, QUEUED))
         if session is None:  # the tab was closed while it waited
             return
-        tab.session, tab.new_session = session, spare.take
+        tab.session, tab.new_session, tab.give_back = session, spare.take, spare.take_back
         await tab.start()
         spare.start()
 

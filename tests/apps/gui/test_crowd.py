@@ -22,6 +22,7 @@ class Hand:
     """In place of a worker process."""
 
     alive: ClassVar[set[Any]] = set()
+    answers = True
 
     def __init__(self) -> None:
         self.alive.add(self)
@@ -29,6 +30,9 @@ class Hand:
 
     def is_alive(self) -> bool:
         return True
+
+    async def renew(self) -> bool:
+        return self.answers
 
     def close(self) -> None:
         self.alive.discard(self)
@@ -70,6 +74,30 @@ def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(monkeypa
         assert spare.queue == []
 
     asyncio.run(asyncio.wait_for(story(), 60))
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_the_worker_of_a_closed_tab_is_the_next_one_s_unless_it_is_busy(
+    monkeypatch: pytest.MonkeyPatch, answers: bool
+) -> None:
+    monkeypatch.setattr(session, "Session", Hand)
+    monkeypatch.setattr(session, "QUEUE_S", 0.001)
+    monkeypatch.setattr(Hand, "alive", set())
+    monkeypatch.setattr(Hand, "answers", answers)
+
+    async def story() -> None:
+        spare = session.SpareWorker("scene", 1)
+        first = await spare.wait(lambda: True, print)
+        waiting = asyncio.create_task(spare.wait(lambda: True, lambda _: None))
+        await asyncio.sleep(0)
+        await spare.take_back(first)
+        second = await waiting
+        assert (second is first) == answers
+        assert Hand.alive == {second}
+        await spare.take_back(second)  # nobody waits
+        assert Hand.alive == set()
+
+    asyncio.run(asyncio.wait_for(story(), 10))
 
 
 @pytest.mark.browser

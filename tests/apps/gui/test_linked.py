@@ -13,7 +13,7 @@ from labpage import CHROMIUM, NARROW, Server, chosen, come, exported, opened, pa
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.messages import Detection, Light
+from skysim.apps.gui.messages import Detection, Lights
 from skysim.apps.gui.page.panels import lights
 from skysim.apps.gui.worker.scene import geometry
 from skysim.scene import loader
@@ -24,7 +24,8 @@ in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed"
 
 
 def test_the_table_has_every_light_with_its_detection_then_the_false_ones() -> None:
-    true = [Light(3, 10, 20, 5000, 1.5), Light(4, 40, 50, 900, float("nan")), Light(5, 70, 80, 100, 4.0)]
+    places_px = np.array([[10.0, 20], [40, 50], [70, 80]])
+    true = Lights(np.array([3, 4, 5]), places_px, np.array([5000.0, 900, 100]), np.array([1.5, np.nan, 4]))
     found = [
         Detection(200, 200, 0.1, 50),
         Detection(10.3, 20.4, 0.05, 700, 3, 0.02),

@@ -18,11 +18,8 @@ from nicegui.page import page
 from skysim.apps.gui.page.page import Tab
 
 
-class NoWorker:
-    """In place of a worker process."""
-
-    def close(self) -> None:
-        pass
+async def ignore(_: object) -> None:
+    """Take a worker back."""
 
 
 def test_a_closed_page_is_freed(tmp_path: Path) -> None:
@@ -34,7 +31,8 @@ def test_a_closed_page_is_freed(tmp_path: Path) -> None:
         with client:
             tab = Tab("shefex2", tmp_path, tmp_path)
             tab.build()
-        tab.session = NoWorker()
+        tab.give_back = ignore
+        tab.session = object()  # type: ignore[assignment]
         client.on_delete(tab.close)
         freed = weakref.ref(tab)
         del tab

@@ -278,19 +278,6 @@ def test_colors_and_the_grid_are_drawn(page: Any) -> None:
     page.get_by_role("checkbox", name="grid").click()
 
 
-ZSCALE = """async ([values, width]) => { const { zscale } = await import("skysim-frame/pixels.js");
-  return zscale({ data: Uint16Array.from(values), width, height: values.length / width }); }"""
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_zscale_is_astropy_s(page: Any, seed: int) -> None:
-    random = np.random.default_rng(seed)
-    image = random.poisson(100 + 30 * seed, (70, 90 + seed)).astype(np.uint16)
-    image.ravel()[random.integers(0, image.size, 60 * seed)] += 2000
-    limits = page.evaluate(ZSCALE, [image.ravel().tolist(), image.shape[1]])
-    np.testing.assert_allclose(limits, ZScaleInterval().get_limits(image), rtol=1e-9, atol=1e-9)
-
-
 NAMES = """async ([names, size]) => { const { drawNames } = await import("skysim-frame/marks.js");
   const boxes = [], pen = { fillRect: (...box) => boxes.push(box), fillText() {} };
   drawNames(pen, names, (x, y) => [x, y], size, "#fff");

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -19,13 +20,13 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.gui.messages import Detection, Light, TrackerResult
+from skysim.apps.gui.messages import Detection, Lights, TrackerResult
 from skysim.apps.gui.page import forms, keys
 from skysim.apps.gui.page.frame import overlay
 from skysim.apps.gui.page.frame.sensor import Sensor
 from skysim.apps.gui.page.frame.star_names import NAMES
 from skysim.apps.gui.server import Guard, host_of, report_path, user_of
-from skysim.apps.gui.worker import export, photo, pixels, study_process, workbench
+from skysim.apps.gui.worker import export, photo, pixels, study_process, tasks, workbench
 from skysim.apps.gui.worker.photo import SUFFIXES
 from skysim.apps.gui.worker.scene import pointing
 from skysim.apps.gui.worker.session import Session, WorkerLost
@@ -173,7 +174,7 @@ def test_a_scene_is_saved_as_what_differs_and_nothing_is_overwritten(tmp_path: P
 
 # Marks.
 
-LIGHTS = (Light(1, 10.0, 20.0, 1e4, 2.0), Light(2, 50.0, 60.0, 1e3, 4.0))
+LIGHTS = Lights(np.array([1, 2]), np.array([[10.0, 20], [50, 60]]), np.array([1e4, 1e3]), np.array([2.0, 4.0]))
 SPOTS = (Detection(10.1, 20.0, 0.01, 5.0, 1, 0.1), Detection(80.0, 80.0, 0.1, 1.0))
 
 
@@ -181,11 +182,11 @@ def test_each_kind_of_mark_can_be_switched_off_and_stands_where_it_should() -> N
     result = TrackerResult("solved", SPOTS, 1.0, (0.0, 0.0, 0.0), windows_px=((50.0, 60.0),))
     drawn = {kind: overlay.marks(LIGHTS, result, {kind}, str) for kind in overlay.KINDS}
     points = {kind: {mark["kind"]: mark["points"] for mark in of_kind["marks"]} for kind, of_kind in drawn.items()}
-    assert points["truth"] == {"truth": [(10.0, 20.0)], "faint": [(50.0, 60.0)]}  # nothing as faint is detected
-    assert points["detected"] == {"detected": [(10.1, 20.0), (80.0, 80.0)]}
-    assert points["identified"] == {"identified": [(10.1, 20.0)]}
-    assert points["false"] == {"false": [(80.0, 80.0)]}
-    assert points["windows"] == {"windows": [(50.0, 60.0)]}
+    assert points["truth"] == {"truth": [[10.0, 20.0]], "faint": [[50.0, 60.0]]}  # nothing as faint is detected
+    assert points["detected"] == {"detected": [[10.1, 20.0], [80.0, 80.0]]}
+    assert points["identified"] == {"identified": [[10.1, 20.0]]}
+    assert points["false"] == {"false": [[80.0, 80.0]]}
+    assert points["windows"] == {"windows": [[50.0, 60.0]]}
     assert [kind for kind, of_kind in drawn.items() if of_kind["names"]] == ["identified"]
     assert drawn["identified"]["names"] == [(10.1, 20.0, "1")]
     assert overlay.marks(LIGHTS, result, (), str)["marks"] == []
@@ -195,10 +196,10 @@ def test_a_faint_light_beside_a_detection_of_noise_gets_no_tick() -> None:
     noise = Detection(51.0, 60.0, 0.1, 1.0)
     result = TrackerResult("solved", (SPOTS[0], noise), 1.0, (0.0, 0.0, 0.0))
     solved = {mark["kind"]: mark["points"] for mark in overlay.marks(LIGHTS, result, {"truth"}, str)["marks"]}
-    assert solved == {"truth": [(10.0, 20.0)], "faint": [(50.0, 60.0)]}
+    assert solved == {"truth": [[10.0, 20.0]], "faint": [[50.0, 60.0]]}
     unsolved = TrackerResult("too few", (noise,), 1.0)
     ticks = {mark["kind"]: mark["points"] for mark in overlay.marks(LIGHTS, unsolved, {"truth"}, str)["marks"]}
-    assert ticks == {"truth": [(10.0, 20.0), (50.0, 60.0)]}
+    assert ticks == {"truth": [[10.0, 20.0], [50.0, 60.0]]}
 
 
 def test_the_cursor_finds_true_lights_and_detections_whatever_is_marked() -> None:
@@ -359,6 +360,21 @@ def test_a_host_is_told_with_or_without_its_port() -> None:
 
 
 # The worker.
+
+
+@pytest.mark.slow
+def test_a_renewed_worker_shows_the_scene_s_start_and_nothing_of_the_last_tab() -> None:
+    worker = tasks.Worker()
+    _, start = worker.open("shefex2", {}, True)
+    worker.move(1.0, 0.0, 5.0, False)
+    kept = worker.workbench.testbed
+    worker.solve_file("sky.png", cv2.imencode(".png", np.eye(90, dtype=np.uint8) * 9)[1].tobytes(), None)
+    worker.renew()
+    assert (worker.other, worker.image, worker.flight) == (None, None, None)
+    _, again = worker.open("shefex2", {}, True)
+    assert again.angles_deg == start.angles_deg
+    assert worker.workbench.testbed is kept  # it is not set up again
+    assert worker.open("shefex2", {"camera.detector.noise": "false"}, True)[0].noise is False
 
 
 @pytest.mark.long

@@ -15,6 +15,7 @@ from nicegui import ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.page import forms, keys, style
+from skysim.apps.gui.page.frame.live import Contents, LiveText
 from skysim.apps.gui.page.frame.sensor import FRAMES, Sensor
 from skysim.apps.gui.page.panels.attitude import AttitudeCard
 from skysim.apps.gui.page.panels.lights import LightsPanel
@@ -45,16 +46,18 @@ PANELS = ("Lab", "Lights", "Scene", "Plan", "Run", "Monte Carlo", "Image", "Log"
 class Tab:
     """One tab: its worker, its scene, and its page elements.
 
-    session : its worker, set when it has got one;  new_session : gives another, None if there are too many
+    session : its worker, set when it has got one;  give_back : takes it when the tab is closed
+    new_session : gives another worker, None if there are too many
     folder : where scenes are saved;  out : where studies are;  cameras : live ones that it may watch
     user : its browser, see `server.user_of`
     state : what the page shows;  view : the newest frame of the scene
     feedback : of the scene's controller; None without a controller
-    solving : whether every frame is solved
+    solving : whether every frame is solved;  contents : of the fields that change with every frame
     """
 
     session: Session
     new_session: Callable[[], Session | None]
+    give_back: Callable[[Session], Awaitable[None]]
 
     def __init__(self, scene: str, folder: Path, out: Path, cameras: Sequence[str] = (), user: str = "") -> None:
         self.id, self.user = secrets.token_hex(8), user
@@ -64,7 +67,7 @@ class Tab:
         self.view: FrameView | None = None
         self.feedback: str | None = None
         self.solving, self.is_open, self.restarting = True, True, False
-        self.message_text = ""
+        self.message_text, self.contents = "", Contents()
         self.editing = asyncio.Lock()
 
     async def close(self) -> None:
@@ -73,7 +76,7 @@ class Tab:
         FRAMES.pop(self.id, None)
         self.study_panel.process.stop(signal.SIGTERM)
         if hasattr(self, "session"):
-            await asyncio.to_thread(self.session.close)
+            await self.give_back(self.session)
 
     async def restart(self) -> None:
         """Show the view again with a new worker after the old one has ended."""
@@ -130,13 +133,13 @@ class Tab:
             self.picker = ui.select(self.scenes(), value=self.scene, on_change=self.scene_picked)
             self.picker.props('dense borderless options-dense aria-label="Scene"').classes("w-44").mark("scene")
             self.picker.on("popup-hide", js_handler=keys.BLUR_JS)
-            self.banner = ui.label("live").classes("lab-banner").mark("banner")
+            self.banner = LiveText(self.contents, "live").classes("lab-banner").mark("banner")
             self.live_button = ui.button("Live", on_click=self.go_live).props("dense outline size=sm").mark("live")
             self.live_button.set_visibility(False)
             self.title = ui.label().classes("lab-title quiet ellipsis")
             self.message = ui.label().classes("lab-said").props('role="status"').mark("message")
             self.spinner = ui.spinner(size="16px").classes("lab-busy").mark("busy")
-            self.latency = ui.label().classes("lab-rate mono quiet").mark("rate")
+            self.latency = LiveText(self.contents).classes("lab-rate mono quiet").mark("rate")
             self.latency.props('title="latency: from the request for a frame to its arrival"')
             self.noise = ui.switch("noise", value=True, on_change=self.switch_noise).props("dense size=xs")
             ui.switch("identify", value=True).bind_value_to(self, "solving").props("dense size=xs")
@@ -228,8 +231,7 @@ class Tab:
     def set_state(self, **changes: Any) -> None:
         """Change what the page shows, as the banner says."""
         self.state = replace(self.state, **changes)
-        self.banner.set_text(self.state.banner)
-        self.banner.classes(remove="live flight replay photo", add=self.state.kind)
+        self.banner.set_text(self.state.banner, self.state.kind)
         self.live_button.set_visibility(self.state.kind != "live")
 
     async def open(
@@ -289,8 +291,8 @@ class Tab:
         begin = time.perf_counter()
         view = await self.await_result(pending)
         if view is not None:
-            self.display_live(view)
             self.latency.set_text(f"{1e3 * (time.perf_counter() - begin):.0f} ms")
+            self.display_live(view)
         return view
 
     def display_live(self, view: FrameView) -> None:
@@ -300,9 +302,9 @@ class Tab:
     def display_frame(self, view: FrameView) -> None:
         """Show a frame of the scene: live, or of its flight."""
         self.view = view
-        self.sensor.show(view)
         self.attitude.show(view)
         self.scene_3d.show(view)
+        self.sensor.show(view)
 
     def display_photo(self, photo: Photo, /, **state: Any) -> None:
         """Show an image that is not of the scene as it is now: a photograph, or a trial again.
@@ -310,8 +312,8 @@ class Tab:
         state : what the page shows thereby
         """
         self.set_state(**state)
-        self.sensor.show_photo(photo)
         self.attitude.show_photo(photo)
+        self.sensor.show_photo(photo)
 
     async def go_live(self) -> None:
         """Return to the live scene at the newest attitude."""

@@ -67,7 +67,8 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-name {{ font-weight: 600; letter-spacing: .02em; white-space: nowrap }}
 .lab-banner {{ flex: none; padding: 1px 8px; border-radius: 9px; font-size: 12px; max-width: 30ch; overflow: hidden;
   text-overflow: ellipsis; white-space: nowrap; border: 1px solid {COLORS["line"]}; color: {COLORS["quiet"]} }}
-.lab-banner.flight, .lab-banner.replay, .lab-banner.photo {{ border-color: {COLORS["warn"]}; color: {COLORS["warn"]} }}
+.lab-banner:is([data-state=flight], [data-state=replay], [data-state=photo]) {{
+  border-color: {COLORS["warn"]}; color: {COLORS["warn"]} }}
 .lab-title {{ flex: 0 1 auto; min-width: 0; max-width: 32% }} .lab-rate {{ width: 56px; text-align: right }}
 .lab-said {{ flex: 1 1 0; min-width: 0; text-align: right; line-height: 1.3; max-height: 2.6em; overflow: hidden;
   display: -webkit-box; -webkit-box-orient: vertical; -webkit-line-clamp: 2; overflow-wrap: anywhere }}
@@ -134,15 +135,20 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-command {{ display: flex; justify-content: space-between; gap: 12px; padding: 3px 8px; cursor: pointer;
   border-radius: 4px }}
 .lab-command.chosen, .lab-command:hover {{ background: {COLORS["line"]} }}
+.lab-card, .lab-head, .lab-readout, .lab-under > .mono {{ contain: content }}
 .lab-card {{ padding: 10px 14px; border-bottom: 1px solid {COLORS["line"]}; width: 100% }}
 .lab-panels {{ min-height: 0; overflow: hidden; background: transparent !important }}
 .lab-panels .q-tab-panel {{ padding: 10px 14px; height: 100%; overflow: auto }}
 .mono {{ font: 12.5px/1.6 ui-monospace, SFMono-Regular, Menlo, monospace; font-variant-numeric: tabular-nums;
   white-space: pre }}
-.quiet {{ color: {COLORS["quiet"]} }} .good {{ color: {COLORS["good"]} }} .bad {{ color: {COLORS["bad"]} }}
-.warn {{ color: {COLORS["warn"]} }}
+.quiet, [data-state=quiet] {{ color: {COLORS["quiet"]} }} .good, [data-state=good] {{ color: {COLORS["good"]} }}
+.bad, [data-state=bad] {{ color: {COLORS["bad"]} }} .warn, [data-state=warn] {{ color: {COLORS["warn"]} }}
 .lab-grid {{ display: grid; grid-template-columns: 84px repeat(3, minmax(0, 1fr)); gap: 2px 10px; align-items: center }}
 .lab-grid .num {{ text-align: right; min-height: 20px }}
+.lab-status {{ margin-top: 6px; min-height: 20px }}
+.lab-angle {{ width: 100%; height: 32px; padding: 0 12px; text-align: right; color: inherit; background: transparent;
+  border: 1px solid color-mix(in srgb, currentColor 24%, transparent); border-radius: 4px }}
+.lab-seek {{ flex: 1 1 0; min-width: 0; accent-color: {COLORS["accent"]} }}
 .q-field--dense .q-field__control, .q-field--dense .q-field__marginal {{ height: 32px; min-height: 32px }}
 .q-field--dense .q-field__native, .q-field--dense .q-field__input {{ min-height: 32px; padding: 2px 0;
   font-size: 12.5px }}

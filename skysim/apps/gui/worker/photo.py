@@ -15,7 +15,7 @@ from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps import plate_solver
-from skysim.apps.gui.messages import Lens, Light, Pose, TrackerResult, Triple
+from skysim.apps.gui.messages import NO_LIGHTS, Lens, Lights, Pose, TrackerResult, Triple
 from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.workbench import (
     detection_views,
@@ -56,7 +56,7 @@ class Photo:
     pose: Pose | None = None
     names: tuple[str, str, str] = ("RA", "Dec", "roll")
     true_deg: Triple | None = None
-    lights: tuple[Light, ...] = ()
+    lights: Lights = NO_LIGHTS
     prefix: str = "HIP"
     hint: str = ""
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import pickle
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -14,7 +16,7 @@ from skysim.apps.gui.messages import NAN, FlightStep, FrameRow, FrameView, Motio
 from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.workbench import Workbench, tracker_result
 from skysim.core.quantities.units import ARCSEC_RAD
-from skysim.core.types import Telemetry
+from skysim.core.types import Frame, Telemetry, Truth
 from skysim.results import telemetry_report
 from skysim.simulation import exposure, run
 from skysim.simulation.run import FrameResult
@@ -22,14 +24,19 @@ from skysim.simulation.testbed import Testbed, build_tracker, exposure_window
 
 MAX_POINTS = 500  # of a curve on the page, roughly
 FLOOR = 1e-3  # arcsec; lower limit of values on a logarithmic axis
+KEPT_BYTES = 2**28  # of frames in the file, beyond which they are rendered again when they are shown
 
 
 @dataclass
 class KeptFrame:
-    """A frame of a flight without its pixels, which are rendered again, bit for bit, when it is shown."""
+    """A frame of a flight without its pixels and its truth.
+
+    place : of these in the file; None: they are rendered again, bit for bit
+    """
 
     view: FrameView
     report: Report
+    place: int | None
 
 
 class Flight:
@@ -37,11 +44,12 @@ class Flight:
 
     Its computation is a series of short steps, so that the worker does other tasks between them.
 
+    file : the first frames with their truth, so that playing them costs no rendering
     moved : the testbed after the simulation of its motion, None before;  told : number of frames reported by `advance`
     """
 
     def __init__(self, bench: Workbench) -> None:
-        self.bench, self.frames = bench, list[KeptFrame]()
+        self.bench, self.frames, self.file = bench, list[KeptFrame](), tempfile.TemporaryFile()  # noqa: SIM115
         self.moved: Testbed | None = None
         self.told, self.told_log = 0, False
         self.progress = (0.0, 1.0)
@@ -59,7 +67,7 @@ class Flight:
             t_s = exposure_window(self.moved.scene, result.frame.index, result.frame.exposure_s).open_s
             error, innovation = filter_errors(self.moved, result, t_s)
             view = replace(view, pixels=b"", t_s=t_s, filter_arcsec=error, innovation_arcsec=innovation)
-            self.frames.append(KeptFrame(view, result.report))
+            self.frames.append(KeptFrame(view, result.report, self.keep(result.frame, result.truth)))
             yield len(self.frames), count
 
     def advance(self, budget_s: float) -> FlightStep:
@@ -74,11 +82,23 @@ class Flight:
             self.told_log, log = True, curves(self.moved.log)
         return FlightStep("done" if is_done else "frames" if self.moved else "motion", *self.progress, rows, log)
 
+    def keep(self, frame: Frame, truth: Truth) -> int | None:
+        """Write a frame to the end of the file, and return its place there; None if the file is full."""
+        place = self.file.seek(0, 2)
+        if place + frame.image_dn.nbytes > KEPT_BYTES:
+            return None
+        pickle.dump((frame, truth), self.file, pickle.HIGHEST_PROTOCOL)
+        return place
+
     def show(self, index: int) -> FrameView:
         """The view of a kept frame with its pixels; the scene is seen from there from now on."""
         assert self.moved is not None
         kept, bench = self.frames[index], self.bench
-        frame, truth = exposure.render_frame(self.moved, index, exposure_s=kept.view.exposure_s)
+        if kept.place is None:
+            frame, truth = exposure.render_frame(self.moved, index, exposure_s=kept.view.exposure_s)
+        else:
+            self.file.seek(kept.place)
+            frame, truth = pickle.load(self.file)
         bench.frame, bench.truth, bench.report = frame, truth, kept.report
         bench.lab_from_body = truth.lab_from_body
         return replace(kept.view, pixels=pixels.encoded(frame.image_dn))

@@ -15,6 +15,7 @@ from skysim.core.errors import InputError
 from skysim.experiments.study.execution.workers import environment, one_thread
 
 QUEUE_S = 0.2  # between two looks for a free worker
+RENEW_S = 1.0  # for the last task of a tab that was closed
 OPENCV_LIMITS = {"OPENCV_IO_MAX_IMAGE_PIXELS": str(2**27)}  # environment: OpenCV refuses larger images
 
 
@@ -78,6 +79,14 @@ class Session:
             raise InputError(reply)
         return reply
 
+    async def renew(self) -> bool:
+        """Make the worker as new for another tab; False if it has ended or does not finish its task soon."""
+        try:
+            await asyncio.wait_for(self.run("renew"), RENEW_S)
+        except (TimeoutError, WorkerLost):
+            return False
+        return True
+
     def close(self) -> None:
         """End the worker; may take seconds."""
         Session.alive.discard(self)
@@ -113,6 +122,14 @@ class SpareWorker:
         if session:
             session.close()
         return Session() if len(Session.alive) < self.limit else None
+
+    async def take_back(self, session: Session) -> None:
+        """A tab was closed: its worker is for the next tab that waits, since starting another takes seconds; else end
+        it."""
+        if self.queue and self.next is None and await session.renew() and self.next is None:
+            self.next = session
+        else:
+            await asyncio.to_thread(session.close)
 
     async def wait(self, wanted: Callable[[], bool], tell: Callable[[str], None]) -> Session | None:
         """`take`, once it is this tab's turn; None if none is wanted any more. tell : gets what it waits for"""

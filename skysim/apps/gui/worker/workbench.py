@@ -15,7 +15,7 @@ from estimator.core.types import Attitude
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.gui.messages import Detection, FrameView, LabGeometry, Lens, Light, SceneInfo, TrackerResult
+from skysim.apps.gui.messages import Detection, FrameView, LabGeometry, Lens, Lights, SceneInfo, TrackerResult
 from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.scene import geometry
 from skysim.core import quaternion
@@ -57,12 +57,14 @@ class Workbench:
 
     @classmethod
     def open(cls, name: str, overrides: Mapping[str, str], before: Workbench | None = None) -> Workbench:
-        """Set up a scene. If only the tracker differs from `before`, its testbed is kept; if tracker or camera, its
-        attitude.
+        """Set up a scene, or keep `before` if it is the same. If only the tracker differs from `before`, its testbed is
+        kept; if tracker or camera, its attitude.
 
         Raises InputError.
         """
         scene = load(name, overrides)
+        if before and before.scene == scene:
+            return before
         if before and before.scene.model_copy(update={"tracker": scene.tracker}) == scene:
             testbed = replace(before.testbed, scene=scene)
             return replace(before, scene=scene, testbed=testbed, estimator=warm_tracker(testbed))
@@ -152,15 +154,14 @@ def id_prefix(testbed: Testbed) -> str:
     return "LED" if np.isnan(testbed.sources.magnitude).all() else "HIP"
 
 
-def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> tuple[Light, ...]:
-    """The true lights of a frame, the brightest first."""
+def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> Lights:
+    """The true lights of a frame, the brightest first. magnitude : V by number, of stars and LEDs"""
     sources, of_bodies = truth.sources, {body.id: body.v_mag for body in truth.bodies}
     of_bodies |= {satellite.id: satellite.v_mag for satellite in truth.satellites}
     rows = np.argsort(-sources.electrons)
-    columns = zip(
-        sources.id[rows].tolist(), sources.flux_xy_px[rows].tolist(), sources.electrons[rows].tolist(), strict=True
-    )
-    return tuple(Light(id, x, y, e, of_bodies.get(id, magnitude.get(id, math.nan))) for id, (x, y), e in columns)
+    ids = sources.id[rows]
+    magnitudes = [of_bodies.get(id, magnitude.get(id, math.nan)) for id in ids.tolist()]
+    return Lights(ids, sources.flux_xy_px[rows], sources.electrons[rows], np.array(magnitudes, float))
 
 
 def magnitude_by_id(testbed: Testbed) -> dict[int, float]:

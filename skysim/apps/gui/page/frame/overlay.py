@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
+from itertools import compress
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import Detection, Light, TrackerResult
+from skysim.apps.gui.messages import Lights, TrackerResult
+from skysim.core.types import Floats
 
 COLORS = {
     **{"truth": "#7a8cff", "detected": "#dd5a60", "identified": "#6ff0d8", "false": "#e8b90f"},
@@ -19,11 +22,11 @@ MAX_TRUTH_MARKS = 400  # most marks of true lights
 UNSOLVED_TICKS = 60  # of the brightest true lights of a frame without detections; fainter ones are dots
 NEAR_PX = 4.0  # a detection within this distance of a true light is not false
 
-Point = tuple[float, float]
+Points = list[list[float]]  # to a tenth of a pixel, for a short message
 
 
 def marks(
-    lights: Collection[Light], result: TrackerResult | None, shown: Collection[str], name: Callable[[int], str]
+    lights: Lights, result: TrackerResult | None, shown: Collection[str], name: Callable[[int], str]
 ) -> dict[str, Any]:
     """What frame.js draws: marks by kind (ticks for true lights, dots for those fainter than any identified one,
     squares for detections, circles for identified ones, crosses for false ones, dashed squares for predicted windows),
@@ -32,63 +35,50 @@ def marks(
     lights of the answer : (x, y, number or -1, whether it is a detection), detections last
     """
     detections = result.detections if result else ()
-    identified = [detection for detection in detections if detection.id >= 0]
-    visible = list(lights)[:MAX_TRUTH_MARKS]
-    bright = bright_count(visible, detections)
-    points: Mapping[str, list[Point]] = {
-        "windows": [rounded(x, y) for x, y in result.windows_px] if result else [],
-        "truth": places(visible[:bright]),
-        "faint": places(visible[bright:]),
-        "detected": places(detections),
-        "identified": places(identified),
-        "false": places(false_detections(detections, lights)),
+    ids = [one.id for one in detections]
+    found_px = np.array([(one.x, one.y) for one in detections], float).reshape(-1, 2)
+    is_identified = np.array(ids, np.int64) >= 0
+    visible = lights[:MAX_TRUTH_MARKS]
+    near_x, near_y = (
+        np.abs(np.subtract.outer(*pair)) < NEAR_PX for pair in zip(lights.xy_px.T, found_px.T, strict=True)
+    )
+    near = near_x & near_y  # of each true light and each detection
+    bright = bright_count(visible, ids, near[: len(visible)])
+    is_false = ~near.any(axis=0) & bool(len(lights))  # without true lights it is not known
+    true, found = rounded(visible.xy_px), rounded(found_px)
+    points: Mapping[str, Points] = {
+        "windows": rounded(np.array(result.windows_px).reshape(-1, 2)) if result else [],
+        "truth": true[:bright],
+        "faint": true[bright:],
+        "detected": found,
+        "identified": list(compress(found, is_identified)),
+        "false": list(compress(found, is_false)),
     }
+    named = list(compress(zip(found, ids, strict=True), is_identified))[:MAX_LABELS]
     return {
         "marks": [
             {"kind": drawn, "color": COLORS[kind], "points": points[drawn]}
             for kind, drawn in (*((kind, kind) for kind in KINDS), ("truth", "faint"))
             if kind in shown and points[drawn]
         ],
-        "names": [(*rounded(one.x, one.y), name(one.id)) for one in identified[:MAX_LABELS]]
-        if "identified" in shown
-        else [],
-        "lights": [(*rounded(one.x, one.y), one.id, 0) for one in visible]
-        + [(*rounded(one.x, one.y), one.id, 1) for one in detections],
+        "names": [(*place, name(id)) for place, id in named] if "identified" in shown else [],
+        "lights": [(*place, id, 0) for place, id in zip(true, visible.id.tolist(), strict=True)]
+        + [(*place, id, 1) for place, id in zip(found, ids, strict=True)],
     }
 
 
-def bright_count(lights: Sequence[Light], detections: Collection[Detection]) -> int:
+def bright_count(lights: Lights, identified: Collection[int], near: NDArray[np.bool_]) -> int:
     """How many lights, the brightest first, are as bright as the faintest identified one, or else detected one.
 
     In a field of hundreds of faint stars some detection of noise is beside one of them.
+    identified : number of the light of each detection, or -1;  near : (lights, detections) whether they are near
     """
-    if not detections or not lights:
+    if not len(identified) or not len(lights):
         return UNSOLVED_TICKS
-    identified = {one.id for one in detections if one.id >= 0}
-    found_px = np.array([(one.x, one.y) for one in detections])
-    seen = [
-        light.id in identified if identified else bool((np.abs(found_px - (light.x, light.y)) < NEAR_PX).all(1).any())
-        for light in lights
-    ]
-    return max((n + 1 for n, is_seen in enumerate(seen) if is_seen), default=0)
+    numbers = [id for id in identified if id >= 0]
+    seen = np.isin(lights.id, numbers) if numbers else near.any(axis=1)
+    return int(np.flatnonzero(seen)[-1]) + 1 if seen.any() else 0
 
 
-def places(items: Collection[Detection] | Collection[Light]) -> list[Point]:
-    return [rounded(item.x, item.y) for item in items]
-
-
-def rounded(x: float, y: float) -> Point:
-    """To a tenth of a pixel, for a short message."""
-    return round(x, 1), round(y, 1)
-
-
-def false_detections(detections: Collection[Detection], lights: Collection[Light]) -> list[Detection]:
-    """Detections that have no true light within NEAR_PX; none if the truth is unknown."""
-    if not lights:
-        return []
-    true_px = np.array([(light.x, light.y) for light in lights])
-    return [
-        detection
-        for detection in detections
-        if not (np.abs(true_px - (detection.x, detection.y)) < NEAR_PX).all(axis=1).any()
-    ]
+def rounded(xy_px: Floats) -> Points:
+    return np.round(xy_px, 1).tolist()

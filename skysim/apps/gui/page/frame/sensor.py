@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import base64
 import functools
-import itertools
-import json
 import math
 from collections.abc import Collection
 from dataclasses import asdict
@@ -17,10 +15,23 @@ import cv2
 import numpy as np
 from nicegui import ui
 
-from skysim.apps.gui.messages import Detection, FrameView, Lens, Light, Pose, SceneInfo, TrackerResult
+from skysim.apps.gui.messages import (
+    NO_LIGHTS,
+    Detection,
+    FrameView,
+    Lens,
+    Light,
+    Lights,
+    Pose,
+    SceneInfo,
+    TrackerResult,
+)
 from skysim.apps.gui.page import keys
 from skysim.apps.gui.page.frame import overlay
+from skysim.apps.gui.page.frame.live import LiveText
+from skysim.apps.gui.page.frame.served import LIMITS, ServedFrame
 from skysim.apps.gui.page.frame.star_names import NAMES
+from skysim.core.types import Floats
 from skysim.results import stretch
 from skysim.sources.solar_system.bodies import NAMES as BODIES
 
@@ -31,14 +42,13 @@ if TYPE_CHECKING:
 FIRST_START = "The first frame on a machine takes up to a minute, because the code is compiled."
 LABELS = NAMES | BODIES  # by number
 STRETCHES = list(stretch.CURVES)
-LIMITS = ("automatic", "zscale", "min to max", "manual")  # of the display; the first three are functions of pixels.js
 COLOR_MAPS = {
     **{"gray": None, "gray, inverted": None, "viridis": cv2.COLORMAP_VIRIDIS, "cividis": cv2.COLORMAP_CIVIDIS},
     **{"inferno": cv2.COLORMAP_INFERNO, "hot": cv2.COLORMAP_HOT},
 }
-FRAME_NUMBERS = itertools.count(1)  # of frames, so that each has its own address
-FRAMES: dict[str, dict[int, bytes]] = {}  # responses by tab and number, the newest KEPT
-KEPT_FRAMES = 3
+FRAMES: dict[str, dict[int, ServedFrame]] = {}  # by tab and number, the newest KEPT_FRAMES
+KEPT_FRAMES = 5
+AHEAD = 2  # frames that the browser fetches while it draws another one
 DRAW_TIMEOUT_S = 1.0  # for the browser to report a drawn frame
 
 
@@ -56,7 +66,7 @@ class Sensor:
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
         self.shown = {"truth", "identified", "false"}
-        self.lights: tuple[Light, ...] = ()
+        self.lights: Lights = NO_LIGHTS
         self.result: TrackerResult | None = None
         self.size_px, self.prefix, self.saturation_dn = (4, 3), "HIP", math.inf
         self.lens: Lens | None = None
@@ -68,10 +78,11 @@ class Sensor:
         with ui.element("div").classes("lab-sensor"):
             self.build_controls()
             with Canvas().mark("sensor") as self.canvas:
-                self.hover = ui.label().classes("mono").mark("hover")
+                self.hover = LiveText(tab.contents).classes("mono").mark("hover")
             with self.canvas.add_slot("wait"), ui.element("div").classes("lab-wait") as self.wait:
                 ui.spinner(size="28px")
                 self.wait_label = ui.label().mark("wait")
+        tab.contents.send = lambda contents: self.canvas.run_method("setContents", contents)
         self.canvas.on("hover", self.hover_changed)
         self.canvas.on("choose", self.light_chosen)
         self.canvas.on("manual", lambda: self.limits.set_value("manual"))
@@ -124,9 +135,10 @@ class Sensor:
         """Display a new image, as large as the window allows."""
         if not self.sent_number:
             self.wait.set_visibility(False)
-        self.sent_number = next(FRAME_NUMBERS)
+        self.sent_number += 1  # so that each frame has its own address
         frames = FRAMES.setdefault(self.tab.id, {})
-        frames[self.sent_number] = with_fields(data, self.fields())
+        fields = self.fields() | {"contents": self.tab.contents.take()}
+        frames[self.sent_number] = ServedFrame(data, self.size_px, self.saturation_dn, fields)
         frames.pop(min(frames) if len(frames) > KEPT_FRAMES else -1, None)
         self.canvas.run_method("show", {"src": self.source})
 
@@ -136,8 +148,8 @@ class Sensor:
         self.frame_drawn.set()
 
     async def wait_drawn(self) -> None:
-        """Wait until at most one frame is not drawn yet, so that frames do not queue up in the browser."""
-        while self.sent_number > self.drawn_number + 1:
+        """Wait until the browser has few frames to draw, so that they do not queue up there."""
+        while self.sent_number > self.drawn_number + AHEAD:
             self.frame_drawn.clear()
             try:
                 await asyncio.wait_for(self.frame_drawn.wait(), DRAW_TIMEOUT_S)
@@ -179,8 +191,6 @@ class Sensor:
     def fields(self) -> dict[str, Any]:
         """What frame.js needs beside the pixels: pointing and marks."""
         view = {
-            "size": self.size_px,
-            "saturation": self.saturation_dn if math.isfinite(self.saturation_dn) else None,
             "pose": pose_fields(self.pose) if self.pose else None,
             "label": self.description(),
         }
@@ -216,13 +226,14 @@ class Sensor:
         """The nearest detection and the nearest true light within a few marks' width, or None."""
         radius_px = max(8.0, self.size_px[0] / 60)
 
-        def distance_px(item: Detection | Light) -> float:
-            return math.hypot(item.x - x, item.y - y)
+        def nearest(places_px: Floats) -> int | None:
+            distance_px = np.hypot(*(places_px - (x, y)).T)
+            return int(distance_px.argmin()) if (distance_px < radius_px).any() else None
 
         detections = self.result.detections if self.result else ()
-        detections = tuple(detection for detection in detections if distance_px(detection) < radius_px)
-        lights = [light for light in self.lights if distance_px(light) < radius_px]
-        return min(detections, key=distance_px, default=None), min(lights, key=distance_px, default=None)
+        spot = nearest(np.array([(one.x, one.y) for one in detections], float).reshape(-1, 2))
+        light = nearest(self.lights.xy_px)
+        return None if spot is None else detections[spot], None if light is None else self.lights[light]
 
     def light_text(self, detection: Detection | None, light: Light | None) -> str:
         """Text on a light: where it truly is, the detection and its error."""
@@ -239,13 +250,6 @@ class Sensor:
             if light:
                 lines += [f"           error {math.hypot(detection.x - light.x, detection.y - light.y):.3f} px"]
         return "\n".join(lines)
-
-
-def with_fields(pixels: bytes, fields: dict[str, Any]) -> bytes:
-    """A frame's response: its pixels, then the fields as JSON, then the length of that as an unsigned integer of 32
-    bits. So a frame comes with its marks, and little goes over the websocket, whose messages are compiled as code."""
-    text = json.dumps(fields, separators=(",", ":")).encode()
-    return b"".join((pixels, text, len(text).to_bytes(4, "little")))
 
 
 def pose_fields(pose: Pose) -> dict[str, Any]:

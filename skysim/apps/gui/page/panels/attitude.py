@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, TrackerResult
 from skysim.apps.gui.page import keys
+from skysim.apps.gui.page.frame.live import LiveInput, LiveText
 from skysim.apps.gui.page.style import format_number
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from skysim.apps.gui.worker.photo import Photo
 
 STAGE_KEYS = {"detector": "F6", "identifier": "F7"}
+ANGLES_JS = "() => emit([...document.querySelectorAll('.lab-angle')].map(field => field.value))"
 
 
 class AttitudeCard:
@@ -34,18 +36,18 @@ class AttitudeCard:
                 ui.label("true (F5)").classes("quiet")
                 self.inputs = [self.angle_input(n) for n in range(3)]
                 ui.label("tracker").classes("quiet")
-                self.estimates = [ui.label("–").classes("mono num") for _ in range(3)]
+                self.estimates = [LiveText(tab.contents, "–").classes("mono num") for _ in range(3)]
                 ui.label("error").classes("quiet")
-                self.errors = [ui.label("–").classes("mono num") for _ in range(3)]
-            self.status = ui.label(" ").classes("mono ellipsis").style("margin-top: 6px").mark("status")
+                self.errors = [LiveText(tab.contents, "–").classes("mono num") for _ in range(3)]
+            self.status = LiveText(tab.contents).classes("mono ellipsis lab-status").mark("status")
         with ui.element("div").classes("lab-card"), ui.element("div").classes("lab-stages"):
             self.stages = {
                 stage: self.stage_select(stage) for stage in ("detector", "centroider", "identifier", "solver")
             }
 
-    def angle_input(self, n: int) -> ui.input:
-        field = ui.input().props(f'dense outlined input-class="text-right" aria-label="angle {n + 1}"')
-        return field.classes("mono").mark(f"angle-{n}").on("keydown.enter", self.point)
+    def angle_input(self, n: int) -> LiveInput:
+        field = LiveInput(self.tab.contents, "text").props(f'aria-label="angle {n + 1}"')
+        return field.classes("mono lab-angle").mark(f"angle-{n}").on("keydown.enter", self.point, js_handler=ANGLES_JS)
 
     def stage_select(self, name: str) -> ui.select:
         label = f"{name} {STAGE_KEYS[name]}" if name in STAGE_KEYS else name
@@ -70,11 +72,12 @@ class AttitudeCard:
         if scene_info and value and value != scene_info.stages[stage]:
             await self.tab.apply_overrides({f"tracker.{stage}": value})
 
-    async def point(self) -> None:
+    async def point(self, event: Any) -> None:
+        """Point the camera at the typed angles."""
         self.tab.stop_playback()
         self.tab.show_message("")
         try:
-            angles = tuple(float(field.value) for field in self.inputs)
+            angles = tuple(float(text) for text in event.args)
         except (TypeError, ValueError):
             self.tab.show_message("an angle is not a number; allowed: degrees, e.g. 83.6")
             return
@@ -119,8 +122,7 @@ class AttitudeCard:
             self.errors[1].set_text("–" if math.isnan(result.roll_arcsec) else f"roll {result.roll_arcsec:+.1f}″")
             self.errors[2].set_text("–" if math.isnan(cross) else f"σ {format_number(cross)}″ {format_number(roll)}″")
         color, text = status_line(result)
-        self.status.set_text(text)
-        self.status.classes(remove="good bad warn quiet", add=color)
+        self.status.set_text(text, color)
 
 
 def format_angle(angle: float) -> str:

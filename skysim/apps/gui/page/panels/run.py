@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import bisect
 import time
 from functools import partial
@@ -13,6 +14,7 @@ from nicegui import ui
 from skysim.apps.gui.messages import FlightStep, FrameRow, MotionLog
 from skysim.apps.gui.page import keys
 from skysim.apps.gui.page.forms import FEEDBACKS, loop_overrides
+from skysim.apps.gui.page.frame.live import LiveInput, LiveText
 from skysim.apps.gui.page.panels.strips import StripChart, rms_line, strips
 from skysim.apps.gui.page.shell.csv_table import csv_table
 
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
 CONTROL_KEYS = ("motion.control", "motion.maneuver")
 BUDGET_S = 0.04  # of a piece of the flight; a key waits for one at most
+POLL_S = 0.05  # between two looks whether the flight plays
 DRAW_S = 0.7  # between two drawings of the strips while frames come
 
 
@@ -31,6 +34,7 @@ class RunPanel:
     rows, log : of the computed frames and of the motion
     computing, stopping : whether the flight is being computed, and whether it shall end
     wanted_s : time to be shown once the flight is computed; None: play it from its start
+    sought : place of the slider while its frame is not shown yet
     index : of the frame on the page;  started_s, from_s : time of the last start of playback, and in the flight there
     closed_scene, closed_overrides : last scene with a closed loop and its overrides, with which an opened loop is
         closed again
@@ -39,14 +43,15 @@ class RunPanel:
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
         self.rows, self.log, self.times_s = list[FrameRow](), MotionLog(()), list[float]()
-        self.computing = self.stopping = self.playing = self.busy = self.dragging = False
+        self.computing = self.stopping = self.playing = False
         self.wanted_s: float | None = None
+        self.sought: int | None = None
         self.plays_when_done = False
         self.index, self.started_s, self.from_s, self.drawn_s = 0, 0.0, 0.0, 0.0
         self.closed_scene, self.closed_overrides = "", dict[str, str]()
         self.build()
         ui.on("moment", self.clicked)
-        ui.timer(1 / 30, self.tick)
+        ui.timer(POLL_S, self.play_on)
 
     def build(self) -> None:
         with ui.row().classes("w-full no-wrap items-center gap-1"):
@@ -61,9 +66,9 @@ class RunPanel:
             self.loop.props('aria-label="Feedback"').mark("feedback").on("popup-hide", js_handler=keys.BLUR_JS)
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
         with ui.row().classes("w-full no-wrap items-center gap-3"):
-            self.seek = ui.slider(min=0, max=1, step=1, value=0).props('dense aria-label="Frame of the flight"')
-            self.seek.on("change", self.slid).on("pan", self.slider_dragged)
-            self.clock = ui.label().classes("mono flex-none").mark("clock")
+            self.seek = LiveInput(self.tab.contents, "range").props('min=0 step=1 aria-label="Frame of the flight"')
+            self.seek.classes("lab-seek").on("input", self.slid, js_handler="event => emit(event.target.value)")
+            self.clock = LiveText(self.tab.contents).classes("mono flex-none").mark("clock")
         with ui.row().classes("w-full no-wrap items-center gap-3"):
             self.summary = ui.label().classes("quiet flex-grow").mark("flight")
             self.csv_button = ui.button("CSV", on_click=self.download).props("dense flat size=sm").mark("csv")
@@ -76,9 +81,10 @@ class RunPanel:
 
     def enable(self) -> None:
         """Let the controls work that have frames to work on, and say what to do without."""
-        for item in (self.back, self.play, self.forward, self.seek, self.csv_button):
+        for item in (self.back, self.play, self.forward, self.csv_button):
             item.set_enabled(bool(self.rows) and not self.computing)
         self.seek.props(f"max={max(len(self.rows) - 1, 1)}")
+        self.seek.props["disabled"] = not self.rows or self.computing
         if self.rows or self.computing:
             return
         info = self.tab.scene_info
@@ -251,41 +257,39 @@ class RunPanel:
             await self.show_index(min(range(len(self.times_s)), key=lambda n: abs(self.times_s[n] - t_s)))
 
     async def slid(self, event: Any) -> None:
-        index = int(event.args)
-        if 0 <= index < len(self.rows):
-            self.from_s, self.started_s = self.times_s[index], time.monotonic()
-            await self.show_index(index)
+        """The slider is dragged: show the frame at its place, of several the newest."""
+        is_showing, self.sought = self.sought is not None, int(event.args)
+        while not is_showing and self.sought is not None:
+            index = self.sought
+            if 0 <= index < len(self.rows):
+                self.from_s, self.started_s = self.times_s[index], time.monotonic()
+                await self.show_index(index)
+            if self.sought == index:
+                self.sought = None
 
-    def slider_dragged(self, event: Any) -> None:
-        """Note whether the user drags the slider; playback does not move it then."""
-        self.dragging = event.args == "start"
-
-    async def tick(self) -> None:
-        """Timer: show the frame whose turn it is, if the last one has been displayed; pause at the last."""
-        if not self.playing or self.busy or not self.rows:
-            return
-        index = max(bisect.bisect_right(self.times_s, self.now_s) - 1, 0)
-        if index != self.index or self.tab.state.kind != "flight":
-            await self.show_index(index)
-        if self.playing and self.index == len(self.rows) - 1:
-            self.pause()
+    async def play_on(self) -> None:
+        """Timer: while the flight plays, show the frame whose turn it is; pause at the last."""
+        while self.playing and self.rows and self.tab.is_open:
+            index = max(bisect.bisect_right(self.times_s, self.now_s) - 1, 0)
+            if index != self.index or self.tab.state.kind != "flight":
+                await self.show_index(index)
+            if self.index >= len(self.rows) - 1:
+                self.pause()
+            elif self.playing:
+                await asyncio.sleep(min(max((self.times_s[index + 1] - self.now_s) / self.factor, 0.001), POLL_S))
 
     async def show_index(self, index: int) -> None:
         """Show a frame of the flight."""
-        self.busy, self.index = True, index
-        try:
-            view = await self.tab.await_result(self.tab.session.run("flight_frame", index))
-            if view is None or index >= len(self.rows):
-                return
-            if not self.dragging:
-                self.seek.set_value(index)
-            self.clock.set_text(f"{view.t_s:.2f} s  {index + 1}/{len(self.rows)}")
-            self.strips.set_moment(view.t_s)
-            self.tab.set_state(kind="flight", t_s=view.t_s)
-            self.tab.display_frame(view)
-            await self.tab.sensor.wait_drawn()
-        finally:
-            self.busy = False
+        self.index = index
+        view = await self.tab.await_result(self.tab.session.run("flight_frame", index))
+        if view is None or index >= len(self.rows):
+            return
+        self.seek.set_value(index)
+        self.clock.set_text(f"{view.t_s:.2f} s  {index + 1}/{len(self.rows)}")
+        self.strips.set_moment(view.t_s)
+        self.tab.set_state(kind="flight", t_s=view.t_s)
+        self.tab.display_frame(view)
+        await self.tab.sensor.wait_drawn()
 
     def download(self) -> None:
         ui.download(csv_table(FrameRow._fields, self.rows), f"{Path(self.tab.scene).stem}_flight.csv")

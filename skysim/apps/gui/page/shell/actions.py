@@ -98,7 +98,6 @@ class Actions:
             await self.tab.go_live()
         elif action == "attitude":
             self.tab.attitude.inputs[0].run_method("focus")
-            self.tab.attitude.inputs[0].run_method("select")
         elif action in ("sensor", "identifier"):
             self.tab.attitude.stages["detector" if action == "sensor" else "identifier"].run_method("showPopup")
         elif action == "runs":

@@ -88,7 +88,7 @@ class Scene3D:
             return
         found = view.result.detections if view.result else ()
         identified = {spot.id: self.tab.sensor.name(spot.id) for spot in found if spot.id >= 0}
-        fields = {"wxyz": view.body_wxyz, "seen": [light.id for light in view.lights]}
+        fields = {"wxyz": view.body_wxyz, "seen": view.lights.id.tolist()}
         self.canvas.run_method("show", fields | {"identified": list(identified.items())})
 
 

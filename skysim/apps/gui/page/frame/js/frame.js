@@ -1,10 +1,15 @@
 // The frame: its pixels come as numbers, so zoom, limits, colors, values under the cursor, loupe and cut are made here,
 // without the server. Marks are drawn together with their frame, so that they never appear on another one.
-import { colorTable, decode, LIMITS, palette, profile, sample } from "skysim-frame/pixels.js";
+import { setContents } from "skysim-frame/live.js";
+import { colorTable, decode, palette, profile } from "skysim-frame/pixels.js";
 import { drawGrid, drawHighlight, drawLoupe, drawMarks, drawNames } from "skysim-frame/marks.js";
 import { drawHistogram, drawProfile, levelAt, nearestLevel } from "skysim-frame/plots.js";
 import { directionText, gridLines } from "skysim-frame/sky.js";
 
+const REST_MS = 400; // without another frame, after which all pixels of the frame are fetched
+const AHEAD = 1; // frames that are fetched while another one is drawn
+const PLOT_MS = 250; // between histograms while frames follow one another
+const WORTHWHILE = 0.95; // screen pixels per pixel, below which a reduced frame saves time
 const LARGEST_PX = 60; // screen pixels of an enlarged pixel
 const REACH_PX = 14; // screen pixels within which the cursor finds a light
 const LOUPE = { across: 11, down: 7 };
@@ -37,7 +42,9 @@ export default {
     Object.assign(this, {
       wanted: null, // the newest view: src, and other marks than those that come with it: size, saturation, pose, label,
       // marks, names, lights
-      drawn: null, // the view on the canvas, with pixels and their sample
+      drawn: null, // the view on the canvas, with its pixels, all or fewer
+      atRest: null, // timer
+      plottedAt: 0,
       lens: null,
       zoom: null, // { scale, x, y }: screen pixels per pixel, and the pixel in the middle; null: the whole frame
       cursor: null, // [x, y] in the frame's pixels
@@ -47,13 +54,20 @@ export default {
       pressed: null,
       held: null, // the limit that is dragged: 0 or 1
       hovered: null, // number of the light under the cursor
-      fetching: false,
+      begun: null, // the newest view whose frame is fetched or drawn
+      fetchedSrc: null,
+      inFlight: 0, // frames that are fetched or drawn
+      queue: Promise.resolve(),
+      space: [0, 0], // width and height of the canvas
     });
   },
   mounted() {
-    this.pen = this.$refs.frame.getContext("2d", { alpha: false });
+    this.pen = this.$refs.frame.getContext("2d", { alpha: false, willReadFrequently: true });
     this.sheet = document.createElement("canvas");
-    this.watcher = new ResizeObserver(() => this.paint());
+    this.watcher = new ResizeObserver(() => {
+      this.space = [this.$refs.frame.clientWidth, this.$refs.frame.clientHeight];
+      this.paint();
+    });
     for (const canvas of [this.$refs.frame, this.$refs.loupe, this.$refs.plot]) this.watcher.observe(canvas);
     window.addEventListener("skysim-hover", this.ring);
   },
@@ -62,9 +76,10 @@ export default {
     this.watcher.disconnect();
   },
   watch: {
-    display() {
-      if (this.display.limits !== "manual") this.manual = null;
+    display(now, before) {
+      if (now.limits !== "manual") this.manual = null;
       this.recolor();
+      if (now.limits !== before.limits && !this.manual) this.complete(true);
     },
   },
   methods: {
@@ -90,46 +105,71 @@ export default {
 
     // Pixels.
 
-    // Draw the newest view. If a newer one arrives while a frame is fetched, draw the fetched one first, then the newer.
-    async update() {
-      if (this.fetching) return;
-      this.fetching = true;
-      try {
-        while (this.wanted && this.wanted !== this.drawn?.view) {
-          const view = this.wanted, lens = this.lens, same = view.src === this.drawn?.src;
-          const fetched = same ? this.drawn : await this.fetchFrame(view.src);
-          if (!fetched && view === this.wanted) break;
-          if (!fetched) continue;
-          if (String(fetched.size) !== String(this.drawn?.size)) this.zoom = this.cut = this.pinned = null;
-          this.drawn = { ...fetched, ...view, view, lens };
-          if (same) this.paint();
-          else this.recolor();
-          this.$emit("drawn", { src: view.src });
-        }
-      } finally {
-        this.fetching = false;
-      }
+    setContents,
+
+    setContents,
+
+    // Fetch the newest view, while up to AHEAD others are fetched or drawn; draw them in their order.
+    update() {
+      if (this.inFlight > AHEAD || this.wanted === this.begun) return;
+      const view = (this.begun = this.wanted), lens = this.lens, isNew = view.src !== this.fetchedSrc;
+      const fetched = isNew ? this.fetchFrame(view.src, this.screenWidth(), this.loupeAt()) : null;
+      this.fetchedSrc = view.src;
+      this.inFlight += 1;
+      this.queue = this.queue.then(async () => {
+        this.take(view, lens, isNew ? await fetched : this.drawn, isNew);
+        this.inFlight -= 1;
+        this.update();
+      });
     },
-    // A frame's pixels with their sample, its pointing and its marks; null if the server is unreachable or holds only
-    // newer frames, which it will announce.
-    async fetchFrame(src) {
+    // Draw a fetched frame, or other marks of the one that is drawn.
+    take(view, lens, frame, isNew) {
+      if (frame?.src !== view.src) return; // the fetch has failed; a newer frame will be announced
+      if (String(frame.size) !== String(this.drawn?.size)) this.zoom = this.cut = this.pinned = null;
+      this.drawn = { ...frame, ...view, view, lens };
+      if (isNew) this.recolor();
+      else this.paint();
+      if (isNew) setContents(frame.contents); // last: sizes are read above, which a changed text would delay
+      this.$emit("drawn", { src: view.src });
+      clearTimeout(this.atRest);
+      if (!this.drawn.isWhole) this.atRest = setTimeout(this.complete, REST_MS);
+    },
+    // Fetch all pixels of the drawn frame, if there are fewer or the limits are others.
+    async complete(always = false) {
+      clearTimeout(this.atRest);
+      const { drawn } = this;
+      if (this.inFlight || !drawn || (drawn.isWhole && always !== true)) return;
+      const frame = await this.fetchFrame(drawn.src, 0, null);
+      if (!frame || this.drawn.src !== drawn.src) return;
+      const { pixels, isWhole, limits, histogram } = frame;
+      this.drawn = { ...this.drawn, pixels, isWhole, limits, histogram };
+      this.recolor();
+    },
+    // The number of columns that suffices for the screen; 0: all.
+    screenWidth() {
+      const [width, height] = this.drawn?.size ?? [0, 0];
+      const scale = Math.min(this.space[0] / width, this.space[1] / height) * devicePixelRatio;
+      return this.zoom || this.cut || !(scale > 0 && scale < WORTHWHILE) ? 0 : Math.round(scale * width);
+    },
+    // A frame's pixels with its pointing and its marks; null if the server is unreachable or holds only newer frames,
+    // which it will announce.
+    async fetchFrame(src, width, near) {
       try {
-        const response = await fetch((window.path_prefix || "") + src);
-        if (!response.ok) return null;
-        const { fields, pixels } = decode(await response.arrayBuffer());
-        return { ...fields, pixels, sampled: sample(pixels) };
+        const query = new URLSearchParams({ width, limits: this.display.limits, near: near ?? [] });
+        const response = await fetch(`${window.path_prefix || ""}${src}?${query}`);
+        return response.ok ? { ...decode(await response.arrayBuffer()), src } : null;
       } catch {
         return null;
       }
     },
     recolor() {
       if (!this.drawn) return;
-      const { pixels, sampled, saturation } = this.drawn;
+      const { pixels, histogram, saturation } = this.drawn;
       const { data, offset, step, width, height } = pixels;
       const levels = this.manual?.map((dn) => (dn - offset) / step);
-      this.levels = levels ?? LIMITS[this.display.limits]?.(pixels, sampled) ?? LIMITS.automatic(pixels, sampled);
+      this.levels = levels ?? this.drawn.limits;
       const limit = saturation === null ? Infinity : (saturation - offset) / step;
-      const table = colorTable(sampled.high, this.levels, this.display.curve, palette(this.display.table), limit);
+      const table = colorTable(histogram.range[1], this.levels, this.display.curve, palette(this.display.table), limit);
       if (this.sheet.width !== width || this.sheet.height !== height || !this.sheetData) {
         [this.sheet.width, this.sheet.height] = [width, height];
         this.sheetPen = this.sheet.getContext("2d", { alpha: false, willReadFrequently: true });
@@ -137,12 +177,25 @@ export default {
       }
       const out = new Uint32Array(this.sheetData.data.buffer);
       for (let n = 0; n < data.length; n++) out[n] = table[data[n]];
-      this.sheetPen.putImageData(this.sheetData, 0, 0);
       this.paint();
     },
+    // A pixel's value; null outside of the frame, or if only means over areas have been fetched.
     value(x, y) {
-      const { data, offset, step, width, height } = this.drawn.pixels;
-      return x < 0 || y < 0 || x >= width || y >= height ? null : offset + step * data[y * width + x];
+      const { pixels, size, isWhole, near } = this.drawn, [width, height] = size;
+      if (x < 0 || y < 0 || x >= width || y >= height) return null;
+      if (isWhole) return pixels.offset + pixels.step * pixels.data[y * width + x];
+      const level = near && near.levels[y - near.y]?.[x - near.x];
+      return level === undefined ? null : pixels.offset + pixels.step * level;
+    },
+    // Column and row of the loupe's upper left pixel; null without a loupe.
+    loupeAt() {
+      const at = this.cursor ?? this.pinned;
+      if (!at || !this.drawn) return null;
+      const [width, height] = this.drawn.size, { across, down } = LOUPE;
+      return [
+        Math.min(Math.max(Math.round(at[0]) - (across >> 1), 0), Math.max(width - across, 0)),
+        Math.min(Math.max(Math.round(at[1]) - (down >> 1), 0), Math.max(height - down, 0)),
+      ];
     },
 
     // Geometry: pixels of the frame (integers are centers) to screen pixels of the canvas and back.
@@ -183,9 +236,7 @@ export default {
       const { scale, left, top } = this.placed;
       pen.fillStyle = "#000";
       pen.fillRect(0, 0, ...window);
-      pen.imageSmoothingEnabled = scale * devicePixelRatio < 1; // enlarged frames show their pixels
-      pen.imageSmoothingQuality = scale * devicePixelRatio < 0.5 ? "medium" : "low"; // so that no star is skipped
-      pen.drawImage(this.sheet, left, top, size[0] * scale, size[1] * scale);
+      this.paintPixels(pen);
       pen.strokeStyle = "#252c38";
       pen.lineWidth = 1;
       pen.strokeRect(left - 0.5, top - 0.5, size[0] * scale + 1, size[1] * scale + 1);
@@ -196,10 +247,23 @@ export default {
       const ringed = lights.find((light) => light[2] === this.hovered && light[2] >= 0);
       if (ringed) drawHighlight(pen, this.toScreen(ringed[0], ringed[1]), PALE);
       canvas.dataset.frame = this.drawn.src;
+      canvas.dataset.whole = this.drawn.isWhole;
       canvas.dataset.placement = [left, top, scale].map((value) => value.toFixed(6)).join(" ");
       canvas.dataset.ringed = ringed ? ringed[2] : "";
       canvas.ariaLabel = this.drawn.label;
       this.paintUnder();
+    },
+    paintPixels(pen) {
+      const { scale, left, top } = this.placed, { size, isWhole } = this.drawn, wide = scale * devicePixelRatio;
+      if (!isWhole && this.sheet.width === Math.round(size[0] * wide)) {
+        // A pixel for each of the screen's: a copy without interpolation.
+        pen.putImageData(this.sheetData, Math.round(left * devicePixelRatio), Math.round(top * devicePixelRatio));
+        return;
+      }
+      this.sheetPen.putImageData(this.sheetData, 0, 0);
+      pen.imageSmoothingEnabled = wide < 1; // enlarged frames show their pixels
+      pen.imageSmoothingQuality = wide < 0.5 ? "medium" : "low"; // so that no star is skipped
+      pen.drawImage(this.sheet, left, top, size[0] * scale, size[1] * scale);
     },
     lines() {
       if (this.gridOf !== this.drawn.view) {
@@ -220,10 +284,17 @@ export default {
     // Loupe, plot and readout.
     paintUnder() {
       if (!this.drawn) return;
-      const plot = this.$refs.plot, pen = this.sized(plot);
+      const now = performance.now(), plot = this.$refs.plot;
+      if (!this.drawn.isWhole && now < this.plottedAt + PLOT_MS) {
+        this.paintLoupe();
+        this.writeReadout();
+        return;
+      }
+      this.plottedAt = now;
+      const pen = this.sized(plot);
       const { offset, step } = this.drawn.pixels, limits = this.levels.map((level) => offset + step * level);
       plot.dataset.limits = limits.map((dn) => dn.toPrecision(8)).join(" ");
-      if (pen && this.cut) {
+      if (pen && this.cut && this.drawn.isWhole) {
         const found = profile(this.drawn.pixels, ...this.cut);
         drawProfile(pen, found, [plot.clientWidth, plot.clientHeight], CUT);
         plot.dataset.cut = this.cut.flat().map((value) => value.toFixed(4)).join(" ");
@@ -237,15 +308,14 @@ export default {
       this.writeReadout();
     },
     paintLoupe() {
-      const at = this.cursor ?? this.pinned;
-      if (!at) return this.clearLoupe(); // the pixels of an earlier frame must not stay
+      const corner = this.loupeAt(), dn = [];
+      if (!corner) return this.clearLoupe();
+      const [x, y] = corner, { across, down } = LOUPE, { step } = this.drawn.pixels;
+      for (let row = y; row < y + down; row++) for (let column = x; column < x + across; column++) dn.push(this.value(column, row));
+      const [width, height] = this.drawn.size, isThere = dn.every((value, n) => value !== null || n % across >= width || n / across >= height);
+      if (!isThere) return this.clearLoupe(); // the pixels of an earlier frame must not stay
       const canvas = this.$refs.loupe, pen = this.sized(canvas);
       if (!pen) return;
-      const { width, height, offset, step } = this.drawn.pixels, { across, down } = LOUPE;
-      const x = Math.min(Math.max(Math.round(at[0]) - (across >> 1), 0), Math.max(width - across, 0));
-      const y = Math.min(Math.max(Math.round(at[1]) - (down >> 1), 0), Math.max(height - down, 0));
-      const dn = [];
-      for (let row = y; row < y + down; row++) for (let column = x; column < x + across; column++) dn.push(this.value(column, row) ?? 0);
       const low = Math.min(...dn), range = Math.max(Math.max(...dn) - low, step);
       const gray = (value) => Math.round(255 * Math.sqrt((value - low) / range));
       const crosses = this.drawn.lights.filter((light) => light[3]);
@@ -290,6 +360,7 @@ export default {
       const middle = this.zoom ?? { scale, x: (clientWidth / 2 - left) / scale, y: (clientHeight / 2 - top) / scale };
       this.pressed = { from: [event.offsetX, event.offsetY], start: this.toFrame(event), middle, cutting: event.shiftKey };
       if (event.shiftKey) this.cut = null;
+      this.complete();
     },
     move(event) {
       if (!this.drawn) return;
@@ -309,6 +380,7 @@ export default {
       }
       this.cursor = at;
       this.hover(at);
+      this.complete();
       this.paintUnder();
     },
     // Report the light under the cursor when it is another one.

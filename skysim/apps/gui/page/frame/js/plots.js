@@ -2,30 +2,25 @@
 
 const MARGIN = { left: 4, right: 4, top: 16, bottom: 16 };
 const QUIET = "#8b95a5", BAR = "#46566e", LIMIT = "#f0b429";
-const BINS = 80;
 
-// The axis is an inverse hyperbolic sine about the sky, in units of its scatter: linear there, logarithmic for stars.
-function axisOf({ sorted, low, high }, width) {
-  const sky = sorted[sorted.length >> 1];
-  const scatter = Math.max(1.4826 * (sky - sorted[sorted.length >> 2]), 1);
-  const bend = (level) => Math.asinh((level - sky) / scatter);
-  const [first, last] = [bend(low) - 0.3, bend(high) + 0.3], inner = width - MARGIN.left - MARGIN.right;
+// The axis is an inverse hyperbolic sine about the sky, in units of its scatter, see `histogram` in served.py.
+const AXIS_MARGIN = 0.3;
+
+function axisOf({ sky, scatter, range }, width) {
+  const bend = (level) => Math.asinh((level - sky) / scatter), inner = width - MARGIN.left - MARGIN.right;
+  const [first, last] = [bend(range[0]) - AXIS_MARGIN, bend(range[1]) + AXIS_MARGIN];
   return {
     at: (level) => MARGIN.left + ((bend(level) - first) / (last - first)) * inner,
     level: (x) => sky + scatter * Math.sinh(first + ((x - MARGIN.left) / inner) * (last - first)),
   };
 }
 
-export function drawHistogram(pen, { pixels, sampled }, levels, [width, height]) {
-  const axis = axisOf(sampled, width), counts = new Float64Array(BINS);
-  for (const value of sampled.sorted) {
-    const bin = Math.floor(((axis.at(value) - MARGIN.left) / (width - MARGIN.left - MARGIN.right)) * BINS);
-    counts[Math.min(Math.max(bin, 0), BINS - 1)] += 1;
-  }
+export function drawHistogram(pen, { pixels, histogram }, levels, [width, height]) {
+  const axis = axisOf(histogram, width), { counts } = histogram;
   const most = Math.log1p(Math.max(...counts)), room = height - MARGIN.top - MARGIN.bottom;
   pen.clearRect(0, 0, width, height);
   pen.fillStyle = BAR;
-  const wide = (width - MARGIN.left - MARGIN.right) / BINS;
+  const wide = (width - MARGIN.left - MARGIN.right) / counts.length;
   counts.forEach((count, n) => {
     const tall = (Math.log1p(count) / most) * room;
     pen.fillRect(MARGIN.left + n * wide, height - MARGIN.bottom - tall, wide + 0.3, tall);

@@ -1,0 +1,199 @@
+"""Frames on their way to the browser: reduced to the screen's pixels while they follow one another."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import pickle
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.visualization import ZScaleInterval
+from labpage import CHROMIUM, NARROW, Server, come, exported, opened, panel, source
+
+pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
+
+from astropy.io import fits
+
+from skysim.apps.gui.messages import Lights
+from skysim.apps.gui.page.frame.live import Contents
+from skysim.apps.gui.page.frame.served import BINS, HEADER_BYTES, ServedFrame, limits_of, reduced
+from skysim.apps.gui.worker import pixels
+from skysim.results import stretch
+
+
+def sky(seed: int, shape: tuple[int, int] = (120, 160)) -> np.ndarray:
+    """Pixels of a sky with some bright stars."""
+    random = np.random.default_rng(seed)
+    image = random.poisson(100, shape).astype(np.uint16)
+    image.ravel()[random.integers(0, image.size, 60)] += 3000
+    return image
+
+
+def decoded(data: bytes) -> tuple[dict[str, Any], np.ndarray]:
+    """Fields and pixels of a response, by its description in frame.js."""
+    length = int.from_bytes(data[-4:], "little")
+    fields = json.loads(data[-4 - length : -4])
+    numbers = np.frombuffer(data[HEADER_BYTES : -4 - length], np.uint16)
+    return fields, numbers.reshape(fields["grid"][::-1])
+
+
+def served(image: np.ndarray, saturation_dn: float = np.inf) -> ServedFrame:
+    return ServedFrame(pixels.encoded(image), image.shape[::-1], saturation_dn, {"label": "sky"})
+
+
+def test_all_pixels_arrive_unchanged_with_the_frame_s_fields() -> None:
+    image = sky(1)
+    fields, levels = decoded(served(image, 4095.0).response(0, "automatic"))
+    np.testing.assert_array_equal(levels, image)
+    assert fields["size"] == [160, 120]
+    assert (fields["label"], fields["saturation"]) == ("sky", 4095)
+    assert decoded(served(image).response(0, "automatic"))[0]["saturation"] is None
+
+
+@pytest.mark.parametrize("limits", ["automatic", "zscale", "min to max", "manual"])
+def test_fewer_pixels_have_the_same_limits_and_histogram(limits: str) -> None:
+    whole, fewer = (decoded(served(sky(2)).response(width, limits)) for width in (0, 77))
+    assert fewer[1].shape == (58, 77)
+    assert [fewer[0][name] for name in ("limits", "histogram")] == [whole[0][name] for name in ("limits", "histogram")]
+
+
+def test_a_reduced_pixel_is_the_mean_over_its_area() -> None:
+    image = sky(3)
+    np.testing.assert_allclose(reduced(image, 40, np.inf), image.reshape(30, 4, 40, 4).mean(axis=(1, 3)), atol=0.5)
+    odd = reduced(image, 77, np.inf)  # areas that share pixels
+    assert odd.mean() == pytest.approx(image.mean(), abs=0.6)
+
+
+def test_a_single_saturated_pixel_is_seen_in_the_reduced_frame() -> None:
+    image = sky(4)
+    image[51, 80], image[90, 83] = 4095, 4095  # the second is on the edge of two areas
+    fewer = reduced(image, 61, 4095)
+    assert np.argwhere(fewer >= 4095).tolist() == [[19, 30], [34, 31], [34, 32]]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_zscale_is_astropy_s_and_the_others_are_those_of_pictures(seed: int) -> None:
+    image = sky(seed, (70, 90 + seed))
+    np.testing.assert_allclose(limits_of(image, "zscale"), ZScaleInterval().get_limits(image), rtol=1e-12)
+    assert limits_of(image, "automatic") == stretch.display_levels(image)
+    assert limits_of(image, "min to max") == (image.min(), image.max())
+
+
+def test_the_histogram_s_axis_is_linear_in_the_sky_and_holds_all_pixels() -> None:
+    """Half of the counts are below the sky's median; the axis ends at the extremes of all pixels."""
+    image = sky(5, (640, 640))
+    found = decoded(served(image).response(0, "automatic"))[0]["histogram"]
+    counts, (low, high) = np.array(found["counts"]), found["range"]
+    assert (len(counts), low, high) == (BINS, image.min(), image.max())
+    assert counts.sum() == 40 * 80
+    assert found["sky"] == np.median(image[::16, ::8])
+    assert found["scatter"] == pytest.approx(10, rel=0.2)  # Poisson, mean 100
+    first, last = np.arcsinh((np.array([low, high]) - found["sky"]) / found["scatter"])
+    edges = np.linspace(first - 0.3, last + 0.3, BINS + 1)
+    assert counts[edges[1:] < 0].sum() == pytest.approx(counts.sum() / 2, rel=0.2)
+
+
+def test_the_loupe_s_pixels_come_unchanged_with_a_reduced_frame() -> None:
+    image = sky(6)
+    near = decoded(served(image).response(60, "automatic", (155, 40)))[0]["near"]
+    assert (near["x"], near["y"]) == (155, 40)
+    assert near["levels"] == image[40:51, 155:].tolist()  # as far as the frame reaches
+
+
+def test_lights_are_a_sequence_that_is_sent_as_columns() -> None:
+    count = 500
+    random = np.random.default_rng(7)
+    lights = Lights(np.arange(count), random.uniform(0, 1000, (count, 2)), random.random(count), random.random(count))
+    again = pickle.loads(pickle.dumps(lights))
+    assert len(pickle.dumps(lights)) < 41 * count + 1000  # eight bytes a number
+    assert len(again) == count
+    assert again[3] == lights[3]
+    assert [light.id for light in again[5:8]] == [5, 6, 7]
+    assert again[3].x == lights.xy_px[3, 0]
+
+
+def test_contents_go_with_the_next_frame_or_else_by_themselves() -> None:
+    async def story() -> list[dict[int, dict[str, str]]]:
+        contents, sent = Contents(), []
+        contents.send = sent.append
+        contents.set(1, {"text": "a"})
+        assert contents.take() == {1: {"text": "a"}}  # a frame takes them
+        await asyncio.sleep(0)
+        assert sent == []
+        contents.set(1, {"text": "a"})  # no change
+        await asyncio.sleep(0)
+        assert sent == []
+        contents.set(1, {"text": "b"})
+        contents.set(2, {"text": "c"})
+        await asyncio.sleep(0)
+        return sent
+
+    assert asyncio.run(story()) == [{1: {"text": "b"}, 2: {"text": "c"}}]
+
+
+# In the browser.
+
+SQUARE = """schema: 1
+base: shefex2
+title: SHEFEX-2 with a square megapixel
+camera: {width_px: 1024, height_px: 1024}
+exposure: {time: "20 ms", rate_hz: 10, frames: 12, first: "0.1 s"}
+"""
+DRAWINGS = """() => { const canvas = document.querySelector('.lab-frame canvas'); window.drawings = [];
+  new MutationObserver(() => window.drawings.push([canvas.dataset.frame, canvas.dataset.whole])).observe(
+    canvas, {attributeFilter: ['data-frame', 'data-whole']}); }"""
+
+
+@pytest.fixture(scope="module")
+def square(browser: Any, server: Server) -> Iterator[Any]:
+    (server.folder / "square.yaml").write_text(SQUARE)
+    with opened(browser, server.login, NARROW) as page:
+        page.get_by_role("combobox", name="Scene").click()
+        before = source(page)
+        page.get_by_role("option", name="square.yaml").click()
+        assert come(lambda: source(page) != before)
+        yield page
+
+
+def is_whole(page: Any) -> bool:
+    return bool(page.locator(".lab-frame canvas").get_attribute("data-whole") == "true")
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium")
+def test_a_key_shows_a_reduced_frame_at_once_and_all_pixels_at_rest(square: Any, tmp_path: Any) -> None:
+    assert come(lambda: is_whole(square))
+    square.evaluate(DRAWINGS)
+    square.keyboard.press("ArrowLeft")
+    assert come(lambda: square.evaluate("window.drawings.some(([, whole]) => whole === 'false')"))
+    assert come(lambda: is_whole(square))
+    frame = fits.getdata(exported(square, "frame, FITS", tmp_path))
+    box = square.locator(".lab-frame canvas").bounding_box()
+    square.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    text = square.locator(".lab-loupe").get_attribute("aria-label")
+    x, y = (int(word) for word in text.split(",")[0].split()[2:4])
+    values = [float(word) for word in text.partition(": ")[2].split()]
+    np.testing.assert_array_equal(values, frame[y : y + 7, x : x + 11].ravel())
+    square.keyboard.press("ArrowLeft")  # the loupe follows at once, before all pixels are there
+    assert come(lambda: square.locator(".lab-loupe").get_attribute("aria-label") not in (text, ""))
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium")
+def test_playing_a_flight_does_not_render_the_page_again(square: Any) -> None:
+    """The texts change with the frames, and NiceGUI's updates, each of which renders the whole page, do not come."""
+    panel(square, "Run")
+    square.get_by_role("button", name="Simulate").click()
+    clock = square.locator("[data-state]", has_text="12/12")
+    clock.wait_for()
+    square.wait_for_timeout(500)
+    square.evaluate("""() => { window.updates = 0;
+      window.socket.on("update", () => { window.updates += 1; }); }""")
+    square.get_by_role("button", name="Play").click()
+    assert come(lambda: not clock.is_visible())
+    assert come(clock.is_visible)
+    assert square.evaluate("window.updates") <= 4  # play and pause
+    assert square.get_by_label("Frame of the flight").input_value() == "11"
