@@ -102,7 +102,7 @@ def study_trials(scene: str, settings: Mapping[str, Any], factors: Mapping[str, 
 def catalog_stars(testbed: Testbed, trial: Any) -> int:
     """Stars of the tracker's limiting magnitude on the chip at a trial's attitude."""
     wxyz = [trial[f"lab_from_body_{axis}"] for axis in "wxyz"]
-    rows = visible_rows(testbed, Rotation.from_quat(wxyz, scalar_first=True))[0]
+    rows = visible_rows(testbed, Rotation.from_quat([wxyz], scalar_first=True))[0].rows
     return int(np.sum(testbed.sources.magnitude[rows] <= testbed.scene.tracker.limit_mag))
 
 

@@ -36,8 +36,8 @@ MAX_PIECES = 100_000
 MIN_POSES, MAX_POSES = 9, 32_769  # number of poses in an exposure
 SINGLE_PIECE_STEPS = 0.4  # path length, in steps, up to which one piece is enough: error 1e-4 of the peak
 STILL_PX = 1e-3  # an image that moves less is drawn as one point
-MIN_TREE_STARS = 20_000  # below, a pass over all takes less than 50 us
-MAX_TREE_SHARE = 0.1  # of the sky, up to which a search tree finds a field's stars sooner than a pass over all
+MIN_BAND_STARS = 20_000  # below, a pass over all takes less than 50 us
+MAX_BAND_SHARE = 0.1  # of the sky, up to which a band of it holds a field's stars sooner than a pass over all
 MAX_PATCH_PIXELS = 1 << 20  # pixels of patches held in memory at once, or as many as the frame has
 
 OcclusionTest = Callable[[Floats], NDArray[np.bool_]]  # (N,) which of N sources at `Sources.place` are occluded
@@ -224,11 +224,25 @@ def project(
     direction_cam, distance, cos_out = _directions(
         sources.place, motion, after_s, sources.normal, cam_from_lab, camera_m
     )
+    return _pixels(sources, optics, direction_cam), distance, cos_out, direction_cam[:, :, 2]
+
+
+def project_each(sources: Sources, optics: Optics, poses: Poses, ends: NDArray[np.int64]) -> tuple[Floats, ...]:
+    """As `project` at mid-exposure, of sources in groups, each at a pose of its own: the results are (N, 2) and (N,).
+
+    ends : (K + 1,) 0, and the number of sources up to the end of each group
+    """
+    direction_cam, distance, cos_out = _directions_each(sources.place, NO_MOTION, NOW, sources.normal, *poses, ends)
+    return _pixels(sources, optics, direction_cam), distance, cos_out, direction_cam[:, 2]
+
+
+def _pixels(sources: Sources, optics: Optics, direction_cam: Floats) -> Floats:
+    """(..., N, 2) pixels of (..., N, 3) directions, each source in its color."""
     xy_px = optics.project(direction_cam)
     if sources.chromatic is not None:
         camera = optics.camera
         xy_px += (xy_px - camera.center_px) * (sources.chromatic[:, 2:3] / camera.corner_px)
-    return xy_px, distance, cos_out, direction_cam[:, :, 2]
+    return xy_px
 
 
 @jit
@@ -265,6 +279,28 @@ def _directions(
     return direction, distance, cosine
 
 
+@jit
+def _directions_each(
+    place: Floats,
+    motion: Floats,
+    after_s: Floats,
+    normal: Floats,
+    cam_from_lab: Floats,
+    camera_m: Floats,
+    ends: NDArray[np.int64],
+) -> tuple[Floats, Floats, Floats]:
+    """As `_directions` of sources in groups, each at a pose of its own: (N, 3), (N,) and (N,)."""
+    direction, distance, cosine = np.empty((len(place), 3)), np.empty(len(place)), np.empty(len(place))
+    for k in range(len(ends) - 1):
+        a, b = ends[k], ends[k + 1]
+        own = _directions(place[a:b], motion, after_s, normal[a:b], cam_from_lab[k : k + 1], camera_m[k : k + 1])
+        for n in range(a, b):
+            distance[n], cosine[n] = own[1][0, n - a], own[2][0, n - a]
+            for i in range(3):
+                direction[n, i] = own[0][0, n - a, i]
+    return direction, distance, cosine
+
+
 def led_images(sources: Sources, optics: Optics, pose: Poses, emitter: Emitter) -> DiskImages | None:
     """The geometric images of N sources at one pose, NaN for stars; None if all are stars."""
     led = np.flatnonzero(sources.radius_m * sources.place[:, 3] > 0)
@@ -293,8 +329,8 @@ def in_view(sources: Sources, optics: Optics, poses: Poses, reach: float = 0.25)
     half_rad = (1 + reach) * optics.field_rad + 0.02 + rotation_rad / 2
     cos_limit, cos_any = (math.cos(min(angle_rad, math.pi)) for angle_rad in (half_rad, half_rad + span_rad))
     place, camera_m = sources.place, np.ascontiguousarray(poses.camera_m)
-    by_tree = len(sources) >= MIN_TREE_STARS and (1 - cos_any) / 2 <= MAX_TREE_SHARE
-    if by_tree and isinstance(sources, StarSources):
+    by_band = len(sources) >= MIN_BAND_STARS and (1 - cos_any) / 2 <= MAX_BAND_SHARE
+    if by_band and isinstance(sources, StarSources):
         near = sources.within(boresight[0], half_rad + span_rad)
         return near[_in_cone(place[near], boresight, camera_m, cos_limit, cos_any)]
     return np.flatnonzero(_in_cone(place, boresight, camera_m, cos_limit, cos_any))

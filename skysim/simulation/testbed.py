@@ -58,15 +58,19 @@ def exposure_window(scene: Scene, index: int, exposure_s: float | None = None) -
     """The exposure window of a frame, opened late by its jitter; as long as the scene's if no time is given."""
     shutter = scene.camera.shutter
     row_time_s = shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0
-    late_s = scene.exposure.trigger_jitter_s * timing_draws(scene.seed, index)[0]
+    jitter_s = scene.exposure.trigger_jitter_s
+    late_s = jitter_s * timing_draws(scene.seed, index)[0] if jitter_s else 0.0
     begin_s = scene.exposure.first_s + index / scene.exposure.rate_hz + late_s
     return Window(begin_s, scene.exposure.time_s if exposure_s is None else exposure_s, row_time_s)
 
 
 def time_tag_error_s(scene: Scene, index: int) -> float:
     """The time that the camera gives to a frame minus the true time of mid-exposure."""
+    exposure = scene.exposure
+    if not exposure.time_tag_jitter_s:
+        return exposure.time_tag_offset_s
     drawn = np.array(timing_draws(scene.seed, index)[1])
-    return scene.exposure.time_tag_offset_s + float(scaled_errors(scene.exposure.time_tag_jitter_s, drawn))
+    return exposure.time_tag_offset_s + float(scaled_errors(exposure.time_tag_jitter_s, drawn))
 
 
 @lru_cache(maxsize=64)

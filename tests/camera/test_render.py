@@ -580,7 +580,7 @@ def test_a_field_of_a_deep_catalog_costs_only_the_stars_near_it(
     in_cone = rendering._in_cone
     monkeypatch.setattr(rendering, "_in_cone", lambda place, *more: tested.append(len(place)) or in_cone(place, *more))
     rows = rendering.in_view(stars, LENS, poses)
-    monkeypatch.setattr(rendering, "MIN_TREE_STARS", 10**9)
+    monkeypatch.setattr(rendering, "MIN_BAND_STARS", 10**9)
     assert rows.tolist() == rendering.in_view(stars, LENS, poses).tolist()
     assert tested[1] == 25_000
     assert len(rows) <= tested[0] < (0.05 * 25_000 if len(angles) < 3 else 25_001)

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
-from estimator.trackers.pipeline import Clock, detect_and_centroid
+from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.camera.detector.added_charge import PARTICLES, SMEAR, AddedCharge
 from skysim.camera.render import Window
 from skysim.core.jit import jit
@@ -19,6 +20,7 @@ from skysim.core.types import BodyTruth, Floats, Frame, SourceTruth, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX
 from skysim.experiments.study.execution.setups import Setup
+from skysim.scene.scene import Scene
 from skysim.simulation.testbed import exposure_window
 from skysim.tracking.onboard_model import assumed_camera
 from skysim.tracking.settings import assumed_settings
@@ -74,21 +76,43 @@ class LabelledFrame(NamedTuple):
     masks: dict[str, list[int]]
 
 
-def label_frame(setup: Setup, seed: int) -> LabelledFrame:
-    """Render a frame trial's frame and its labels. They depend on the setup and the seed alone."""
-    scene = setup.testbed.scene
+class Labeller(NamedTuple):
+    """What the labels of all frames of one scene take.
+
+    camera, settings : what its tracker assumes
+    threshold_e      : least charge that something else than light adds to a pixel of a mask
+    """
+
+    camera: Camera
+    settings: Settings
+    threshold_e: float
+
+
+def labeller(scene: Scene) -> Labeller:
+    """The labeller of a scene, made once for its frames: it takes as long as a tenth of them."""
     config = scene.camera.detector
-    added = AddedCharge(max(math.hypot(config.read_noise_e, config.reset_noise_e), 1.0))
+    threshold_e = max(math.hypot(config.read_noise_e, config.reset_noise_e), 1.0)
+    return Labeller(assumed_camera(scene), assumed_settings(scene), threshold_e)
+
+
+def label_frame(setup: Setup, seed: int, by: Labeller | None = None) -> LabelledFrame:
+    """Render a frame trial's frame and its labels. They depend on the setup and the seed alone.
+
+    by : of the setup's scene, if there is one already
+    """
+    scene = setup.testbed.scene
+    by = by or labeller(scene)
+    added = AddedCharge(by.threshold_e)
     frame, truth, streak_px = trials.render_trial_frame(setup, seed, added)
-    masks = {SATURATED: frame.image_dn >= least_value(frame), **added.masks}
     try:
-        found = detect_and_centroid(frame.image_dn, assumed_camera(scene), assumed_settings(scene), Clock(), streak_px)
+        found = detect_and_centroid(frame.image_dn, by.camera, by.settings, Clock(), streak_px)
     except ImageError:  # a saturated frame
         found = Centroids.empty()
     sources, unmatched = source_rows(truth.sources, found.xy_px)
     add_radii(sources, truth.bodies, scene.camera.focal_px)
     extents = image_extents(sources, exposure_window(scene, frame.index), scene.camera.height_px)
-    runs = {name: run_lengths(masks[name]) for name in MASKS if name in masks}
+    runs = {SATURATED: run_lengths(frame.image_dn, least_value(frame))}
+    runs |= {name: run_lengths(added.masks[name]) for name in MASKS if name in added.masks}
     return LabelledFrame(frame, truth, sources, extents, unmatched, runs)
 
 
@@ -170,10 +194,14 @@ def across_sigma_px(area_px: Floats, streak_px: Floats) -> Floats:
     return np.asarray(np.sqrt((np.sqrt(square**2 + 4 * area_px**2) - square) / (8 * math.pi)))
 
 
-def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
-    """Lengths of the runs of a (H, W) mask, column by column, the first of pixels that are not set: COCO's code."""
-    y, x = np.divmod(np.flatnonzero(mask), mask.shape[1])  # a copy of the transposed mask would take ten times longer
-    flat = np.sort(x * len(mask) + y)
+def run_lengths(mask: NDArray[Any], least: float = True) -> list[int]:
+    """Lengths of the runs of a (H, W) mask, column by column, the first of pixels that are not set: COCO's code.
+
+    least : of an image, the least value of a pixel that is set
+    """
+    rows = np.flatnonzero(mask.max(axis=1) >= least)  # most have no pixel that is set
+    y, x = np.nonzero(mask[rows] >= least)
+    flat = np.sort(x * len(mask) + rows[y])  # a copy of the transposed mask would take ten times longer
     if not len(flat):
         return [mask.size]
     breaks = np.flatnonzero(np.diff(flat) != 1)

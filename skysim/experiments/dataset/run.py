@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from skysim import __version__
 from skysim.core.errors import InputError
 from skysim.experiments.dataset import shards
-from skysim.experiments.dataset.labels import LabelledFrame, label_frame
+from skysim.experiments.dataset.labels import LabelledFrame, label_frame, labeller
 from skysim.experiments.dataset.plan import DatasetPlan
 from skysim.experiments.dataset.shards import TarWriter, shard_name
 from skysim.experiments.dataset.storage import Storage
@@ -78,12 +78,15 @@ class ShardQueue:
 
 def labelled_frames(plan: DatasetPlan, shard: int) -> Iterator[tuple[int, dict[str, Any], Setup, LabelledFrame]]:
     """The frames of a shard: number, level of each factor, test bed, frame with labels."""
+    known = None  # settings of the frame before
     for frame in plan.frames_of(shard):
         levels, settings = plan.draw(shard, frame)
-        if frame == plan.frames_of(shard).start:
+        if known is None:
             setup = prepared_setup(plan.spec, settings)
-        setup = setup._replace(trial=resolve_trial(plan.spec, settings))
-        yield frame, levels, setup, label_frame(setup, plan.seed(frame))
+            by = labeller(setup.testbed.scene)
+        if settings != known:
+            setup, known = setup._replace(trial=resolve_trial(plan.spec, settings)), settings
+        yield frame, levels, setup, label_frame(setup, plan.seed(frame), by)
 
 
 def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import tarfile
 from typing import IO, Any
@@ -13,6 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.types import ra_dec_roll_rad
 from skysim.core.errors import InputError
+from skysim.core.jit import jit
+from skysim.core.types import Floats
 from skysim.experiments.dataset.labels import MASKS, Extents, LabelledFrame
 from skysim.experiments.dataset.storage import EXTRA, Storage
 from skysim.scene.scene import Scene
@@ -22,6 +25,11 @@ ZARR, ZARR_ARRAY = "images.zarr", "images"
 BLOCK = 512  # bytes of a block of a tar file
 COCO_SNR = 3.0  # sources below are no annotations; they are in the other labels
 CATEGORIES = ("source", *MASKS)
+COMMA, SPACE, MINUS, POINT, ZERO = b", -.0"
+SOURCE_JSON = (
+    '{"id": %d, "image_id": %d, "category_id": 1, "bbox": [%s], "area": %r, '
+    '"segmentation": [[%s]], "iscrowd": 0, "source": %d, "electrons": %r, "detected": %s}'
+)
 
 
 def to_npy(array: NDArray[Any]) -> bytes:
@@ -108,25 +116,27 @@ def coco_image(labels: dict[str, Any]) -> dict[str, Any]:
 def coco_annotations(one: LabelledFrame, number: int) -> bytes:
     """JSON objects, joined by commas: outlines of the sources, and masks of the rest as crowds.
 
-    Ids are unique in the dataset. Objects of a whole shard would take longer, for the sake of Python's garbage.
+    Ids are unique in the dataset. A source is written as `json.dumps` would write it, ten times as fast.
     """
     seen = one.sources["snr"] >= COCO_SNR
-    found: list[dict[str, Any]] = [
-        {"category_id": 1, "bbox": box, "area": box[2] * box[3], "segmentation": [outline], "iscrowd": 0, **labels}
-        for box, outline, labels in outlines(one.sources[seen], one.extents.of(seen))
-    ]
+    rows, first = one.sources[seen], number * 100_000 + 1
+    boxes, corners = outlines(one.extents.of(seen))
+    ids, detected = rows["id"].tolist(), (("false", "true")[one] for one in rows["detected"].tolist())
+    areas = (boxes[:, 2] * boxes[:, 3]).tolist()
+    columns = hundredths(boxes), areas, hundredths(corners), ids, rows["electrons"].tolist(), detected
+    found = [SOURCE_JSON % (first + n, number, *each) for n, each in enumerate(zip(*columns, strict=True))]
     height, width = one.frame.image_dn.shape
     for name, counts in one.masks.items():
         if len(counts) > 1:
             code = {"size": [height, width], "counts": counts}
             mask = {"bbox": mask_box(counts, height), "area": sum(counts[1::2]), "segmentation": code, "iscrowd": 1}
-            found.append({"category_id": 1 + CATEGORIES.index(name), **mask})
-    numbered = [{"id": number * 100_000 + n, "image_id": number, **each} for n, each in enumerate(found, 1)]
-    return json.dumps(numbered)[1:-1].encode()
+            numbers = {"id": first + len(found), "image_id": number, "category_id": 1 + CATEGORIES.index(name)}
+            found.append(json.dumps(numbers | mask))
+    return ", ".join(found).encode()
 
 
-def outlines(rows: NDArray[Any], extents: Extents) -> list[tuple[list[float], list[float], dict[str, Any]]]:
-    """Box (x, y, width, height), outline (x, y of four corners) and labels of each source.
+def outlines(extents: Extents) -> tuple[Floats, Floats]:
+    """(N, 4) boxes (x, y, width, height) and (N, 8) outlines (x, y of four corners).
 
     COCO's origin is the corner of the first pixel, half a pixel from its center.
     """
@@ -134,11 +144,45 @@ def outlines(rows: NDArray[Any], extents: Extents) -> list[tuple[list[float], li
     a, b = extents.along * extents.half_px[:, :1], across * extents.half_px[:, 1:]
     corners = np.round(extents.center_px[:, None] + 0.5 + np.stack([-a - b, a - b, a + b, b - a], axis=1), 2)
     low, high = corners.min(axis=1), corners.max(axis=1)
-    boxes = np.round(np.column_stack([low, high - low]), 2).tolist()
-    names = {"source": "id", "electrons": "electrons", "detected": "detected"}
-    columns = zip(*(rows[name].tolist() for name in names.values()), strict=True)
-    labels = [dict(zip(names, values, strict=True)) for values in columns]
-    return list(zip(boxes, corners.reshape(-1, 8).tolist(), labels, strict=True))
+    return np.round(np.column_stack([low, high - low]), 2), corners.reshape(-1, 8)
+
+
+def hundredths(numbers: Floats) -> list[str]:
+    """The rows of (N, K) finite numbers with two decimals, as `json.dumps` writes a list without its brackets."""
+    steps = np.rint(100 * np.abs(numbers)).astype(np.int64)
+    text, ends = _hundredths(steps, np.signbit(numbers))
+    whole = text[: ends[-1]].tobytes().decode("ascii")
+    return [whole[begin:end] for begin, end in itertools.pairwise(ends.tolist())]
+
+
+@jit
+def _hundredths(steps: NDArray[np.int64], negative: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """The ASCII of numbers of hundredths with their signs, and where each row ends in it, after a first 0."""
+    digits, ends = np.empty(20, np.uint8), np.zeros(len(steps) + 1, np.int64)
+    text, at = np.empty(steps.size * 25, np.uint8), 0
+    for n in range(len(steps)):
+        for k in range(steps.shape[1]):
+            if k:
+                text[at], text[at + 1] = COMMA, SPACE
+                at += 2
+            if negative[n, k]:
+                text[at] = MINUS
+                at += 1
+            left, count = steps[n, k] // 100, 0
+            while left or count == 0:
+                digits[count] = ZERO + left % 10
+                left //= 10
+                count += 1
+            for i in range(count):
+                text[at + i] = digits[count - 1 - i]
+            at += count
+            text[at], text[at + 1] = POINT, ZERO + steps[n, k] // 10 % 10
+            at += 2
+            if steps[n, k] % 10:
+                text[at] = ZERO + steps[n, k] % 10
+                at += 1
+        ends[n + 1] = at
+    return text, ends
 
 
 def mask_box(counts: list[int], height: int) -> list[float]:

@@ -125,6 +125,14 @@ def test_boxes_hold_the_light_of_their_sources(whole: Path) -> None:
     assert len(set(ids)) == len(ids)
 
 
+def test_numbers_with_two_decimals_are_written_as_json_writes_them() -> None:
+    rng = np.random.default_rng(3)
+    numbers = np.round(rng.standard_normal((500, 4)) * 10.0 ** rng.integers(-3, 6, (500, 4)), 2)
+    numbers[0] = [0.0, -0.0, 100.0, -0.05]
+    assert [f"[{row}]" for row in shards.hundredths(numbers)] == [json.dumps(row) for row in numbers.tolist()]
+    assert shards.hundredths(np.empty((0, 4))) == []
+
+
 def test_the_box_of_a_mask_is_about_its_pixels() -> None:
     from skysim.experiments.dataset.labels import run_lengths
 

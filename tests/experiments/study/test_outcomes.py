@@ -26,7 +26,7 @@ ARCMIN_RAD = math.radians(1 / 60)
 def solved(spec: TrialSpec, seed: int = 3) -> tuple[Setup, Report, TrueLights]:
     """A centroid trial's report and true lights."""
     setup = setups.prepared_setup(spec, {})
-    lights, report = trials.solved_centroids(setup, seed)
+    ((lights, report),) = trials.solved_centroids(setup, [seed])
     assert report.attitude.solved
     return setup, report, lights
 
@@ -146,7 +146,7 @@ def test_a_streak_is_as_long_as_the_rate_times_the_exposure() -> None:
     setup = setups.prepared_setup(spec, {})
     expected_px = math.radians(4.0) * setup.testbed.scene.exposure.time_s * setup.testbed.scene.camera.focal_px
     assert trials.run_frame_trial(setup, 5).streak_px == pytest.approx(expected_px, rel=0.03)
-    assert math.isnan(trials.run_centroid_trial(setups.prepared_setup(SKY, {}), 5).streak_px)
+    assert math.isnan(trials.run_centroid_trials(setups.prepared_setup(SKY, {}), [5])[0].streak_px)
 
 
 @pytest.mark.slow
@@ -169,7 +169,7 @@ def test_a_row_has_the_attitude_of_its_trial() -> None:
     for spec in (SKY, DOME):
         setup = setups.prepared_setup(spec, {})
         drawn = trials.random_attitude(setup, trials.streams(setup, 8)[0])
-        outcome = trials.run_centroid_trial(setup, 8)
+        (outcome,) = trials.run_centroid_trials(setup, [8])
         wxyz = [getattr(outcome, f"lab_from_body_{axis}") for axis in "wxyz"]
         assert (Rotation.from_quat(wxyz, scalar_first=True) * drawn.inv()).magnitude() < 1e-12
         if spec is DOME:

@@ -207,7 +207,7 @@ def test_trials_that_raise_are_rows_until_they_are_too_many(
             raise ZeroDivisionError(f"of {seed}")
         return Outcome("solved", 1, 1)
 
-    monkeypatch.setitem(trials.TRIALS, "centroids", fragile)
+    monkeypatch.setitem(trials.TRIALS, "centroids", trials.one_by_one(fragile))
     monkeypatch.setattr(runner, "CHUNK_S", 0.0)  # one trial a chunk
     path = tmp_path / "fragile.sqlite"
     told = other(told, paired="false")

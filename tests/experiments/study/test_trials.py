@@ -177,7 +177,7 @@ def test_the_brightest_are_kept_where_only_so_many_may_be():
 
 def test_other_noise_leaves_the_attitude():
     told = [setups.prepared_setup(SKY, {"trial.noise_seed": n}) for n in (0, 1)]
-    (first, seen), (again, other) = (trials.solved_centroids(ready, 12) for ready in told)
+    (first, seen), (again, other) = (trials.solved_centroids(ready, [12])[0] for ready in told)
     assert (first.lab_from_body * again.lab_from_body.inv()).magnitude() == 0
     assert (first.xy_px == again.xy_px).all()
     assert not np.array_equal(seen.centroids.xy_px, other.centroids.xy_px)
@@ -203,7 +203,7 @@ def test_lights_of_a_coded_trial_are_as_bright_as_rendered_ones(code):
     """Of frame 7, over the mean light of each LED: bits, edges of bits, pulses."""
     ready = setups.prepared_setup(CODED, {"light.led.code": code})
     testbed, lab_from_body = ready.testbed.in_run(5), Rotation.from_rotvec([0.1, 0.05, 1.0])
-    rows, xy_px, electrons = detections.visible_rows(testbed, lab_from_body)
+    ((rows, xy_px, electrons),) = detections.visible_rows(testbed, Rotation.concatenate([lab_from_body]))
     light_e = electrons * detections.brightness(testbed, rows, 7)
     _, truth = exposure.render_frame(testbed.at_rest(lab_from_body, 7), 7)
     size_px = np.array(testbed.canvas.shape[::-1])

@@ -158,7 +158,7 @@ def test_what_is_refused_changes_no_outcome(
     outcomes = []
     for chosen in (settings, settings | change):
         setup = build_setup(plan.spec, chosen)
-        outcomes.append(trials.TRIALS[setup.trial.kind](setup, 5))
+        outcomes += trials.TRIALS[setup.trial.kind](setup, [5])
     assert outcomes[0] == outcomes[1]
     assert outcomes[0].status == "solved"
     for key in change:

@@ -15,7 +15,7 @@ from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions,
 from skysim.experiments.papers.intervals import bootstrap_interval
 from skysim.experiments.papers.published import experiments
 from skysim.experiments.study.execution.setups import Setup
-from skysim.experiments.study.execution.trials import run_centroid_trial
+from skysim.experiments.study.execution.trials import run_centroid_trials
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.results.metrics import Summary, rms
 from skysim.results.plots import INK, MARKS
@@ -60,7 +60,7 @@ def build_setup(lights: int) -> Setup:
 
 def solve_random_attitudes(setup: Setup, seeds: Sequence[int]) -> AttitudeErrors:
     """Errors of lost-in-space solutions from simulated centroids at random attitudes."""
-    solutions = [run_centroid_trial(setup, seed) for seed in seeds]
+    solutions = run_centroid_trials(setup, seeds)
     errors = np.array([[one.x_arcsec, one.y_arcsec, one.roll_arcsec] for one in solutions])
     return AttitudeErrors(errors[np.isfinite(errors[:, 0])])
 

@@ -7,6 +7,9 @@ its code and of its drive's pulses in the exposure, with photon noise and FLUX_N
 
 from __future__ import annotations
 
+import itertools
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -14,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Centroids
 from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.pipeline import Report
-from skysim.camera.render import Poses, in_view, project, rates_e_s
+from skysim.camera.render import Poses, in_view, project_each, rates_e_s
 from skysim.core.types import Floats
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
@@ -26,36 +29,50 @@ LEAST_SIGMA_PX = 1e-3
 FLUX_NOISE = 0.02  # relative, of a light in a frame; above that of rendered ones (benchmarks/codes.py)
 
 
-def visible_sources(testbed: Testbed, lab_from_body: Rotation) -> tuple[Floats, Floats]:
-    """(N, 2) pixel positions and (N,) photoelectrons of the visible sources whose center is on the detector.
+class View(NamedTuple):
+    """The visible sources whose center is on the detector at one attitude, without occluded ones.
 
-    Occluded sources are left out.
+    rows : (N,) in `testbed.sources`;  xy_px : (N, 2);  electrons : (N,) photo-electrons of an exposure
     """
-    return visible_rows(testbed, lab_from_body)[1:]
+
+    rows: NDArray[np.int64]
+    xy_px: Floats
+    electrons: Floats
 
 
-def visible_rows(
-    testbed: Testbed, lab_from_body: Rotation, t_s: float = 0.0
-) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """As `visible_sources` at a time, after the sources' (N,) rows in `testbed.sources`."""
+def visible_sources(testbed: Testbed, lab_from_body: Rotation) -> tuple[Floats, Floats]:
+    """(N, 2) pixel positions and (N,) photo-electrons of the visible sources at one attitude."""
+    (view,) = visible_rows(testbed, Rotation.concatenate([lab_from_body]))
+    return view.xy_px, view.electrons
+
+
+def visible_rows(testbed: Testbed, lab_from_body: Rotation, t_s: float = 0.0) -> list[View]:
+    """The view at each of B attitudes, all at one time. The sources near all fields are projected at once."""
+    R_cam_from_body, camera_body_m = testbed.mount.cam_from_body.as_matrix(), testbed.mount.camera_body_m
     R_lab_from_body = lab_from_body.as_matrix()
-    R_cam_from_lab = testbed.mount.cam_from_body.as_matrix() @ R_lab_from_body.T
-    poses = Poses(R_cam_from_lab[None], (R_lab_from_body @ testbed.mount.camera_body_m)[None])
-    rows = in_view(testbed.sources, testbed.optics, poses, reach=0.0)
-    near, sky = testbed.sources.take(rows), sky_during(testbed, t_s)
+    poses = Poses(
+        np.array([R_cam_from_body @ each.T for each in R_lab_from_body]),
+        np.array([each @ camera_body_m for each in R_lab_from_body]),
+    )
+    each_pose = (Poses(*(part[n : n + 1] for part in poses)) for n in range(len(R_lab_from_body)))
+    rows = [in_view(testbed.sources, testbed.optics, pose, reach=0.0) for pose in each_pose]
+    ends = np.cumsum([0, *map(len, rows)])
+    near, sky = testbed.sources.take(np.concatenate(rows)), sky_during(testbed, t_s)
     if sky:
         near = sky.stars_seen(near)
-    xy_px, distance_m, cos_out, cos_in = (one[0] for one in project(near, testbed.optics, poses))
+    xy_px, distance_m, cos_out, cos_in = project_each(near, testbed.optics, poses, ends)
+    rate_e_s = rates_e_s(near, testbed.optics, testbed.emitter, distance_m, cos_out, cos_in)
+    electrons = rate_e_s * np.minimum(near.on_s / near.period_s, 1.0) * testbed.scene.exposure.time_s
     x, y = xy_px.T
     width_px, height_px = testbed.canvas.shape[::-1]
-    visible = np.flatnonzero((x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5))
-    occludes = occlusion_test(testbed, lab_from_body, sky)
-    if occludes:
-        visible = visible[~occludes(near.place[visible])]
-    duty_cycle = np.minimum(near.on_s / near.period_s, 1.0)
-    rate_e_s = rates_e_s(near, testbed.optics, testbed.emitter, distance_m, cos_out, cos_in)
-    electrons = rate_e_s * duty_cycle * testbed.scene.exposure.time_s
-    return rows[visible], xy_px[visible], electrons[visible]
+    visible = (x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5)
+    views = []
+    for n, (begin, end) in enumerate(itertools.pairwise(ends.tolist())):
+        chosen = begin + np.flatnonzero(visible[begin:end])
+        if occludes := occlusion_test(testbed, lab_from_body[n], sky):
+            chosen = chosen[~occludes(near.place[chosen])]
+        views.append(View(rows[n][chosen - begin], xy_px[chosen], electrons[chosen]))
+    return views
 
 
 def simulate_detections(
@@ -89,7 +106,7 @@ def solve_coded(
 ) -> tuple[Floats, Report]:
     """(N, 2) true pixel positions, and the report of the first frame with an attitude, or of the code's last one."""
     testbed = testbed.in_run(int(rng.integers(2**62)))
-    rows, xy_px, electrons = visible_rows(testbed, lab_from_body)
+    ((rows, xy_px, electrons),) = visible_rows(testbed, Rotation.concatenate([lab_from_body]))
     electrons = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(rows)))
     per_frame = trial.model_copy(update={"magnitude_sigma": 0.0})  # the error of a brightness is that of the LED
     tracker.last_s = None  # begins anew

@@ -88,7 +88,7 @@ def replayed_frames(setup: Setup, seed: int) -> Iterator[tuple[Frame, Truth, Rep
             kind="frames", **{name: getattr(trial, name) for name in ("tilt_deg", "dec_deg", "near")}
         )
         frame, truth, _ = trials.render_trial_frame(setup._replace(trial=frame_trial), seed)
-        yield frame, truth, solve_or_failed(lambda: trials.solved_centroids(setup, seed)[1])
+        yield frame, truth, solve_or_failed(lambda: trials.solved_centroids(setup, [seed])[0][1])
     elif isinstance(trial, FlightTrial):
         testbed = run.simulate_motion(trials.flight_testbed(setup, seed))
         for result in run.run(testbed, setup.estimator):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate
 from estimator.trackers.coded_tracker import CodedTracker
+from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import Health, TrackedReport, TrackingMode
@@ -31,7 +32,6 @@ from skysim.experiments.study.execution.detections import (
     simulate_detections,
     solve_coded,
     visible_rows,
-    visible_sources,
 )
 from skysim.experiments.study.execution.outcomes import (
     FAILED,
@@ -62,6 +62,7 @@ from skysim.tracking import factory
 GYRO_RAD_S = 1e-5  # standard deviation that a frame trial's gyro claims, 2 arcseconds a second
 KNOTS = 9  # samples of a frame trial's trajectory in each exposure
 STREAK_POSES = 9  # poses along the streak of a frame that is not rendered
+BLOCK = 64  # centroid trials that run together
 
 
 class Row(NamedTuple):
@@ -109,50 +110,91 @@ class TrialJob:
 
 def run_segments(spec: TrialSpec, segments: tuple[Segment, ...]) -> list[Row]:
     """Run all trials of some segments, in order."""
-    return [
-        run_trial(spec, segment, segment.first + n, replicate, key)
-        for segment in segments
-        for key in [setup_key(spec, segment.settings)]
-        for n, replicate in enumerate(segment.replicates)
-    ]
+    return [row for segment in segments for row in run_segment(spec, segment)]
 
 
-def run_trial(spec: TrialSpec, segment: Segment, trial: int, replicate: int, key: str = "") -> Row:
-    """Run one trial; an exception is stored in its row as a traceback.
+def run_segment(spec: TrialSpec, segment: Segment) -> list[Row]:
+    """Run the trials of a segment, in order, as many at a time as their kind allows."""
+    key = setup_key(spec, segment.settings)
+    size = block_size(spec, segment, key)
+    return [row for block in divided(segment, size) for row in run_block(spec, block, key)]
 
+
+def block_size(spec: TrialSpec, segment: Segment, key: str) -> int:
+    """How many trials of a segment run together. Detections must reach an external tracker once, in order."""
+    try:
+        setup = prepared_setup(spec, segment.settings, key)
+    except Exception:  # in the rows
+        return 1
+    own = isinstance(setup.estimator, StarTracker | DomeTracker)
+    return BLOCK if own and setup.trial.kind == "centroids" else 1
+
+
+def divided(segment: Segment, size: int) -> Iterator[Segment]:
+    """The segment in parts of so many trials."""
+    for n in range(0, len(segment.replicates), size):
+        yield segment._replace(first=segment.first + n, replicates=segment.replicates[n : n + size])
+
+
+def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
+    """Run the trials of a segment together.
+
+    If one of them raises an exception, each runs by itself, and the row of that one stores the traceback.
     key : `setup_key` of the segment, if it is known
     """
-    seed = seed_of(spec, segment.point, replicate)
-    scene, outcome, error, start_s = "", FAILED, None, time.perf_counter()
+    numbers = list(enumerate(segment.replicates, segment.first))
+    seeds = [seed_of(spec, segment.point, replicate) for _, replicate in numbers]
+    scene, outcomes, error, start_s = "", [FAILED] * len(seeds), None, time.perf_counter()
     try:
         setup = prepared_setup(spec, segment.settings, key)
         scene, start_s = setup.scene_hash, time.perf_counter()
-        outcome = TRIALS[setup.trial.kind](setup, seed)
+        outcomes = TRIALS[setup.trial.kind](setup, seeds)
     except Exception:
+        if len(seeds) > 1:
+            return [row for one in divided(segment, 1) for row in run_block(spec, one, key)]
         error = traceback.format_exc().replace(f"{ROOT}/", "")  # independent of the installation path
-    seconds = time.perf_counter() - start_s
-    return Row(trial, segment.point, replicate, seed, scene, code_version(), outcome, error, seconds)
+    seconds = (time.perf_counter() - start_s) / len(seeds)
+    return [
+        Row(trial, segment.point, replicate, seed, scene, code_version(), outcome, error, seconds)
+        for (trial, replicate), seed, outcome in zip(numbers, seeds, outcomes, strict=True)
+    ]
 
 
-def run_centroid_trial(setup: Setup, seed: int) -> Outcome:
-    """Centroid trial: random attitude, noisy true detections and false ones; identified and solved."""
-    lights, report = solved_centroids(setup, seed)
-    return score(setup.testbed, setup.estimator, report, lights)
+def run_trial(spec: TrialSpec, segment: Segment, trial: int, replicate: int) -> Row:
+    """Run one trial of a segment's point; an exception is stored in its row as a traceback."""
+    return run_block(spec, segment._replace(first=trial, replicates=range(replicate, replicate + 1)))[0]
 
 
-def solved_centroids(setup: Setup, seed: int) -> tuple[TrueLights, Report]:
-    """The lights of a centroid trial, and the report on its detections; of coded light on those of the last frame."""
-    trial, (attitude_rng, noise) = setup.trial, streams(setup, seed)
+def run_centroid_trials(setup: Setup, seeds: Sequence[int]) -> list[Outcome]:
+    """Centroid trials: random attitude, noisy true detections and false ones; identified and solved.
+
+    Every step is made for all of the trials before the next one, so that its code is in the processor's cache.
+    """
+    solved = solved_centroids(setup, seeds)
+    return [score(setup.testbed, setup.estimator, report, lights) for lights, report in solved]
+
+
+def solved_centroids(setup: Setup, seeds: Sequence[int]) -> list[tuple[TrueLights, Report]]:
+    """The lights of centroid trials, and the report on the detections; of coded light on those of the last frame."""
+    testbed, trial, estimator = setup.testbed, setup.trial, setup.estimator
     assert isinstance(trial, CentroidTrial)
-    lab_from_body = random_attitude(setup, attitude_rng)
-    if isinstance(setup.estimator, CodedTracker):
-        xy_px, report = solve_coded(setup.testbed, setup.estimator, trial, lab_from_body, noise)
+    drawn = [streams(setup, seed) for seed in seeds]
+    lab_from_body = random_attitudes(setup, [attitude_rng for attitude_rng, _ in drawn])
+    noise = [noise_rng for _, noise_rng in drawn]
+    if isinstance(estimator, CodedTracker):
+        coded = [solve_coded(testbed, estimator, trial, *each) for each in zip(lab_from_body, noise, strict=True)]
+        seen_px, reports = [xy_px for xy_px, _ in coded], [report for _, report in coded]
     else:
-        xy_px, electrons = visible_sources(setup.testbed, lab_from_body)
-        detections = simulate_detections(trial, xy_px, electrons, setup.testbed.scene, noise)
-        exposure_s = setup.testbed.scene.exposure.time_s
-        report = Report(factory.solve_centroids(setup.estimator, detections, exposure_s), detections)
-    return TrueLights(lab_from_body, xy_px, xy_px, None), report
+        views = visible_rows(testbed, lab_from_body)
+        seen_px, scene = [view.xy_px for view in views], testbed.scene
+        detections = [
+            simulate_detections(trial, view.xy_px, view.electrons, scene, rng)
+            for view, rng in zip(views, noise, strict=True)
+        ]
+        exposure_s = scene.exposure.time_s
+        reports = [Report(factory.solve_centroids(estimator, each, exposure_s), each) for each in detections]
+    lights = [TrueLights(*each, each[1], None) for each in zip(lab_from_body, seen_px, strict=True)]
+    return list(zip(lights, reports, strict=True))
 
 
 def streams(setup: Setup, seed: int) -> tuple[np.random.Generator, np.random.Generator]:
@@ -211,17 +253,22 @@ def flown_lights(testbed: Testbed, index: int) -> tuple[TrueLights, float]:
     window, rows = exposure_window(testbed.scene, index, testbed.exposures_s[index]), testbed.scene.camera.height_px
     middle_s, exposed_s = window.middle_s(rows), window.exposure_s * np.linspace(0, 1, STREAK_POSES)
     lab_from_body = testbed.trajectory.attitude_at(middle_s)
-    visible, xy_px, _ = visible_rows(testbed, lab_from_body, middle_s)
+    (view,) = visible_rows(testbed, Rotation.concatenate([lab_from_body]), middle_s)
     poses = render.poses(testbed.trajectory, testbed.mount, window.open_s + exposed_s)
-    path_px = render.project(testbed.sources.take(visible), testbed.optics, poses)[0]
+    path_px = render.project(testbed.sources.take(view.rows), testbed.optics, poses)[0]
     streak_px = np.linalg.norm(np.diff(path_px, axis=0), axis=2).sum(axis=0)
-    return TrueLights(lab_from_body, xy_px, xy_px, streak_px), middle_s
+    return TrueLights(lab_from_body, view.xy_px, view.xy_px, streak_px), middle_s
 
 
-TRIALS: dict[str, Callable[[Setup, int], Outcome]] = {
-    "centroids": run_centroid_trial,
-    "frames": run_frame_trial,
-    "flight": run_flight_trial,
+def one_by_one(run: Callable[[Setup, int], Outcome]) -> Callable[[Setup, Sequence[int]], list[Outcome]]:
+    """Trials of which each is run by itself."""
+    return lambda setup, seeds: [run(setup, seed) for seed in seeds]
+
+
+TRIALS: dict[str, Callable[[Setup, Sequence[int]], list[Outcome]]] = {
+    "centroids": run_centroid_trials,
+    "frames": one_by_one(run_frame_trial),
+    "flight": one_by_one(run_flight_trial),
 }
 
 
@@ -229,7 +276,12 @@ TRIALS: dict[str, Callable[[Setup, int], Outcome]] = {
 
 
 def random_attitude(setup: Setup, rng: np.random.Generator) -> Rotation:
-    """Random lab_from_body.
+    """Random lab_from_body, see `random_attitudes`."""
+    return random_attitudes(setup, [rng])[0]
+
+
+def random_attitudes(setup: Setup, rngs: Sequence[np.random.Generator]) -> Rotation:
+    """Random lab_from_body, N of them, each drawn by a generator of its own.
 
     Under a dome: tilt uniform in solid angle within `tilt_deg`, tilt direction and yaw uniform. Otherwise: boresight
     uniform over the sphere within `dec_deg` or between two angles from a body, roll uniform.
@@ -237,23 +289,28 @@ def random_attitude(setup: Setup, rng: np.random.Generator) -> Rotation:
     trial, testbed = setup.trial, setup.testbed
     attitudes = trial.start if isinstance(trial, FlightTrial) else trial
     assert attitudes is not None
-    first, last = rng.uniform(0, 2 * math.pi, 2)
+    turns = [rng.uniform(0, 2 * math.pi, 2).tolist() for rng in rngs]
     # A uniform cosine of the tilt, or sine of the declination, is uniform in solid angle.
     if isinstance(testbed.scene.light, DomeConfig):
         tilt_deg = attitudes.tilt_deg
         low, high = tilt_deg if isinstance(tilt_deg, tuple) else (tilt_deg,) * 2
-        cosine = rng.uniform(math.cos(math.radians(high)), math.cos(math.radians(low)))
-        return quaternion.to_rotation(zyz(first, math.acos(min(cosine, 1.0)), last - first))
+        least, most = math.cos(math.radians(high)), math.cos(math.radians(low))
+        tilts = [math.acos(min(rng.uniform(least, most), 1.0)) for rng in rngs]
+        drawn = [zyz(first, tilt, last - first) for (first, last), tilt in zip(turns, tilts, strict=True)]
+        return Rotation.from_quat(np.array(drawn)[:, [1, 2, 3, 0]])
     near = attitudes.near
     low, high = (math.radians(dec) for dec in attitudes.dec_deg)
     if near:  # a body is the pole
         high, low = (math.pi / 2 - math.radians(off) for off in near.off_deg)
-    zenith = math.acos(min(max(rng.uniform(math.sin(low), math.sin(high)), -1.0), 1.0))
-    lab_from_cam = zyz(first, zenith, last)
+    least, most = math.sin(low), math.sin(high)
+    zeniths = [math.acos(min(max(rng.uniform(least, most), -1.0), 1.0)) for rng in rngs]
+    lab_from_cam = [zyz(first, zenith, last) for (first, last), zenith in zip(turns, zeniths, strict=True)]
     if near:
-        lab_from_cam = quaternion.multiply(lab_from_body_pole(near.body, testbed.scene), lab_from_cam)
+        lab_from_pole = lab_from_body_pole(near.body, testbed.scene)
+        lab_from_cam = [quaternion.multiply(lab_from_pole, each) for each in lab_from_cam]
     cam_from_body = quaternion.from_rotation(testbed.mount.cam_from_body)
-    return quaternion.to_rotation(quaternion.multiply(lab_from_cam, cam_from_body))
+    drawn = [quaternion.multiply(each, cam_from_body) for each in lab_from_cam]
+    return Rotation.from_quat(np.array(drawn)[:, [1, 2, 3, 0]])
 
 
 def lab_from_body_pole(name: str, scene: Scene) -> Floats:
