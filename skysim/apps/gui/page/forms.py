@@ -105,17 +105,18 @@ def section_fields(model: BaseModel, tree: Any, prefix: str, kinds: tuple[str, .
         key, value = f"{prefix}{file_key}", getattr(model, name)
         is_set = isinstance(tree, dict) and file_key in tree
         subtree = tree[file_key] if is_set else None
-        others = () if key in ONE_KIND else offered_kinds(info.annotation)
+        annotation: Any = info.annotation
+        others = () if key in ONE_KIND else offered_kinds(annotation)
         if isinstance(value, BaseModel) and (subtree is None or isinstance(subtree, dict)):
             yield from section_fields(value, subtree, f"{key}.", others)
-        elif value is None and len(others) == len(models(info.annotation)) + 1:
+        elif value is None and len(others) == len(models(annotation)) + 1:
             yield Field(f"{key}.kind", "null", "", others, is_set, NO_SECTION)
         elif file_key == "kind" and kinds:
             yield Field(key, value, "", tuple(dict.fromkeys((*kinds, value))), is_set)
         else:
             subtree = short_path(subtree)
             text = yaml_line(subtree) if is_set else yaml_line(file_value(value, si_unit(name)))
-            yield Field(key, text, display_unit(file_key), allowed_values(info.annotation), is_set)
+            yield Field(key, text, display_unit(file_key), allowed_values(annotation), is_set)
 
 
 def short_path(value: Any) -> Any:
