@@ -68,7 +68,6 @@ def screenshots() -> None:
         bellatrix = page.locator("tr", has_text="Bellatrix")
         box, (left, top, scale) = frame_placement(page)
         x, y = (float(bellatrix.locator("td").nth(column).inner_text()) for column in (3, 4))
-        page.get_by_role("tab", name="Lab").click()
         page.mouse.click(box["x"] + left + (x + 0.5) * scale, box["y"] + top + (y + 0.5) * scale)
         page.wait_for_timeout(3000)
         page.screenshot(path=IMAGES / "lab_page.jpg", quality=85)

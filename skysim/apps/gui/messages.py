@@ -161,7 +161,7 @@ class SceneInfo:
 
     names : of its three angles;  prefix : of its lights' numbers (HIP or LED)
     field_deg : horizontal field of view;  pixel_arcsec : angle of a pixel in the frame's middle
-    stages : the tracker's algorithm by stage;  choices : all algorithms by stage
+    stages : the tracker's algorithm by stage
     duration_s : of its motion;  noise : whether the camera has noise, else a frame is the expected value
     """
 
@@ -173,7 +173,6 @@ class SceneInfo:
     field_deg: float
     pixel_arcsec: float
     stages: dict[str, str]
-    choices: dict[str, tuple[str, ...]]
     duration_s: float
     noise: bool
     geometry: LabGeometry
@@ -238,18 +237,23 @@ class FrameRow(NamedTuple):
     innovation_arcsec: float
 
 
+Phase = Literal["motion", "frames", "done"]  # of computing a flight
+
+
 @dataclass(frozen=True, slots=True)
 class FlightStep:
     """Progress of a flight that is being computed: its motion in seconds, then its frames.
 
     rows : of the frames since the last step;  log : of the motion, in the first step after it has ended
+    residuals : of the lights identified in these frames: time, number, and residual in pixels
     """
 
-    phase: Literal["motion", "frames", "done"]
+    phase: Phase
     done: float
     total: float
     rows: tuple[FrameRow, ...] = ()
     log: MotionLog | None = None
+    residuals: tuple[tuple[float, int, float], ...] = ()
 
 
 class PlanCheck(NamedTuple):

@@ -113,7 +113,7 @@ def tab(browser: Any, server: Server) -> Iterator[Any]:
 @pytest.fixture
 def page(tab: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
     """The tab, with its first panel before it; a picture of how the test left it."""
-    tab.get_by_role("tab", name="Lab").click()
+    tab.get_by_role("tab", name="Run").click()
     tab.get_by_role("button", name="fit", exact=True).click()
     yield tab
     pictured(tab, request.node.name)
@@ -191,6 +191,14 @@ def chosen(page: Any, name: str, option: str) -> None:
     """Choose from a list."""
     page.get_by_role("combobox", name=name).click()
     page.get_by_role("option", name=option, exact=True).click()
+
+
+def choose_stage(page: Any, stage: str, algorithm: str) -> None:
+    """Choose an algorithm of the tracker in the panel that F6 or F7 opens."""
+    onto_the_page(page)
+    page.keyboard.press("F6" if stage in ("detector", "centroider") else "F7")
+    chosen(page, f"tracker.{stage}", algorithm)
+    page.get_by_text(re.compile("^stages")).filter(has_text=algorithm).wait_for()
 
 
 def set_to(page: Any, name: str, value: str) -> None:

@@ -3,18 +3,35 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from labpage import CHROMIUM, NARROW, Server, chosen, come, exported, opened, panel, pictured, screen, status
+from labpage import (
+    CHROMIUM,
+    NARROW,
+    Server,
+    chosen,
+    come,
+    exported,
+    onto_the_page,
+    opened,
+    panel,
+    pictured,
+    screen,
+    set_to,
+    status,
+)
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.messages import Detection, Lights
-from skysim.apps.gui.page.panels import lights
+from skysim.apps.gui.messages import Detection, Lights, MotionLog, TrackerResult
+from skysim.apps.gui.page.panels import lights, strips
+from skysim.apps.gui.worker import playback
 from skysim.apps.gui.worker.scene import geometry
 from skysim.scene import loader
 from skysim.simulation.testbed import build_testbed
@@ -61,6 +78,29 @@ def test_an_led_without_current_is_dark_and_the_views_look_where_they_say() -> N
     assert views["outside"].eye_m[2] < places_m[:, 2].max()
 
 
+def test_the_strip_of_residuals_has_a_dot_for_each_identified_light_and_frame() -> None:
+    spots = (Detection(1, 2, 0.1, 5, 7, 0.03125), Detection(3, 4, 0.1, 5), Detection(5, 6, 0.1, 5, 9, float("nan")))
+    solved = TrackerResult("solved", spots, 1.0, (0.0, 0.0, 0.0))
+    view = SimpleNamespace(t_s=0.25, result=solved)
+    assert list(playback.light_residuals(view)) == [(0.25, 7, 0.03125)]
+    assert list(playback.light_residuals(SimpleNamespace(t_s=0.5, result=None))) == []
+    residuals = [(0.25, 7, 0.03125), (0.5, 7, 0.0625), (0.5, 9, 0.131)]
+    (strip,) = strips.strips([], MotionLog(()), residuals)
+    assert strip.dots == [[0.25, 0.0312, 7], [0.5, 0.0625, 7], [0.5, 0.131, 9]]
+    assert strips.y_axis(strip, 0)["max"] == 0.2
+    fields = strips.dot_fields([strips.Strip("first"), strip], "LED {}".format)
+    assert fields["names"] == {7: "LED 7", 9: "LED 9"}
+    assert (fields["grid"], fields["place"]["top"]) == (1, strips.STRIP_PX + strips.HEAD_PX)
+    assert not any(curve.points for curve in strip.curves)  # a chart that is drawn again does not send them again
+
+
+def test_of_too_many_residuals_whole_frames_are_left_out() -> None:
+    residuals = [(t / 10, id, 0.1) for t in range(700) for id in range(60)]
+    dots = strips.thinned(residuals)
+    assert len(dots) <= strips.MAX_DOTS
+    assert [[dot[2] for dot in dots if dot[0] == t] for t in (0.0, 0.3)] == [list(range(60))] * 2
+
+
 # In the browser.
 
 
@@ -89,7 +129,6 @@ def identified(page: Any, folder: Path) -> dict[int, tuple[float, float]]:
 @pytest.mark.browser
 @in_browser
 def test_the_laboratory_shows_which_lights_are_lit_seen_and_identified(dome: Any, tmp_path: Path) -> None:
-    panel(dome, "Lab")
     count = len(identified(dome, tmp_path))
     assert come(lambda: f"identified {count}," in drawn(dome, "lights"))
     for name in ("camera", "bearing", "top", "outside"):
@@ -114,7 +153,6 @@ def test_a_light_that_is_hovered_in_one_view_lights_up_in_the_others(dome: Any, 
     spots = identified(dome, tmp_path)
     one, (x, y) = next(iter(spots.items()))
     frame = dome.locator(".lab-frame canvas")
-    panel(dome, "Lab")
     dome.mouse.move(*screen(dome, x, y))
     assert come(lambda: drawn(dome, "ringed") == str(one))
     dome.mouse.move(*screen(dome, 2, 2))
@@ -142,3 +180,40 @@ def test_a_light_that_is_hovered_in_one_view_lights_up_in_the_others(dome: Any, 
     other = dome.locator(f".lab-lights tr[data-id='{nearest}'].ringed")
     other.wait_for()
     pictured(dome, "the_table_of_lights")
+
+
+DOT = """() => { const canvas = document.querySelector(".lab-dots"), dots = getElement(+canvas.id.slice(1));
+  const at = dots.scale(), box = canvas.getBoundingClientRect(), dot = dots.shown.dots.at(-3), [x, y] = at(dot);
+  return [dot[2], box.left + x, box.top + y]; }"""  # number and place of a dot on the screen
+
+
+@pytest.mark.browser
+@in_browser
+def test_a_dot_of_a_strip_lights_up_its_light_and_a_light_its_dots(browser: Any, server: Server) -> None:
+    with opened(browser, server.login, NARROW) as page:
+        panel(page, "Scene")
+        page.get_by_placeholder("find a key").fill("exposure.frames")
+        set_to(page, "exposure.frames", "5")
+        onto_the_page(page)
+        panel(page, "Run")
+        page.get_by_role("button", name="Simulate").click()
+        page.get_by_text(re.compile(r"5/5$")).wait_for()
+        for _ in range(10):  # room for all strips
+            page.get_by_role("separator", name="Height of the 3-D view").press("ArrowUp")
+        canvas, frame = page.locator(".lab-dots"), page.locator(".lab-frame canvas")
+        assert come(lambda: int(canvas.get_attribute("data-dots") or 0) > 60)
+        canvas.evaluate("one => one.closest('.q-tab-panel').scrollTo(0, 250)")
+        page.wait_for_timeout(500)
+        _, x, y = page.evaluate(DOT)
+        page.mouse.move(x - 30, y - 60)
+        page.mouse.move(x, y, steps=3)
+        assert come(lambda: canvas.get_attribute("data-ringed") != "")
+        one = str(canvas.get_attribute("data-ringed"))  # of dots on one another the nearest
+        assert come(lambda: drawn(page, "ringed") == one)
+        assert come(lambda: frame.get_attribute("data-ringed") == one)
+        pictured(page, "a_dot_of_a_strip")
+        page.mouse.move(*screen(page, 2, 2))
+        assert come(lambda: canvas.get_attribute("data-ringed") == "")
+        page.mouse.move(*screen(page, *next(iter(identified(page, server.folder).values()))))
+        assert come(lambda: canvas.get_attribute("data-ringed") not in ("", None))
+        assert canvas.get_attribute("data-ringed") == frame.get_attribute("data-ringed")

@@ -27,6 +27,7 @@ from labpage import (
     angles,
     brightness,
     changed,
+    choose_stage,
     chosen,
     come,
     differs,
@@ -302,7 +303,7 @@ def test_names_are_beside_their_stars_within_the_frame_and_cover_no_other(page: 
 def test_tab_reaches_every_control_and_shows_where_it_is(page: Any) -> None:
     onto_the_page(page)
     unseen, reached = picture(page), []
-    for _ in range(24):
+    for _ in range(27):
         page.keyboard.press("Tab")
         name, *box = page.evaluate(FOCUSED)
         assert come(partial(differs, page, unseen, box)), name
@@ -315,9 +316,10 @@ def test_tab_reaches_every_control_and_shows_where_it_is(page: Any) -> None:
         "Stretch",
         "Limits",
         "Colors",
+        "Width of the panels",
         "angle 1",
-        "detector F6",
-        "solver",
+        "Height of the 3-D view",
+        "Simulate",
     ]
     assert [name for name in reached if name in wanted] == wanted
     onto_the_page(page)
@@ -344,19 +346,63 @@ def test_typing_and_help_hold_the_camera_still(page: Any) -> None:
     changed(page, frame)
 
 
+def focused(page: Any, name: str) -> None:
+    """Wait until a list has the keyboard."""
+    page.wait_for_function("name => document.activeElement.closest('[aria-label]')?.ariaLabel === name", arg=name)
+
+
 def test_another_identifier_by_f7_and_the_keys_are_the_camera_s_again(page: Any) -> None:
     page.keyboard.press("F7")
+    focused(page, "tracker.identifier")
+    page.keyboard.press("Enter")
     page.get_by_role("option", name="pyramid").wait_for()
     page.keyboard.press("ArrowDown")
     page.keyboard.press("Enter")
     page.get_by_role("listbox").wait_for(state="detached")
-    assert page.get_by_role("combobox", name="identifier F7").input_value() == "pyramid"
+    page.get_by_text("stages (F6, F7): default · default · pyramid · default").wait_for()
     status(page, "solved")
     frame = source(page)
     page.keyboard.press("1")
     changed(page, frame)
     panel(page, "Log")
     page.get_by_text("opened shefex2 with tracker.identifier").wait_for()
+
+
+def test_f6_configures_image_processing_without_keys_that_have_no_effect(page: Any) -> None:
+    """Each change is an override of the scene, which is undone."""
+    page.keyboard.press("F6")
+    focused(page, "tracker.detector")
+    onto_the_page(page)
+    identified = status(page, "solved")
+    set_to(page, "tracker.threshold_sigma", "40")
+    assert come(lambda: status(page, "solved") != identified)
+    assert come(lambda: "tracker.threshold_sigma%3D40" in page.url)
+    choose_stage(page, "detector", "thesis")
+    page.get_by_label("tracker.threshold_sigma", exact=True).wait_for(state="detached")
+    assert page.get_by_label("tracker.min_area_px", exact=True).count() == 0
+    assert come(lambda: "tracker.detector%3Dthesis" in page.url and "threshold" not in page.url)
+    pictured(page, "f6")
+    for undone in ("tracker.detector", "tracker.threshold_sigma"):
+        onto_the_page(page)
+        page.wait_for_timeout(1500)
+        page.keyboard.press("Control+z")
+        assert come(lambda: undone not in page.url), page.url  # noqa: B023
+    field = page.get_by_label("tracker.threshold_sigma", exact=True)
+    assert come(lambda: field.input_value() == "5")
+
+
+def test_the_sensor_model_s_noise_is_set_in_arcseconds(page: Any) -> None:
+    page.keyboard.press("F6")
+    page.get_by_label("noise, ″ an axis").fill("3")
+    page.get_by_label("noise, ″ an axis").press("Enter")
+    page.get_by_label("noise, magnitudes").fill("0.4")
+    panel(page, "Monte Carlo")
+    page.get_by_text("noise of a centroid: 3″ an axis").wait_for()
+    assert page.get_by_label("noise, mag", exact=True).input_value() == "0.4"
+    assert float(page.get_by_label("noise, px").input_value()) == pytest.approx(3 / 81.7, rel=2e-3)
+    page.get_by_label("noise, px").fill("0.1")
+    page.get_by_label("noise, mag", exact=True).fill("0.25")
+    onto_the_page(page)
 
 
 def test_f8_sets_the_field_and_an_arrow_goes_a_fiftieth_of_it(page: Any) -> None:
@@ -394,7 +440,7 @@ def test_a_dropped_picture_is_solved_shown_or_refused(page: Any, tmp_path: Path)
     page.set_input_files("input[type=file]", ROOT / "docs" / "images" / "sky.jpg")
     page.get_by_text("sky.jpg: solved").wait_for()
     changed(page, frame)
-    identifier = page.get_by_role("combobox", name="identifier F7").input_value()
+    identifier = page.get_by_text(re.compile("^stages")).inner_text().split(" · ")[2]
     stage = "" if identifier == "default" else f"; identifier {identifier}"
     assert page.get_by_text(f"sky.jpg: solved{stage}\n").count() == 1
     assert page.get_by_label("angle 1").input_value() == ""  # nobody knows where it was taken
@@ -430,19 +476,19 @@ def identified(page: Any) -> None:
 
 
 def test_a_picture_is_solved_by_the_chosen_detector_and_identifier(page: Any) -> None:
-    onto_the_page(page)
-    chosen(page, "identifier F7", "default")
+    choose_stage(page, "identifier", "default")
     panel(page, "Image")
     sky = ROOT / "docs" / "images" / "sky.jpg"
     page.set_input_files("input[type=file]", sky)
     page.get_by_text(re.compile(r"sky\.jpg: solved\n")).wait_for(timeout=SLOW_MS)
     field = float(re.search(r"field ([\d.]+)°", page.locator(".lab-panels .mono").last.inner_text())[1])
-    chosen(page, "identifier F7", "pyramid")
+    choose_stage(page, "identifier", "pyramid")
+    panel(page, "Image")
     page.get_by_label("field of view, deg").fill(str(field))
     page.set_input_files("input[type=file]", sky)
     page.get_by_text("sky.jpg: solved; identifier pyramid").wait_for(timeout=SLOW_MS)
     page.get_by_label("field of view, deg").fill("")
-    chosen(page, "identifier F7", "default")
+    choose_stage(page, "identifier", "default")
     identified(page)
 
 
@@ -519,6 +565,23 @@ def test_bad_input_is_refused_where_it_stands(page: Any) -> None:
     page.get_by_placeholder("new-name").fill("../out")
     page.get_by_role("button", name="Save as").click()
     page.get_by_text("allowed: letters, digits").first.wait_for()
+
+
+def test_another_shutter_is_chosen_in_the_form(page: Any) -> None:
+    panel(page, "Scene")
+    page.get_by_placeholder("find a key").fill("shutter")
+    frame = source(page)
+    chosen(page, "camera.shutter.kind", "rolling")
+    changed(page, frame)
+    assert come(lambda: page.get_by_label("camera.shutter.leak", exact=True).count() == 0)
+    assert page.get_by_label("camera.shutter.row_time", exact=True).input_value() == "2.25e-05 s"
+    pictured(page, "shutter")
+    frame = source(page)
+    chosen(page, "camera.shutter.kind", "interline")
+    changed(page, frame)
+    page.get_by_label("camera.shutter.leak", exact=True).wait_for()
+    page.get_by_placeholder("find a key").fill("")
+    onto_the_page(page)
 
 
 def test_a_scene_is_saved_opened_again_and_not_overwritten(page: Any, server: Server) -> None:

@@ -145,6 +145,63 @@ def test_fields_know_their_unit_and_their_choices() -> None:
     assert not values["camera.detector.bits"].is_set
 
 
+def test_another_kind_of_a_section_brings_its_keys_and_keeps_those_of_both() -> None:
+    """The file's own kind comes back as the file has it; edits of the section go with its kind."""
+    at_first = {one.key: one for one in forms.fields("shefex2", {})}
+    assert at_first["camera.shutter.kind"].allowed_values == ("global", "rolling", "frame_transfer", "interline")
+    assert at_first["light.kind"].allowed_values == ("stars",)  # another one needs another start of the motion
+    edited = {"tracker.limit_mag": "5.5", "camera.shutter.row_time": "20 us"}
+    rolling = forms.with_value("shefex2", edited, "camera.shutter.kind", "rolling")
+    assert rolling == {"tracker.limit_mag": "5.5", "camera.shutter": "{kind: rolling, row_time: 2e-05 s}"}
+    shutter = {one.key: one for one in forms.fields("shefex2", rolling) if one.key.startswith("camera.shutter")}
+    assert set(shutter) == {"camera.shutter.kind", "camera.shutter.row_time"}
+    assert shutter["camera.shutter.kind"].text == "rolling"
+    assert shutter["camera.shutter.row_time"].text == "2e-05 s"
+    back = forms.with_value("shefex2", rolling, "camera.shutter.kind", at_first["camera.shutter.kind"].text)
+    assert back == {"tracker.limit_mag": "5.5"}
+
+
+def test_a_section_that_is_left_out_can_be_had_and_left_out_again() -> None:
+    assert {one.key: one for one in forms.fields("shefex2", {})}["camera.vignetting.kind"].shown == "none"
+    with_stops = forms.with_value("shefex2", {}, "camera.vignetting.kind", "two_stops")
+    assert loader.load("shefex2", with_stops).camera.vignetting.kind == "two_stops"
+    assert forms.with_value("shefex2", with_stops, "camera.vignetting.kind", "none") == {}
+
+
+@pytest.mark.parametrize("name", ["afit_simsat", "shefex2", "simsat_slew"])
+def test_every_offered_kind_makes_a_scene(name: str) -> None:
+    fields = [field for field in forms.fields(name, {}) if field.key.endswith(".kind")]
+    offered = [(field.key, kind) for field in fields for kind in field.allowed_values]
+    assert len(offered) > 10
+    for key, kind in offered:
+        scene = loader.load(name, forms.with_value(name, {}, key, kind))
+        value = forms.section_at(scene, key.removesuffix(".kind"))[1]
+        assert getattr(value, "kind", "none") == kind
+
+
+def test_an_edit_that_makes_another_one_useless_takes_it_back() -> None:
+    """The detector thesis has thresholds of its own."""
+    before = {"tracker.threshold_sigma": "6", "camera.f_number": "2"}
+    assert forms.with_value("shefex2", before, "tracker.detector", "thesis") == {
+        "camera.f_number": "2",
+        "tracker.detector": "thesis",
+    }
+    with pytest.raises(InputError, match=r"tracker\.threshold_sigma"):
+        forms.with_value("shefex2", {}, "tracker.threshold_sigma", "-1")
+
+
+def test_keys_without_effect_are_told() -> None:
+    stars, dome = ({one.key: one for one in forms.fields(name, {})} for name in ("shefex2", "afit_simsat"))
+    assert "LEDs" in dome["tracker.limit_mag"].no_effect
+    assert not stars["tracker.limit_mag"].no_effect
+    assert stars["tracker.brightness_sigma"].no_effect
+    thesis = {one.key: one for one in forms.fields("shefex2", {"tracker.detector": "thesis"})}
+    assert thesis["tracker.threshold_sigma"].no_effect
+    assert not stars["tracker.threshold_sigma"].no_effect
+    assert "default" in stars["tracker.identifier"].allowed_values
+    assert (dome["tracker.solver"].shown, stars["tracker.identifier"].shown) == ("rotation_only", "default")
+
+
 @pytest.mark.slow
 def test_the_loop_is_closed_by_something_else_whether_the_scene_has_a_word_or_a_section() -> None:
     for name in ("afit_simsat", "simsat_bump", "simsat_slew"):

@@ -6,7 +6,7 @@ import re
 from typing import Any
 
 import pytest
-from labpage import CHROMIUM, come, onto_the_page, panel, set_to
+from labpage import CHROMIUM, choose_stage, come, onto_the_page, panel, set_to
 
 pytest_plugins = ["labpage"]
 RUNS = 400
@@ -31,11 +31,11 @@ def test_table_1_of_ptase(page: Any) -> None:
     page.get_by_label("runs, F8").fill(str(RUNS))
     set_to(page, "field, °", "20")
     onto_the_page(page)
-    page.keyboard.press("F7")  # step 3
-    page.get_by_role("option", name="fialho_2", exact=True).click()
-    panel(page, "Monte Carlo")  # step 4
-    for label, value in (("noise, px", "0.0272"), ("noise, mag", "0.25"), ("false", "0")):
-        page.get_by_label(label, exact=True).fill(value)
+    choose_stage(page, "identifier", "fialho_2")  # step 3
+    page.get_by_label("noise, ″ an axis").fill("3")  # step 4
+    page.get_by_label("noise, magnitudes").fill("0.25")
+    panel(page, "Monte Carlo")
+    page.get_by_label("false", exact=True).fill("0")
     page.get_by_text("noise of a centroid: 3″ an axis").wait_for()
     onto_the_page(page)
     page.keyboard.press("2")  # step 5

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labpage import CHROMIUM, angles, changed, chosen, come, panel, source, status
+from labpage import CHROMIUM, angles, changed, chosen, come, source, status
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
@@ -106,7 +106,6 @@ def test_a_drag_of_the_vehicle_moves_it_and_its_frames_and_reset_brings_it_back(
     chosen(page, "Scene", "afit_simsat")
     page.get_by_text("AFIT SimSat under its measured dome").wait_for()
     status(page, "solved")
-    panel(page, "Lab")
     page.get_by_role("button", name="outside").click()
     before, frame, moved = angles(page), source(page), page.locator(".lab-push")
     box = page.locator(".lab-space > canvas").first.bounding_box()

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labpage import CHROMIUM, NARROW, Server, changed, come, onto_the_page, opened, panel, pictured, source
+from labpage import CHROMIUM, NARROW, WIDE, Server, changed, come, onto_the_page, opened, panel, pictured, source
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
@@ -170,6 +170,83 @@ def test_the_theme_and_the_splitter_are_remembered(tab_of_own: Any) -> None:
 
 @pytest.mark.browser
 @in_browser
+@pytest.mark.parametrize("size", [NARROW, WIDE], ids=["1280", "1920"])
+def test_frame_laboratory_and_panel_are_seen_together_in_sizes_of_the_user_s(
+    tab_of_own: Any, size: dict[str, int]
+) -> None:
+    page = tab_of_own
+    page.set_viewport_size(size)
+    panel(page, "Run")
+    line = page.get_by_role("separator", name="Height of the 3-D view")
+
+    def tall() -> float:
+        return float(page.locator(".lab-space-pane").bounding_box()["height"])
+
+    def drag(down: float) -> None:
+        box = line.bounding_box()
+        x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"]
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x, y + down, steps=4)
+        page.mouse.up()
+
+    first, frame = tall(), source(page)
+    panels = page.locator(".lab-panels").bounding_box()
+    assert first > 180
+    assert panels["height"] > 240
+    assert panels["y"] + panels["height"] < size["height"]
+    drag(60)
+    assert come(lambda: abs(tall() - first - 60) < 8)
+    line.focus()
+    dragged = tall()
+    page.keyboard.press("ArrowUp")
+    assert come(lambda: abs(tall() - dragged + 24) < 1)
+    assert source(page) == frame  # the key was not the camera's
+    kept = tall()
+    page.reload()
+    page.locator(".lab-frame canvas[data-frame]").wait_for()
+    assert come(lambda: tall() == kept)
+    line.dblclick()
+    assert come(lambda: tall() == first)
+    pictured(page, f"together_{size['width']}")
+    page.set_viewport_size(NARROW)
+
+
+@pytest.mark.browser
+@in_browser
+def test_a_closed_laboratory_is_not_drawn_and_one_that_does_not_change_neither(tab_of_own: Any) -> None:
+    page = tab_of_own
+    line, canvas = page.get_by_role("separator", name="Height of the 3-D view"), page.locator(".lab-space canvas").first
+
+    def pictures() -> int:
+        return int(canvas.get_attribute("data-drawn") or 0)
+
+    def moved(key: str) -> int:
+        """How many pictures are drawn for a key."""
+        page.wait_for_timeout(1000)
+        before, frame = pictures(), source(page)
+        onto_the_page(page)
+        page.keyboard.press(key)
+        changed(page, frame)
+        page.wait_for_timeout(1500)
+        return pictures() - before
+
+    page.locator(".lab-space-pane").wait_for()
+    assert moved("ArrowRight") >= 1
+    line.focus()
+    for _ in range(12):
+        page.keyboard.press("ArrowUp")
+    assert come(lambda: page.locator(".lab-space-pane").bounding_box()["height"] == 0)
+    assert moved("ArrowRight") == 0
+    before = pictures()
+    line.focus()
+    page.keyboard.press("Enter")
+    assert come(lambda: pictures() > before)  # with the newest attitude
+    assert moved("ArrowLeft") >= 1
+
+
+@pytest.mark.browser
+@in_browser
 @pytest.mark.parametrize("width", [900, 420])
 def test_a_narrow_window_cuts_no_control(tab_of_own: Any, width: int) -> None:
     page = tab_of_own
@@ -180,13 +257,13 @@ def test_a_narrow_window_cuts_no_control(tab_of_own: Any, width: int) -> None:
       .filter(([_, box]) => box.left < 0 || box.right > innerWidth + 1).map(([name]) => name)"""
     panel(page, "Log")
     page.set_viewport_size({"width": width, "height": 800})
-    for name in ("Lab", "Run", "Monte Carlo"):
+    for name in ("Run", "Tracker", "Monte Carlo"):
         panel(page, name)
         page.wait_for_timeout(500)
         assert page.evaluate(cut) == []
-        if name == "Lab":  # hidden while the window changed
-            space = page.locator(".lab-space canvas").first
-            assert come(lambda: space.bounding_box()["width"] > 0.8 * width)  # noqa: B023
+        space = page.locator(".lab-space canvas").first
+        assert come(lambda: space.bounding_box()["width"] > 0.8 * width)  # noqa: B023
+        assert space.bounding_box()["height"] > 300
         assert page.locator(".lab-frame canvas").bounding_box()["width"] > 0.5 * width
         pictured(page, f"narrow_{width}_{name.replace(' ', '_')}")
     page.set_viewport_size(NARROW)

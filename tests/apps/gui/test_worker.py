@@ -104,7 +104,7 @@ def test_monte_carlo_is_stopped_goes_on_and_a_failed_trial_is_seen_again(second:
 
 def test_two_tabs_do_not_disturb_one_another(page: Any, second: Any) -> None:
     still = angles(page)
-    panel(second, "Lab")
+    panel(second, "Run")
     frame = source(second)
     second.keyboard.press("Shift+ArrowDown")
     changed(second, frame)

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from functools import cache
 from math import isfinite, radians, tan
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args, get_origin
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import read_yaml, set_key
 from skysim.core.paths import SCENES
 from skysim.core.quantities.units import SI_SUFFIX, si_unit
-from skysim.scene.loader import file_names, find, load, read
+from skysim.scene.keys import unused
+from skysim.scene.loader import file_names, find, load, read, with_overrides
 from skysim.scene.scene import NAME_ALIAS, Scene
 from skysim.scene.sections.motion import expand_control
+from skysim.tracking import settings as tracker_settings
 
 # Units of bare numbers by suffix of a key.
 DISPLAY_UNITS = {
@@ -27,6 +31,18 @@ DISPLAY_UNITS = {
 }
 UNIT_SUFFIX = re.compile(rf"_({'|'.join(sorted(DISPLAY_UNITS, key=len, reverse=True))})$")
 SECTIONS = ("vehicle", "motion", "site", "light", "background", "camera", "exposure", "filter", "tracker")
+NO_SECTION = "none"  # the kind of a section that is left out
+# Values of the keys that a kind of section requires, when it is chosen. A kind without them, as of a file, is not
+# offered; nor is another kind of light, which requires another start of the motion.
+FIRST_VALUES: dict[str, Any] = {
+    **{"row_time": "10 us", "fwhm_px": 2, "radius_px": 3, "cutoff_deg": 40, "transmission": [1, 0.8]},
+    **{"angle_deg": [0, 40], "intensity": [1, 0.5]},
+    **{"apex": "1.5 m", "radius": "1.5 m", "semi_axes": ["1.5 m", "1.5 m", "1.3 m"], "axis": "x"},
+    **{"count": 800, "frequency": 16, "spacing": "40 mm", "pitch": "20 mm", "cap_deg": 60},
+    **{"temperature_c": 20, "start_c": 20, "rate_c_h": 1, "mean_c": 20, "amplitude_c": 2, "period": "1 h"},
+    **{"altitude": "500 km", "inclination_deg": 51.6},
+}
+ONE_KIND = ("light",)
 
 
 class Field(NamedTuple):
@@ -34,7 +50,9 @@ class Field(NamedTuple):
 
     key   : dotted;  text: its value as YAML, from the file, or else the default
     unit  : of a bare number;  allowed_values: those of an enumeration
-    is_set: whether a file sets it
+    is_set: whether a file or an override sets it
+    meaning   : what `null` stands for, if that is one of the allowed values
+    no_effect : why the key does nothing in this scene; empty if it does something
     """
 
     key: str
@@ -42,19 +60,34 @@ class Field(NamedTuple):
     unit: str
     allowed_values: tuple[str, ...]
     is_set: bool
+    meaning: str = ""
+    no_effect: str = ""
 
     @property
     def section(self) -> str:
         first = self.key.partition(".")[0]
         return first if first in SECTIONS else "scene"
 
+    @property
+    def shown(self) -> str:
+        """The text in the field."""
+        return self.meaning if self.meaning and self.text == "null" else self.text
+
 
 def fields(name: str, overrides: Mapping[str, str]) -> list[Field]:
     """All keys that a scene has or could have, sections in the order of the README. Raises InputError."""
     scene = load(name, overrides)
-    tree = read(find(name))[0]
+    tree = with_overrides(read(find(name))[0], overrides)
+    stages, names = tracker_settings.assumed_settings(scene), tracker_settings.algorithm_names(scene)
+    meanings = {f"tracker.{stage}": getattr(stages, stage) for stage in names}
+    choices = {f"tracker.{stage}": algorithms for stage, algorithms in names.items()}
     form_fields = [
-        item._replace(text=overrides[item.key], is_set=True) if item.key in overrides else item
+        item._replace(
+            text=overrides.get(item.key, item.text),
+            allowed_values=choices.get(item.key, item.allowed_values),
+            meaning=meanings.get(item.key, item.meaning),
+            no_effect=unused.reason(item.key, scene),
+        )
         for item in section_fields(scene, tree, "")
         if item.key not in (NAME_ALIAS, "schema")
     ]
@@ -62,19 +95,28 @@ def fields(name: str, overrides: Mapping[str, str]) -> list[Field]:
     return sorted(form_fields, key=lambda item: order.index(item.section))
 
 
-def section_fields(model: BaseModel, tree: Any, prefix: str) -> Iterator[Field]:
-    """Yield the fields of a section. A list of sections is one field, as is one given by a word (`control: pid`)."""
+def section_fields(model: BaseModel, tree: Any, prefix: str, kinds: tuple[str, ...] = ()) -> Iterator[Field]:
+    """Yield the fields of a section. A list of sections is one field, as is one given by a word (`control: pid`).
+
+    kinds : that the section could have instead of its own
+    """
     for name, info in type(model).model_fields.items():
         file_key = info.alias or SI_SUFFIX.sub("", name)
         key, value = f"{prefix}{file_key}", getattr(model, name)
         is_set = isinstance(tree, dict) and file_key in tree
         subtree = tree[file_key] if is_set else None
+        annotation: Any = info.annotation
+        others = () if key in ONE_KIND else offered_kinds(annotation)
         if isinstance(value, BaseModel) and (subtree is None or isinstance(subtree, dict)):
-            yield from section_fields(value, subtree, f"{key}.")
+            yield from section_fields(value, subtree, f"{key}.", others)
+        elif value is None and len(others) == len(models(annotation)) + 1:
+            yield Field(f"{key}.kind", "null", "", others, is_set, NO_SECTION)
+        elif file_key == "kind" and kinds:
+            yield Field(key, value, "", tuple(dict.fromkeys((*kinds, value))), is_set)
         else:
             subtree = short_path(subtree)
             text = yaml_line(subtree) if is_set else yaml_line(file_value(value, si_unit(name)))
-            yield Field(key, text, display_unit(file_key), allowed_values(info.annotation), is_set)
+            yield Field(key, text, display_unit(file_key), allowed_values(annotation), is_set)
 
 
 def short_path(value: Any) -> Any:
@@ -96,6 +138,84 @@ def allowed_values(annotation: Any) -> tuple[str, ...]:
         return tuple(str(item) for item in get_args(annotation))
     parts = [item for item in get_args(annotation) if item is not type(None)]
     return allowed_values(parts[0]) if len(parts) == 1 and get_origin(annotation) is not tuple else ()
+
+
+def models(annotation: Any) -> dict[str, type[BaseModel]]:
+    """The models of a section that has several kinds, by kind."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        kind = annotation.model_fields.get("kind")
+        return dict.fromkeys(allowed_values(kind.annotation), annotation) if kind else {}
+    found: dict[str, type[BaseModel]] = {}
+    for part in get_args(annotation) if get_origin(annotation) in (Union, UnionType, Annotated) else ():
+        found |= models(part)
+    return found
+
+
+@cache
+def offered_kinds(annotation: Any) -> tuple[str, ...]:
+    """The kinds that a section may be given by a choice, with NO_SECTION if it may be left out; () if there is none."""
+    found = tuple(kind for kind, model in models(annotation).items() if first_section(model, kind) is not None)
+    return (NO_SECTION, *found) if found and NoneType in get_args(annotation) else found
+
+
+def first_section(model: type[BaseModel], kind: str, kept: Mapping[str, Any] | None = None) -> dict[str, Any] | None:
+    """A section of a kind with the keys that it requires and others that are kept; None if their values are unknown."""
+    required = [info.alias or name for name, info in model.model_fields.items() if info.is_required()]
+    section = {"kind": kind} | {key: FIRST_VALUES[key] for key in required if key in FIRST_VALUES} | dict(kept or {})
+    try:
+        model.model_validate(section)
+    except ValidationError:
+        return None
+    return section
+
+
+def with_value(name: str, overrides: Mapping[str, str], key: str, text: str) -> dict[str, str]:
+    """Overrides after a key has got a value, without those that lose their effect thereby. Raises InputError.
+
+    The kind of a section replaces the section.
+    """
+    section = key.removesuffix(".kind")
+    changed = with_kind(name, overrides, section, text) if section != key else {**overrides, key: text}
+    scene = load(name, changed, refuses_unused=False)
+    kept = {one: value for one, value in changed.items() if one == key or not unused.reason(one, scene)}
+    validated_scene(name, kept)
+    return kept
+
+
+def with_kind(name: str, overrides: Mapping[str, str], section: str, kind: str) -> dict[str, str]:
+    """Overrides by which a section gets another kind: that of the file, or with the keys that this kind requires.
+
+    Keys that both kinds have keep their values.
+    """
+    rest = {key: text for key, text in overrides.items() if key != section and not key.startswith(f"{section}.")}
+    info, in_file = section_at(load(name, rest, refuses_unused=False), section)
+    if kind == getattr(in_file, "kind", NO_SECTION):
+        return rest
+    if kind == NO_SECTION:
+        return rest | {section: "null"}
+    model, now = models(info.annotation)[kind], section_at(load(name, overrides), section)[1]
+    kept = {
+        info.alias or field: file_value(getattr(now, field), si_unit(field))
+        for field, info in (type(now).model_fields.items() if isinstance(now, BaseModel) else ())
+        if field != "kind" and field in now.model_fields_set and same_field(model, field, info.annotation)
+    }
+    found = first_section(model, kind, kept) or first_section(model, kind)
+    return rest | {section: yaml_line(found)}
+
+
+def same_field(model: type[BaseModel], name: str, annotation: Any) -> bool:
+    """Whether a model has a field of a name with the same type, and no section."""
+    field = model.model_fields.get(name)
+    return field is not None and field.annotation == annotation and not models(annotation)
+
+
+def section_at(scene: Scene, key: str) -> tuple[Any, Any]:
+    """The field of a dotted key in the schema, and its value in a scene."""
+    info, value = None, scene
+    for part in key.split("."):
+        names = unused.field_names(type(value))
+        info, value = type(value).model_fields[names[part]], getattr(value, names[part])
+    return info, value
 
 
 def file_value(value: Any, unit: str) -> Any:

@@ -6,12 +6,12 @@ import asyncio
 import secrets
 import signal
 import time
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from nicegui import ui
+from nicegui import run, ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.page import forms, keys, style
@@ -23,7 +23,8 @@ from skysim.apps.gui.page.panels.monte_carlo import MonteCarloPanel
 from skysim.apps.gui.page.panels.photo import PhotoPanel
 from skysim.apps.gui.page.panels.plan import PlanPanel
 from skysim.apps.gui.page.panels.run import RunPanel
-from skysim.apps.gui.page.panels.scene import ScenePanel
+from skysim.apps.gui.page.settings.scene import ScenePanel
+from skysim.apps.gui.page.settings.tracker import TrackerPanel
 from skysim.apps.gui.page.shell.actions import Actions
 from skysim.apps.gui.page.shell.arrangement import Arrangement
 from skysim.apps.gui.page.shell.help import help_dialog
@@ -40,7 +41,7 @@ from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.scene.loader import find, load
 
-PANELS = ("Lab", "Lights", "Scene", "Plan", "Run", "Monte Carlo", "Image", "Log")
+PANELS = ("Run", "Lights", "Scene", "Tracker", "Plan", "Monte Carlo", "Image", "Log")
 
 
 class Tab:
@@ -113,7 +114,7 @@ class Tab:
             self.build_header()
             self.sensor = Sensor(self)
             with ui.element("div").classes("lab-side"):
-                Arrangement.splitter()
+                Arrangement.splitter("side", "vertical", "Width of the panels")
                 self.attitude = AttitudeCard(self)
                 self.build_panels()
             with ui.element("div").classes("lab-keys").mark("keys"):
@@ -158,16 +159,16 @@ class Tab:
         )
 
     def build_panels(self) -> None:
-        grid = "display: grid; grid-template: 34px minmax(0, 1fr) / minmax(0, 1fr); min-height: 0"
-        with ui.element("div").style(grid):
+        with ui.element("div").classes("lab-panes"):
+            with ui.element("div").classes("lab-space-pane"):
+                self.scene_3d = Scene3D(self)
+            Arrangement.splitter("space", "horizontal", "Height of the 3-D view")
             with ui.tabs().props("dense align=left no-caps indicator-color=primary") as self.tabs:
                 # Otherwise the arrow keys would select tabs.
                 self.tabs.on("click", js_handler=keys.BLUR_JS)
                 for name in PANELS:
                     ui.tab(name).mark(f"tab-{name}")
-            with ui.tab_panels(self.tabs, value="Lab", animated=False, keep_alive=True).classes("lab-panels"):
-                with ui.tab_panel("Lab").classes("relative-position"):
-                    self.scene_3d = Scene3D(self)
+            with ui.tab_panels(self.tabs, value=PANELS[0], animated=False, keep_alive=True).classes("lab-panels"):
                 with ui.tab_panel("Lights"):
                     self.lights = LightsPanel(self)
                 with ui.tab_panel("Scene"):
@@ -178,6 +179,8 @@ class Tab:
                     self.run_panel = RunPanel(self)
                 with ui.tab_panel("Monte Carlo"):
                     self.study_panel = MonteCarloPanel(self)
+                with ui.tab_panel("Tracker"):
+                    self.tracker_panel = TrackerPanel(self)
                 with ui.tab_panel("Image"):
                     self.photo = PhotoPanel(self)
                 with ui.tab_panel("Log"):
@@ -265,14 +268,17 @@ class Tab:
         self.plan_panel.clear()
         self.study_panel.set_scene()
         self.display_live(view)
-        await self.scene_panel.set_scene()
+        fields = await run.io_bound(forms.fields, scene, overrides)
+        self.scene_panel.set_scene(fields)
+        self.tracker_panel.set_scene(fields)
         self.log(f"opened {Path(scene).name}" + (f" with {', '.join(overrides)}" if overrides else ""))
         return True
 
-    async def apply_overrides(self, overrides: Mapping[str, str]) -> None:
-        """Reopen the scene with further overrides; edits made meanwhile follow one after the other."""
+    async def apply_overrides(self, overrides: Mapping[str, str], dropped: Collection[str] = ()) -> None:
+        """Reopen the scene with further overrides and without some; edits made meanwhile follow one after the other."""
         async with self.editing:
-            await self.open(self.scene, {**self.overrides, **overrides})
+            kept = {key: text for key, text in self.overrides.items() if key not in dropped}
+            await self.open(self.scene, {**kept, **overrides})
 
     async def switch_noise(self) -> None:
         """Render with the camera's noise, or each pixel's expected value; the attitude is kept."""

@@ -107,28 +107,36 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-run > * {{ flex: none }}
 .lab-moment {{ position: absolute; left: 0; top: 0; bottom: 0; width: 1.5px; pointer-events: none;
   background: {CURVE_COLORS[0]} }} .lab-moment[hidden] {{ display: none }}
+.lab-dots {{ position: absolute; left: 0; top: 0; pointer-events: none }}
 .mono.lab-log {{ white-space: pre-wrap; overflow-wrap: anywhere }}
 .q-uploader__subtitle {{ display: none }} .q-uploader__title {{ font-size: 13px; font-weight: 500 }}
 .lab-space {{ position: relative; overflow: hidden }}
 .lab-space > canvas {{ position: absolute; inset: 0; width: 100%; height: 100%; touch-action: none }}
 .lab-space > .lab-names {{ pointer-events: none }}
 .lab-tag {{ position: absolute; left: 0; top: 0; pointer-events: none; color: #fff; background: #0d1015b0 }}
-.lab-looks {{ position: absolute; right: 20px; top: 14px; display: flex; gap: 4px }}
+.lab-looks {{ position: absolute; right: 10px; top: 8px; display: flex; gap: 4px }}
 .lab-looks > .q-btn {{ color: #9cc4ff; background: #0d1015b0 }}
-.lab-push {{ position: absolute; right: 20px; top: 46px; display: flex; gap: 10px; align-items: center;
+.lab-push {{ position: absolute; right: 10px; top: 38px; display: flex; gap: 10px; align-items: center;
   color: #d7dce4; background: #0d1015b0 }} .lab-push > .q-btn {{ color: #9cc4ff }}
 .lab-lights {{ width: 100%; border-collapse: collapse; cursor: default; text-align: right }}
 .lab-lights th {{ position: sticky; top: -10px; font-weight: normal; color: {COLORS["quiet"]};
   background: {COLORS["panel"]} }}
 .lab-lights tr > :first-child {{ text-align: left }} .lab-lights tr.ringed {{ background: {COLORS["line"]} }}
-.lab-turn {{ position: absolute; left: 24px; bottom: 16px; font-size: 11px; pointer-events: none; color: #aab3c2;
+.lab-turn {{ position: absolute; left: 8px; bottom: 6px; font-size: 11px; pointer-events: none; color: #aab3c2;
   background: #0d1015b0; padding: 0 4px }}
 .stale {{ opacity: .45 }}
-.lab-side {{ display: grid; grid-template: auto auto minmax(0, 1fr) / minmax(0, 1fr);
+.lab-side {{ display: grid; grid-template: auto minmax(0, 1fr) / minmax(0, 1fr);
   border-left: 1px solid {COLORS["line"]}; min-height: 0; min-width: 0; background: {COLORS["panel"]} }}
 .lab-side {{ position: relative }}
-.lab-split {{ position: absolute; left: -4px; top: 0; width: 7px; height: 100%; cursor: col-resize; z-index: 5;
-  touch-action: none }}
+.lab-panes {{ display: grid; min-height: 0; grid-template: min(var(--lab-space, 38%), calc(100% - 60px)) 9px 34px
+  minmax(0, 1fr) / minmax(0, 1fr) }}
+.lab-space-pane {{ position: relative; min-height: 0; overflow: hidden; container-type: size }}
+@container (max-height: 150px) {{ .lab-turn {{ display: none }} }}
+.lab-split {{ touch-action: none; z-index: 5 }}
+.lab-split.vertical {{ position: absolute; left: -4px; top: 0; width: 7px; height: 100%; cursor: col-resize }}
+.lab-split.horizontal {{ cursor: row-resize; border: solid {COLORS["line"]}; border-width: 1px 0;
+  background: radial-gradient(circle, {COLORS["quiet"]} 1px, transparent 1.5px) center / 7px 7px no-repeat,
+  linear-gradient({COLORS["panel"]} 0 0) }}
 .lab-split:hover, .lab-split:focus-visible {{ background: {COLORS["accent"]}; opacity: .6; outline: none }}
 .lab-palette {{ width: min(560px, 94vw); max-width: none; padding: 8px 12px; gap: 4px }}
 .lab-commands {{ max-height: 60vh; overflow: auto; width: 100% }}
@@ -164,15 +172,14 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .q-field--dense .q-field__native > span {{ font-size: 12.5px; line-height: 20px }}
 .q-field--dense .q-field__label {{ font-size: 12px; top: 11px }}
 .q-field--dense.q-field--float .q-field__label {{ transform: translateY(-38%) scale(.85) }}
-.lab-stages {{ display: grid; grid-template-columns: repeat(4, minmax(0, 1fr)); gap: 8px }}
-.lab-stages .q-field__control {{ padding: 0 2px 0 8px }} .lab-stages .q-field__append {{ padding: 0 }}
 .q-select.q-field--dense.q-field--labeled .q-field__native > span {{ margin-top: -12px }}
 .lab-trial .q-field__control {{ padding: 0 4px 0 8px }} .lab-panels .q-btn {{ padding: 2px 8px }}
 .lab-panels .q-uploader__header {{ background: {COLORS["line"]} }}
 .q-field--dense .q-field__suffix {{ align-self: center; padding: 0 }}
 .lab-trial {{ display: grid; width: 100%; grid-template-columns: 1fr 1.4fr 1fr 1fr .7fr 1fr; gap: 6px;
   margin: 8px 0 }}
-.q-tab {{ min-height: 34px; padding: 0 6px; text-transform: none }} .q-tab__label {{ font-size: 13px }}
+.q-tab__content {{ min-width: 0 }} .q-tab__label {{ font-size: 13px }}
+.q-tab {{ min-height: 34px; padding: 0 6px; text-transform: none }}
 .q-tabs {{ min-height: 34px }}
 .q-btn {{ text-transform: none }} .q-btn .q-btn__content {{ font-size: 12px; line-height: 1.5 }}
 .lab-sections .q-item {{ padding: 2px 0 }}
@@ -181,16 +188,16 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   .nicegui-content {{ overflow: auto }}
   .lab {{ height: auto; grid-template: auto auto auto auto / minmax(0, 1fr);
     grid-template-areas: "head" "sensor" "side" "keys" }}
-  .lab-head {{ flex-wrap: wrap; row-gap: 0; min-height: 44px }} .lab-title, .lab-split {{ display: none }}
+  .lab-head {{ flex-wrap: wrap; row-gap: 0; min-height: 44px }} .lab-title, .lab .lab-split {{ display: none }}
   .lab-said {{ text-align: left; flex-basis: 200px }}
   .lab-keys {{ flex-wrap: wrap; padding: 6px 14px; row-gap: 4px }}
   .lab-sensor {{ grid-template-rows: auto calc(min(70vh, 75vw) + 200px) }}
   .lab-bar {{ flex-wrap: wrap; padding: 4px 14px }}
-  .lab-side {{ grid-template-rows: auto auto 620px; border-left: 0 }}
+  .lab-side {{ grid-template-rows: auto auto; border-left: 0 }}
+  .lab-panes {{ grid-template-rows: 340px 34px 586px }}
   .lab-run > .row:first-child {{ flex-wrap: wrap }}
 }}
 @media (max-width: 600px) {{
-  .lab-stages {{ grid-template-columns: repeat(2, minmax(0, 1fr)) }}
   .lab-trial {{ grid-template-columns: repeat(2, minmax(0, 1fr)) }}
   .lab-grid {{ grid-template-columns: 60px repeat(3, minmax(0, 1fr)); gap: 2px 6px }}
 }}

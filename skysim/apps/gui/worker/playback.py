@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimator.trackers.pipeline import Report
-from skysim.apps.gui.messages import NAN, FlightStep, FrameRow, FrameView, MotionLog
+from skysim.apps.gui.messages import NAN, FlightStep, FrameRow, FrameView, MotionLog, Phase
 from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.workbench import Workbench, tracker_result
 from skysim.core.quantities.units import ARCSEC_RAD
@@ -76,11 +76,13 @@ class Flight:
         while not is_done and time.perf_counter() < end_s:
             progress = next(self.steps, None)
             is_done, self.progress = progress is None, progress or self.progress
-        rows = tuple(frame_row(frame.view) for frame in self.frames[self.told :])
+        views = [frame.view for frame in self.frames[self.told :]]
+        rows, residuals = tuple(map(frame_row, views)), tuple(row for view in views for row in light_residuals(view))
         self.told, log = len(self.frames), None
         if self.moved and not self.told_log:
             self.told_log, log = True, curves(self.moved.log)
-        return FlightStep("done" if is_done else "frames" if self.moved else "motion", *self.progress, rows, log)
+        phase: Phase = "done" if is_done else "frames" if self.moved else "motion"
+        return FlightStep(phase, *self.progress, rows, log, residuals)
 
     def keep(self, frame: Frame, truth: Truth) -> int | None:
         """Write a frame to the end of the file, and return its place there; None if the file is full."""
@@ -113,6 +115,13 @@ def frame_row(view: FrameView) -> FrameRow:
     errors = result.cross_arcsec, cross_sigma, result.roll_arcsec, roll_sigma
     counts = len(view.lights), result.identified
     return FrameRow(view.t_s, *errors, *counts, view.filter_arcsec, view.innovation_arcsec)
+
+
+def light_residuals(view: FrameView) -> Iterator[tuple[float, int, float]]:
+    """Time, number and residual in pixels of every light that is identified in a frame."""
+    for spot in view.result.detections if view.result else ():
+        if spot.id >= 0 and math.isfinite(spot.residual_px):
+            yield view.t_s, spot.id, spot.residual_px
 
 
 def curves(log: Telemetry) -> MotionLog:

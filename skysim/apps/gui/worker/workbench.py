@@ -93,7 +93,6 @@ class Workbench:
             2 * math.degrees(math.atan(camera.width_px / 2 / camera.focal_px)),
             1 / camera.focal_px / ARCSEC_RAD,
             self.stages,
-            tracker_settings.algorithm_names(scene),
             self.testbed.duration_s,
             camera.detector.noise,
             self.geometry,

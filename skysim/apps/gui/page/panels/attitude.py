@@ -1,15 +1,13 @@
-"""Attitude card: true angles (editable), the tracker's angles, its error, and its algorithms by stage."""
+"""Attitude card: true angles (editable), the tracker's angles, its error, and the names of its algorithms."""
 
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, TrackerResult
-from skysim.apps.gui.page import keys
 from skysim.apps.gui.page.frame.live import LiveInput, LiveText
 from skysim.apps.gui.page.style import format_number
 
@@ -17,12 +15,11 @@ if TYPE_CHECKING:
     from skysim.apps.gui.page.page import Tab
     from skysim.apps.gui.worker.photo import Photo
 
-STAGE_KEYS = {"detector": "F6", "identifier": "F7"}
 ANGLES_JS = "() => emit([...document.querySelectorAll('.lab-angle')].map(field => field.value))"
 
 
 class AttitudeCard:
-    """True and estimated angles with the error, and one list of algorithms for each of the tracker's four stages.
+    """True and estimated angles with the error, and the algorithms of the tracker's four stages.
 
     shows_photo: whether the card shows an image that is not of the current scene
     """
@@ -40,37 +37,21 @@ class AttitudeCard:
                 ui.label("error").classes("quiet")
                 self.errors = [LiveText(tab.contents, "–").classes("mono num") for _ in range(3)]
             self.status = LiveText(tab.contents).classes("mono ellipsis lab-status").mark("status")
-        with ui.element("div").classes("lab-card"), ui.element("div").classes("lab-stages"):
-            self.stages = {
-                stage: self.stage_select(stage) for stage in ("detector", "centroider", "identifier", "solver")
-            }
+            self.stages = ui.label(" ").classes("quiet ellipsis").mark("stages")
 
     def angle_input(self, n: int) -> LiveInput:
         field = LiveInput(self.tab.contents, "text").props(f'aria-label="angle {n + 1}"')
         return field.classes("mono lab-angle").mark(f"angle-{n}").on("keydown.enter", self.point, js_handler=ANGLES_JS)
 
-    def stage_select(self, name: str) -> ui.select:
-        label = f"{name} {STAGE_KEYS[name]}" if name in STAGE_KEYS else name
-        field = ui.select([], label=label, on_change=partial(self.choose, name))
-        field.on("popup-hide", js_handler=keys.BLUR_JS)
-        return field.props("dense outlined options-dense").mark(name)
-
     def set_scene(self, scene_info: SceneInfo) -> None:
         """Take over a new scene: angle names and algorithms."""
         self.set_headers(scene_info.names)
-        for name, field in self.stages.items():
-            field.props["title"] = f"{name}: {scene_info.stages[name]}"  # tooltip with the full name
-            field.set_options(list(scene_info.choices[name]), value=scene_info.stages[name])
+        self.stages.set_text("stages (F6, F7): " + " · ".join(scene_info.stages.values()))
+        self.stages.props["title"] = ", ".join(f"{stage} {name}" for stage, name in scene_info.stages.items())
 
     def set_headers(self, names: tuple[str, str, str]) -> None:
         for head, name in zip(self.heads, names, strict=True):
             head.set_text(f"{name}, deg")
-
-    async def choose(self, stage: str) -> None:
-        """Select an algorithm: the tracker is rebuilt, the rest of the scene is kept."""
-        scene_info, value = self.tab.scene_info, self.stages[stage].value
-        if scene_info and value and value != scene_info.stages[stage]:
-            await self.tab.apply_overrides({f"tracker.{stage}": value})
 
     async def point(self, event: Any) -> None:
         """Point the camera at the typed angles."""

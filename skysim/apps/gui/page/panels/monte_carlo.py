@@ -60,7 +60,9 @@ class MonteCarloPanel:
             self.false_lights = ui.number("false", value=0, min=0, max=100, precision=0).props("dense outlined")
             self.field = ui.number("field, °", min=1, max=90).props("dense outlined").mark("field")
             self.field.on("keydown.enter", self.set_field_of_view)
-        self.noise_text = ui.label().classes("quiet").mark("noise-text")
+        with ui.row().classes("w-full no-wrap items-center gap-3") as self.model:
+            self.with_noise = ui.checkbox("with noise", value=True).props("dense size=xs").mark("with-noise")
+            self.noise_text = ui.label().classes("quiet").mark("noise-text")
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
         self.note = ui.label("No study has been run yet: press 2.").classes("quiet").style("margin-top: 6px")
         self.note.mark("trials-note")
@@ -89,7 +91,7 @@ class MonteCarloPanel:
 
     def study_chosen(self) -> None:
         """Hide the Monte Carlo fields when a study file is chosen."""
-        for item in (self.fields, self.noise_text):
+        for item in (self.fields, self.model):
             item.set_visibility(not self.study_select.value)
 
     async def set_field_of_view(self) -> None:
@@ -161,7 +163,7 @@ class MonteCarloPanel:
         trial: dict[str, Any] = {"kind": self.kind.value}
         if self.kind.value == "centroids":
             noise = {"noise_px": self.noise, "magnitude_sigma": self.magnitude}
-            trial |= {name: float(field.value or 0) for name, field in noise.items()}
+            trial |= {name: float(field.value or 0) * bool(self.with_noise.value) for name, field in noise.items()}
             trial |= {"false_lights": int(self.false_lights.value or 0)}
         if not (self.count.value and 1 <= self.count.value <= 100_000):
             raise InputError("runs: allowed: 1 to 100000")
@@ -215,8 +217,11 @@ class MonteCarloPanel:
         self.run_number = int(number) if number.isdigit() else 0
         self.count.set_value(study.trials)
         self.kind.set_value(trial["kind"])
-        self.noise.set_value(trial.get("noise_px", self.noise.value))
-        self.magnitude.set_value(trial.get("magnitude_sigma", self.magnitude.value))
+        noise_px, magnitude_sigma = trial.get("noise_px"), trial.get("magnitude_sigma")
+        self.with_noise.set_value(noise_px != 0 or magnitude_sigma != 0)
+        if self.with_noise.value and noise_px is not None:
+            self.noise.set_value(noise_px)
+            self.magnitude.set_value(magnitude_sigma)
         self.false_lights.set_value(trial.get("false_lights", self.false_lights.value))
 
     def show_count(self, done: int) -> None:

@@ -92,7 +92,7 @@ class PlanPanel:
                     f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in 255 * color_scale(np.linspace(0, 1, 8))
                 )
                 ui.element("div").style(f"width: 120px; height: 10px; background: linear-gradient(90deg, {colors})")
-                ui.label("100 % of the LEDs coincide; drawn in the Lab panel").classes("quiet")
+                ui.label("100 % of the LEDs coincide; drawn in the 3-D view").classes("quiet")
 
     # The survey.
 

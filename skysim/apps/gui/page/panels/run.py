@@ -31,7 +31,7 @@ DRAW_S = 0.7  # between two drawings of the strips while frames come
 class RunPanel:
     """Panel that computes the flight, plays, pauses, steps and seeks.
 
-    rows, log : of the computed frames and of the motion
+    rows, log : of the computed frames and of the motion;  residuals : of the identified lights, see `FlightStep`
     computing, stopping : whether the flight is being computed, and whether it shall end
     wanted_s : time to be shown once the flight is computed; None: play it from its start
     sought : place of the slider while its frame is not shown yet
@@ -43,6 +43,7 @@ class RunPanel:
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
         self.rows, self.log, self.times_s = list[FrameRow](), MotionLog(()), list[float]()
+        self.residuals = list[tuple[float, int, float]]()
         self.computing = self.stopping = self.playing = False
         self.wanted_s: float | None = None
         self.sought: int | None = None
@@ -108,9 +109,10 @@ class RunPanel:
 
     def clear(self) -> None:
         self.rows, self.log, self.times_s, self.index, self.from_s = [], MotionLog(()), [], 0, 0.0
+        self.residuals = []
         self.seek.set_value(0)
         self.bar.set_value(0)
-        self.strips.draw([], 1.0)
+        self.strips.draw([], 1.0, str)
         self.enable()
 
     async def close_loop(self) -> None:
@@ -176,6 +178,7 @@ class RunPanel:
     def take(self, step: FlightStep) -> None:
         """Take over what is new of the flight."""
         self.rows += step.rows
+        self.residuals += step.residuals
         self.times_s += [row.t_s for row in step.rows]
         self.log = step.log or self.log
         self.bar.set_value(step.done / max(step.total, 1e-9))
@@ -190,7 +193,8 @@ class RunPanel:
         """Draw the strips with the frames so far."""
         self.drawn_s = time.monotonic()
         ends = [*self.log.t_s[-1:], *self.times_s[-1:]]
-        self.strips.draw(strips(self.rows, self.log), max(ends, default=1.0))
+        lights = () if self.computing else self.residuals  # which are many, and sent once
+        self.strips.draw(strips(self.rows, self.log, lights), max(ends, default=1.0), self.tab.sensor.name)
         if self.rows:
             self.summary.set_text(rms_line(self.rows))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from nicegui import ui
@@ -14,6 +14,8 @@ from skysim.apps.gui.page.style import CURVE_COLORS, TOOLTIP, chart_color
 
 BAND_COLOR = "#8b95a5"
 STRIP_PX, HEAD_PX, AXIS_PX = 118, 22, 24  # height of a strip, of its title and legend, of the time axis
+INNER_PX = STRIP_PX - HEAD_PX - 8  # height of a strip between its axes
+MAX_DOTS = 20_000  # of lights; of more, some frames are left out
 Points = list[list[float]]
 LEFT_PX, RIGHT_PX = 52, 12  # of a strip, to the edges of the chart
 # A click on a strip, and the line of the shown moment over all strips. The line is an element of its own, because the
@@ -34,6 +36,7 @@ CHART_JS = """() => {
     });
   }
   skysimMoment(chart, chart.skysim.t_s);
+  getElement(%d)?.attach(chart);
 }"""
 MOMENT_JS = f"""
 window.skysimMoment = (chart, t_s) => {{
@@ -57,19 +60,27 @@ class Curve:
 
 @dataclass(frozen=True)
 class Strip:
-    """One chart with its unit in the title."""
+    """One chart with its unit in the title.
+
+    dots : of lights, drawn by strips.js: time, value, and the light's number
+    """
 
     title: str
-    curves: tuple[Curve, ...]
+    curves: tuple[Curve, ...] = ()
     logarithmic: bool = False
+    dots: Points = field(default_factory=list)
 
     @property
     def drawn(self) -> tuple[Curve, ...]:
         return tuple(curve for curve in self.curves if curve.points)
 
 
-def strips(rows: Sequence[FrameRow], log: MotionLog) -> list[Strip]:
-    """The strips of a flight that have a curve."""
+class Dots(ui.element, component="strips.js"):  # type: ignore[call-arg]
+    """Dots over a strip, implemented in strips.js."""
+
+
+def strips(rows: Sequence[FrameRow], log: MotionLog, residuals: Sequence[tuple[float, int, float]] = ()) -> list[Strip]:
+    """The strips of a flight that have something to show. residuals : see `FlightStep`"""
 
     def of_frames(value: Callable[[FrameRow], float]) -> Points:
         pairs = ((row.t_s, value(row)) for row in rows)
@@ -111,10 +122,18 @@ def strips(rows: Sequence[FrameRow], log: MotionLog) -> list[Strip]:
                 Curve("identified", of_frames(lambda row: row.identified)),
             ),
         ),
+        Strip("residual of each light, px", dots=thinned(residuals)),
         Strip("rate, °/s", (of_motion("rate"),)),
         Strip("momentum, N m s", (of_motion("momentum"),)),
     ]
-    return [strip for strip in found if strip.drawn]
+    return [strip for strip in found if strip.drawn or strip.dots]
+
+
+def thinned(residuals: Sequence[tuple[float, int, float]]) -> Points:
+    """The residuals as dots, of every frame or, if they are many, of every so many-th one."""
+    times_s = sorted({t_s for t_s, _, _ in residuals})
+    kept = set(times_s[:: max(math.ceil(len(residuals) / MAX_DOTS), 1)])
+    return [[round(t_s, 4), float(f"{px:.3g}"), id] for t_s, id, px in residuals if t_s in kept]
 
 
 class StripChart:
@@ -125,13 +144,17 @@ class StripChart:
 
     def __init__(self) -> None:
         self.strips: list[Strip] = []
-        self.chart = ui.echart({"series": []}).classes("w-full").mark("strips")
+        with ui.element("div").classes("w-full relative-position"):
+            self.chart = ui.echart({"series": []}).classes("w-full").mark("strips")
+            self.dots = Dots().mark("dots")
         ui.add_body_html(f"<script>{MOMENT_JS}</script>")
-        self.chart.on("chart:finished", js_handler=CHART_JS % self.chart.id)
+        self.chart.on("chart:finished", js_handler=CHART_JS % (self.chart.id, self.dots.id))
         self.chart.set_visibility(False)
 
-    def draw(self, drawn: list[Strip], end_s: float) -> None:
-        """Draw strips up to a time."""
+    def draw(self, drawn: list[Strip], end_s: float, name: Callable[[int], str]) -> None:
+        """Draw strips up to a time. name : of a light"""
+        if any(strip.dots for strip in (*self.strips, *drawn)):
+            self.dots.run_method("show", dot_fields(drawn, name))
         self.strips = drawn
         self.chart.set_visibility(bool(drawn))
         self.chart.style(f"height: {len(drawn) * STRIP_PX + AXIS_PX}px")
@@ -145,6 +168,15 @@ class StripChart:
             self.chart.client.run_javascript(f"skysimMoment(getElement({self.chart.id})?.chart, {t_s:.4f})")
 
 
+def dot_fields(drawn: list[Strip], name: Callable[[int], str]) -> dict[str, Any]:
+    """What strips.js draws: dots, names of their lights, and the place of their strip."""
+    n = next((n for n, strip in enumerate(drawn) if strip.dots), 0)
+    dots = drawn[n].dots if drawn else []
+    names = {int(id): name(int(id)) for _, _, id in dots}
+    place = {"left": LEFT_PX, "right": RIGHT_PX, "top": n * STRIP_PX + HEAD_PX, "height": INNER_PX}
+    return {"dots": dots, "names": names, "grid": n, "place": place, "color": CURVE_COLORS[0]}
+
+
 def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
     """ECharts options of stacked strips; each has a title with its unit and a legend."""
     text, rule = {":color": chart_color("quiet"), "fontSize": 11}, {"lineStyle": {":color": chart_color("line")}}
@@ -152,7 +184,7 @@ def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
     title = {"padding": 0, "left": 0, "textStyle": title_text}
     legend = {"textStyle": text, "itemWidth": 14, "itemHeight": 7, "itemGap": 10, "right": 10, "padding": 0}
     tops = [n * STRIP_PX for n in range(len(drawn))]
-    grid = {"left": LEFT_PX, "right": RIGHT_PX, "height": STRIP_PX - HEAD_PX - 8}
+    grid = {"left": LEFT_PX, "right": RIGHT_PX, "height": INNER_PX}
     x_axis = {"type": "value", "min": 0, "max": round(end_s, 3), "splitLine": {"show": False}}
     last = len(drawn) - 1
     return {
@@ -183,7 +215,15 @@ def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
 
 def y_axis(strip: Strip, n: int) -> dict[str, Any]:
     axis = {"gridIndex": n, "splitNumber": 3, "type": "log" if strip.logarithmic else "value"}
+    if strip.dots:
+        return axis | {"min": 0, "max": round_up(max(dot[1] for dot in strip.dots))}
     return axis | (decades([y for curve in strip.drawn for _, y in curve.points]) if strip.logarithmic else {})
+
+
+def round_up(value: float) -> float:
+    """The next greater of 1, 2, 5, 10, ... times a power of ten."""
+    decade = 10.0 ** math.floor(math.log10(max(value, 1e-6)))
+    return float(f"{next(step * decade for step in (1, 2, 5, 10) if step * decade >= value):.6g}")
 
 
 def decades(values: list[float]) -> dict[str, float]:

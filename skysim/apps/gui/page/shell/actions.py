@@ -43,6 +43,7 @@ class Actions:
             Command("redo the change that was undone", "Ctrl Shift Z", self.tab.history.redo),
             Command("compute the flight of the scene, or stop that", "", self.tab.run_panel.simulate),
             Command("change between the dark and the light theme", "", self.tab.arrangement.toggle),
+            Command("give frame, 3-D view and panels their first sizes", "", self.tab.arrangement.reset),
         ]
         found += [Command(f"panel: {name}", "", partial(self.tab.tabs.set_value, name)) for name in self.panels]
         return found + [Command(f"export: {name}", "", partial(self.tab.export, name)) for name in export.FILE_BY_ITEM]
@@ -99,7 +100,8 @@ class Actions:
         elif action == "attitude":
             self.tab.attitude.inputs[0].run_method("focus")
         elif action in ("sensor", "identifier"):
-            self.tab.attitude.stages["detector" if action == "sensor" else "identifier"].run_method("showPopup")
+            self.tab.tabs.set_value("Tracker")
+            self.tab.tracker_panel.open(action)
         elif action == "runs":
             self.tab.tabs.set_value("Monte Carlo")
             self.tab.study_panel.count.run_method("focus")

@@ -23,6 +23,7 @@ export default {
     // Not reactive: Vue must not watch the objects of three.js.
     // held: what the user drags: { body: its place in body axes, plane: in which it is pulled, wanted: to where }
     Object.assign(this, { held: null, telling: null });
+    Object.assign(this, { inSight: false, newest: "" }); // whether a part of it is on the screen; the newest frame's fields
     Object.assign(this, { inside: false, hovered: null, ringed: null, preset: "outside", named: [], drawnAt: 0, drawings: 0 });
   },
   mounted() {
@@ -43,11 +44,14 @@ export default {
     this.controls.addEventListener("change", () => this.draw());
     this.watcher = new ResizeObserver(() => this.resize());
     this.watcher.observe(this.$el);
+    this.sight = new IntersectionObserver((entries) => this.see(entries.at(-1).isIntersecting));
+    this.sight.observe(this.$el);
     window.addEventListener("skysim-hover", this.ring);
   },
   beforeUnmount() {
     window.removeEventListener("skysim-hover", this.ring);
     this.watcher?.disconnect();
+    this.sight?.disconnect();
     this.renderer?.dispose();
   },
   methods: {
@@ -67,12 +71,15 @@ export default {
       this.world.add(lamp, this.vehicle, this.axes, this.lights.points, this.band);
       for (const shape of lab.shapes) (shape.on_vehicle ? this.vehicle : this.world).add(solid(shape));
       this.named = [];
+      this.newest = "";
       this.paintLights();
       this.look(this.preset);
     },
     // The newest frame: { wxyz: lab_from_body, seen: numbers on the frame, identified: [number, name] each }.
     show({ wxyz, seen, identified }) {
-      if (!this.vehicle) return;
+      const fields = JSON.stringify([wxyz, seen, identified]);
+      if (!this.vehicle || fields === this.newest) return;
+      this.newest = fields;
       this.vehicle.quaternion.set(wxyz[1], wxyz[2], wxyz[3], wxyz[0]);
       this.lights.setFrame(new Set(seen), new Set(identified.map(([id]) => id)));
       const index = new Map(this.lab.lights.id.map((id, n) => [id, n]));
@@ -128,9 +135,14 @@ export default {
       this.camera.updateProjectionMatrix();
       this.draw(true);
     },
+    // Nothing is drawn while the view is closed, or scrolled away.
+    see(inSight) {
+      this.inSight = inSight;
+      if (inSight) this.draw(true);
+    },
     // Draw soon; pictures are further apart without a graphics card, unless the mouse is here.
     draw(now = false) {
-      if (this.waiting) return;
+      if (this.waiting || !this.inSight) return;
       const pause = now || this.smooth || this.inside ? SMOOTH_MS : BUSY_MS;
       const wait = Math.max(0, this.drawnAt + pause - performance.now());
       this.waiting = setTimeout(() => requestAnimationFrame(this.render), wait);
@@ -138,7 +150,7 @@ export default {
     render() {
       this.waiting = null;
       this.drawnAt = performance.now();
-      if (!this.lights || !this.$el.clientWidth) return;
+      if (!this.lights || !this.inSight || !this.$el.clientWidth || !this.$el.clientHeight) return;
       const size = this.renderer.getDrawingBufferSize(new THREE.Vector2());
       this.lights.points.material.uniforms.pixels.value = size.y / Math.tan((this.camera.fov * Math.PI) / 360);
       this.renderer.render(this.world, this.camera);

@@ -1,0 +1,1 @@
+"""The settings of a scene as forms: all its keys, and those of sensor and identifier."""
