@@ -20,9 +20,9 @@ from starlette.datastructures import MutableHeaders
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import HTTPConnection, Request
 from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.routing import Route, Router
 
 from skysim.apps.gui.page.frame.sensor import FRAMES
-from skysim.apps.gui.page.frame.served import LIMITS
 from skysim.apps.gui.page.page import Tab
 from skysim.apps.gui.page.panels.photo import LIMIT_BYTES
 from skysim.apps.gui.worker.session import SpareWorker
@@ -42,11 +42,30 @@ REPORT_POLICY = (
 SECURITY_HEADERS = {"x-frame-options": "DENY", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
 # Noise is not compressible: gzip at its default level takes half a second for a frame.
 FRAME_HEADERS = {"cache-control": "no-store", "content-encoding": "identity"}
+NEAR = r"(\d{1,6}),(\d{1,6})"  # column and row of a pixel
 USER, USER_BYTES, YEAR_S = "skysim_user", 8, 365 * 86400  # cookie with the number of a browser
 QUEUED = "This page opens when another one has been closed."
 CONNECT_TIMEOUT_S = 50.0  # for a browser to load the page
 RECONNECT_S = 6.0  # for a lost browser to reconnect, before its work ends
 PING_INTERVAL_S, PING_TIMEOUT_S = 5.0, 30.0  # of the connection; a busy machine answers late
+
+
+def frame(request: Request) -> Response:
+    """A frame of a tab, see `ServedFrame`; 404 if it is no longer among the newest.
+
+    Query: width, of the screen; limits, one of LIMITS; near, column and row of the loupe's corner
+    """
+    served = FRAMES.get(request.path_params["tab"], {}).get(request.path_params["number"])
+    query = request.query_params
+    width, near = re.fullmatch(r"\d{1,6}", query.get("width", "0")), re.fullmatch(NEAR, query.get("near", ""))
+    if served is None or width is None:
+        return Response(status_code=404)
+    data = served.response(int(width[0]), query.get("limits", ""), (int(near[1]), int(near[2])) if near else None)
+    return Response(data, media_type="application/octet-stream", headers=FRAME_HEADERS)
+
+
+# Frames pass by the application's own layers, each of which takes a tenth of the time that a frame may take.
+FRAME_ROUTES = Router([Route("/frame/{tab}/{number:int}", frame)])
 
 
 class Guard:
@@ -67,7 +86,8 @@ class Guard:
             return
         response = self.refusal(HTTPConnection(scope))
         if response is None:
-            await self.app(scope, limited(receive), with_policy(send))
+            inner = FRAME_ROUTES if scope["path"].startswith("/frame/") else self.app
+            await inner(scope, limited(receive), with_policy(send))
         elif scope["type"] == "http":
             await response(scope, receive, send)
         else:
@@ -188,16 +208,6 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
     app.on_startup(spare.start)
     app.on_shutdown(spare.close)
     app.on_shutdown(stop_studies)
-
-    @app.get("/frame/{tab}/{number}")
-    def frame(tab: str, number: int, width: int = 0, limits: str = LIMITS[0], near: str = "") -> Response:
-        """A frame of a tab, see `ServedFrame`; 404 if it is no longer among the newest. near : column,row"""
-        served = FRAMES.get(tab, {}).get(number)
-        if served is None:
-            return Response(status_code=404)
-        place = re.fullmatch(r"(\d{1,6}),(\d{1,6})", near)
-        data = served.response(width, limits, (int(place[1]), int(place[2])) if place else None)
-        return Response(data, media_type="application/octet-stream", headers=FRAME_HEADERS)
 
     @app.get("/report/{name}")
     def report(name: str, request: Request) -> Response:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import pickle
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,14 @@ from labpage import CHROMIUM, NARROW, Server, come, exported, opened, panel, sou
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
+import httpx
 from astropy.io import fits
 
 from skysim.apps.gui.messages import Lights
 from skysim.apps.gui.page.frame.live import Contents
+from skysim.apps.gui.page.frame.sensor import FRAMES
 from skysim.apps.gui.page.frame.served import BINS, HEADER_BYTES, ServedFrame, limits_of, reduced
+from skysim.apps.gui.server import Guard
 from skysim.apps.gui.worker import pixels
 from skysim.results import stretch
 
@@ -101,6 +104,30 @@ def test_the_loupe_s_pixels_come_unchanged_with_a_reduced_frame() -> None:
     near = decoded(served(image).response(60, "automatic", (155, 40)))[0]["near"]
     assert (near["x"], near["y"]) == (155, 40)
     assert near["levels"] == image[40:51, 155:].tolist()  # as far as the frame reaches
+
+
+def test_frames_are_served_to_logged_in_browsers_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def nothing(*_: object) -> None:
+        raise AssertionError("not a frame")
+
+    guard, image = Guard(nothing, ("*",), "right", 1), sky(8)
+    monkeypatch.setitem(FRAMES, "tab", {3: served(image)})
+
+    async def answers(paths: Sequence[str], token: str) -> list[httpx.Response]:
+        transport, cookies = httpx.ASGITransport(app=guard), {"skysim_gui_1": token}
+        async with httpx.AsyncClient(transport=transport, base_url="http://lab", cookies=cookies) as client:
+            return [await client.get(path) for path in paths]
+
+    assert asyncio.run(answers(["/frame/tab/3"], "wrong"))[0].status_code == 401
+    paths = ["3?limits=zscale", "3?width=40&limits=automatic&near=5,6", "3?near=5,6,7"]
+    whole, fewer, odd = asyncio.run(answers([f"/frame/tab/{path}" for path in paths], "right"))
+    np.testing.assert_array_equal(decoded(whole.content)[1], image)
+    assert whole.headers["cache-control"] == "no-store"
+    fields, levels = decoded(fewer.content)
+    assert (levels.shape, fields["near"]["x"]) == ((30, 40), 5)
+    assert "near" not in decoded(odd.content)[0]
+    wrong = ["/frame/tab/4", "/frame/other/3", "/frame/tab/x", "/frame/tab/3?width=x", "/frame/tab/3?width=-4"]
+    assert {answer.status_code for answer in asyncio.run(answers(wrong, "right"))} == {404}
 
 
 def test_lights_are_a_sequence_that_is_sent_as_columns() -> None:
