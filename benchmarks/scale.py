@@ -25,7 +25,7 @@ from benchmarks.timing import verdict, versus
 from skysim.camera.detector.added_charge import AddedCharge
 from skysim.core.errors import InputError
 from skysim.experiments.dataset import plan, run, shards
-from skysim.experiments.dataset.labels import LabelledFrame, label_frame
+from skysim.experiments.dataset.labels import LabelledFrame, label_frame, labeller
 from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study.execution import engines, trials
 from skysim.experiments.study.plan import Plan
@@ -106,12 +106,14 @@ def parts_of(made: plan.DatasetPlan) -> dict[str, float]:
     spent = dict.fromkeys(("render", "label", "encode", "write"), 0.0)
     with tempfile.TemporaryFile() as file:
         tar = shards.TarWriter(file)
+        by = None
         for number, levels, setup, one in run.labelled_frames(made, 0):
-            seed, threshold_e = made.seed(number), setup.testbed.scene.camera.detector.read_noise_e
+            by = by or labeller(setup.testbed.scene)
+            seed = made.seed(number)
             with timed(spent, "render"):
-                trials.render_trial_frame(setup, seed, AddedCharge(threshold_e))
+                trials.render_trial_frame(setup, seed, AddedCharge(by.threshold_e))
             with timed(spent, "label"):
-                label_frame(setup, seed)
+                label_frame(setup, seed, by)
             with timed(spent, "encode"):
                 row = shards.frame_labels(one, setup.testbed.scene, {"frame": number, "shard": 0, "seed": seed})
                 shards.coco_annotations(one, number)
