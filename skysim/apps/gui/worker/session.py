@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import multiprocessing
-import os
 import signal
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +17,6 @@ from skysim.experiments.study.execution.workers import environment, one_thread
 QUEUE_S = 0.2  # between two looks for a free worker
 RENEW_S = 1.0  # for the last task of a tab that was closed
 OPENCV_LIMITS = {"OPENCV_IO_MAX_IMAGE_PIXELS": str(2**27)}  # environment: OpenCV refuses larger images
-RENDER_THREADS = {"NUMBA_NUM_THREADS": str(min(2, os.cpu_count() or 1))}  # someone waits for a key's frame
 
 
 class WorkerLost(Exception):
@@ -60,7 +58,7 @@ class Session:
         context = multiprocessing.get_context("spawn")
         self.pipe, worker_pipe = context.Pipe()
         self.process = context.Process(target=serve, args=(worker_pipe,), daemon=True)
-        with one_thread(), environment(OPENCV_LIMITS | RENDER_THREADS):
+        with one_thread(), environment(OPENCV_LIMITS):
             self.process.start()
         worker_pipe.close()
         self.thread = ThreadPoolExecutor(1, "session")

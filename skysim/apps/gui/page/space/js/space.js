@@ -5,7 +5,7 @@ import { drawNames } from "skysim-frame/marks.js";
 import { Lights } from "skysim-space/lights.js";
 import { axes, band, solid } from "skysim-space/solids.js";
 
-const BUSY_MS = 400, SMOOTH_MS = 33; // between pictures without a graphics card, and with one or under the mouse
+const BUSY_MS = 1000, SMOOTH_MS = 33; // between pictures without a graphics card, and with one or under the mouse
 const REACH_PX = 12;
 const PULL_MS = 40; // between two messages of a drag
 const NEAR_M = 0.02, FAR_M = 60;
