@@ -32,6 +32,7 @@ import numpy as np
 import psutil
 
 from benchmarks.timing import verdict
+from skysim.apps.gui.server import RECONNECT_S
 from skysim.core.types import Floats
 
 SCENE = """schema: 1
@@ -359,13 +360,13 @@ def crowd(tabs: Any, other: Any, server: Server) -> list[dict[str, Any]]:
     begin = time.monotonic()
     others[0].close()
     shown(others[WORKERS_LIMIT - 1])
-    waited_s = time.monotonic() - begin
+    waited_s = time.monotonic() - begin - RECONNECT_S  # in which the closed page could have come back
     for page in (first, *others[1:]):
         page.close()
     median, worst = float(np.median(alone)), float(np.max(during))
-    what = f"{worst:.0f} ms, beyond {median:.0f} ms alone (at most {np.max(alone):.0f} ms)"
+    what = f"beyond {median:.0f} ms alone; median {np.median(during):.0f} ms"
     return [
-        verdict("a waiting tab opened after another is closed", waited_s, "s", f"{CROWD} tabs", 5.0),
+        verdict("a waiting tab opened after a worker is free", waited_s, "s", f"{CROWD} tabs", 5.0),
         verdict("greatest delay of a key while they open", worst - median, "ms", what, 200.0),
     ]
 

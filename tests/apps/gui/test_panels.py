@@ -26,7 +26,7 @@ from skysim.apps.gui.page.frame import overlay
 from skysim.apps.gui.page.frame.sensor import Sensor
 from skysim.apps.gui.page.frame.star_names import NAMES
 from skysim.apps.gui.server import Guard, host_of, report_path, user_of
-from skysim.apps.gui.worker import export, photo, pixels, study_process, tasks, workbench
+from skysim.apps.gui.worker import export, photo, pixels, playback, study_process, tasks, workbench
 from skysim.apps.gui.worker.photo import SUFFIXES
 from skysim.apps.gui.worker.scene import pointing
 from skysim.apps.gui.worker.session import Session, WorkerLost
@@ -432,6 +432,25 @@ def test_a_renewed_worker_shows_the_scene_s_start_and_nothing_of_the_last_tab() 
     assert again.angles_deg == start.angles_deg
     assert worker.workbench.testbed is kept  # it is not set up again
     assert worker.open("shefex2", {"camera.detector.noise": "false"}, True)[0].noise is False
+
+
+@pytest.mark.slow
+def test_kept_frames_of_a_flight_are_those_that_are_rendered_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    worker, pixels_of, exported = tasks.Worker(), [], []
+    worker.open("shefex2", {"exposure.frames": "2"}, False)
+    for kept_bytes in (playback.KEPT_BYTES, 0):
+        monkeypatch.setattr(playback, "KEPT_BYTES", kept_bytes)
+        worker.begin_flight()
+        while worker.advance_flight(1.0).phase != "done":
+            pass
+        assert [frame.place is None for frame in worker.flight.frames] == [kept_bytes == 0] * 2
+        worker.flight_frame(0)
+        pixels_of.append(worker.flight_frame(1).pixels)
+        exported.append(fits.getdata(BytesIO(worker.export()["frame.fits"])))
+    assert pixels_of[0] == pixels_of[1] == pixels.encoded(exported[0])
+    np.testing.assert_array_equal(*exported)
+    moved = worker.move(0.0, 0.0, 1.0, False)  # afterwards the export is of the live scene
+    assert pixels.encoded(fits.getdata(BytesIO(worker.export()["frame.fits"]))) == moved.pixels
 
 
 @pytest.mark.long

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 import tempfile
 import time
 from collections.abc import Iterator
@@ -15,8 +14,9 @@ from estimator.trackers.pipeline import Report
 from skysim.apps.gui.messages import NAN, FlightStep, FrameRow, FrameView, MotionLog, Phase
 from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.workbench import Workbench, tracker_result
+from skysim.core import quaternion
 from skysim.core.quantities.units import ARCSEC_RAD
-from skysim.core.types import Frame, Telemetry, Truth
+from skysim.core.types import Frame, Telemetry
 from skysim.results import telemetry_report
 from skysim.simulation import exposure, run
 from skysim.simulation.run import FrameResult
@@ -29,14 +29,14 @@ KEPT_BYTES = 2**28  # of frames in the file, beyond which they are rendered agai
 
 @dataclass
 class KeptFrame:
-    """A frame of a flight without its pixels and its truth.
+    """A frame of a flight without its pixels.
 
-    place : of these in the file; None: they are rendered again, bit for bit
+    place : of these in the file, and their number of bytes; None: they are rendered again, bit for bit
     """
 
     view: FrameView
     report: Report
-    place: int | None
+    place: tuple[int, int] | None
 
 
 class Flight:
@@ -44,13 +44,14 @@ class Flight:
 
     Its computation is a series of short steps, so that the worker does other tasks between them.
 
-    file : the first frames with their truth, so that playing them costs no rendering
+    file : pixels of the first frames, so that playing them costs no rendering;  shown : number of the shown frame
     moved : the testbed after the simulation of its motion, None before;  told : number of frames reported by `advance`
     """
 
     def __init__(self, bench: Workbench) -> None:
         self.bench, self.frames, self.file = bench, list[KeptFrame](), tempfile.TemporaryFile()  # noqa: SIM115
         self.moved: Testbed | None = None
+        self.shown: int | None = None
         self.told, self.told_log = 0, False
         self.progress = (0.0, 1.0)
         self.steps = self.compute()
@@ -67,7 +68,7 @@ class Flight:
             t_s = exposure_window(self.moved.scene, result.frame.index, result.frame.exposure_s).open_s
             error, innovation = filter_errors(self.moved, result, t_s)
             view = replace(view, pixels=b"", t_s=t_s, filter_arcsec=error, innovation_arcsec=innovation)
-            self.frames.append(KeptFrame(view, result.report, self.keep(result.frame, result.truth)))
+            self.frames.append(KeptFrame(view, result.report, self.keep(result.frame)))
             yield len(self.frames), count
 
     def advance(self, budget_s: float) -> FlightStep:
@@ -84,26 +85,34 @@ class Flight:
         phase: Phase = "done" if is_done else "frames" if self.moved else "motion"
         return FlightStep(phase, *self.progress, rows, log, residuals)
 
-    def keep(self, frame: Frame, truth: Truth) -> int | None:
-        """Write a frame to the end of the file, and return its place there; None if the file is full."""
-        place = self.file.seek(0, 2)
-        if place + frame.image_dn.nbytes > KEPT_BYTES:
+    def keep(self, frame: Frame) -> tuple[int, int] | None:
+        """Write a frame's pixels to the end of the file, and return their place there; None if the file is full."""
+        data, begin = pixels.encoded(frame.image_dn), self.file.seek(0, 2)
+        if begin + len(data) > KEPT_BYTES:
             return None
-        pickle.dump((frame, truth), self.file, pickle.HIGHEST_PROTOCOL)
-        return place
+        self.file.write(data)
+        return begin, len(data)
 
     def show(self, index: int) -> FrameView:
         """The view of a kept frame with its pixels; the scene is seen from there from now on."""
-        assert self.moved is not None
         kept, bench = self.frames[index], self.bench
+        self.shown, bench.frame = index, None
+        bench.lab_from_body = quaternion.to_rotation(np.array(kept.view.body_wxyz))
         if kept.place is None:
-            frame, truth = exposure.render_frame(self.moved, index, exposure_s=kept.view.exposure_s)
-        else:
-            self.file.seek(kept.place)
-            frame, truth = pickle.load(self.file)
-        bench.frame, bench.truth, bench.report = frame, truth, kept.report
-        bench.lab_from_body = truth.lab_from_body
-        return replace(kept.view, pixels=pixels.encoded(frame.image_dn))
+            self.render()
+            assert bench.frame is not None
+            return replace(kept.view, pixels=pixels.encoded(bench.frame.image_dn))
+        self.file.seek(kept.place[0])
+        return replace(kept.view, pixels=self.file.read(kept.place[1]))
+
+    def render(self) -> None:
+        """Render the shown frame with its truth, unless another frame of the scene has been rendered since."""
+        if self.shown is None or self.bench.frame is not None:
+            return
+        assert self.moved is not None
+        kept, bench = self.frames[self.shown], self.bench
+        bench.frame, bench.truth = exposure.render_frame(self.moved, self.shown, exposure_s=kept.view.exposure_s)
+        bench.report = kept.report
 
 
 def frame_row(view: FrameView) -> FrameRow:

@@ -149,6 +149,8 @@ class Worker:
         """The files of the image on the page."""
         if self.other is not None and self.image is not None:
             return export.photo_files(self.other, self.image)
+        if self.flight:
+            self.flight.render()
         return export.frame_files(self.workbench, self.scene, dict(self.overrides or {}))
 
     def solve_file(self, name: str, data: bytes, fov_deg: float | None, stages: photo.Stages = ()) -> photo.Photo:
