@@ -374,9 +374,9 @@ def test_f6_configures_image_processing_without_keys_that_have_no_effect(page: A
     focused(page, "tracker.detector")
     onto_the_page(page)
     identified = status(page, "solved")
-    set_to(page, "tracker.threshold_sigma", "40")
+    set_to(page, "tracker.threshold_sigma", "9")
     assert come(lambda: status(page, "solved") != identified)
-    assert come(lambda: "tracker.threshold_sigma%3D40" in page.url)
+    assert come(lambda: "tracker.threshold_sigma%3D9" in page.url)
     choose_stage(page, "detector", "thesis")
     page.get_by_label("tracker.threshold_sigma", exact=True).wait_for(state="detached")
     assert page.get_by_label("tracker.min_area_px", exact=True).count() == 0
