@@ -41,6 +41,8 @@ OUT_OF_REACH = {
     "skysim.scene.loader.load_scene": "the same",
     "skysim.core.paths.title_of": "two lines of a file that lies in a folder of ours",
     "skysim.apps.gui.worker.export.frame_files": "copies a run's files",
+    "skysim.apps.gui.page.frame.served.ServedFrame.levels": "pixels of our own frames",
+    "skysim.apps.gui.page.frame.served.ServedFrame.saturation_level": "their header",
     "skysim.apps.gui.page.panels.monte_carlo.MonteCarloPanel.study_file": OURS,
     "skysim.apps.gui.page.shell.history.History.read": "the page's address, which `View.from_query` checks",
     "skysim.apps.gui.worker.study_process.monte_carlo": "values of the page's form, checked by `loader.load`",
