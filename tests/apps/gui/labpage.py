@@ -209,6 +209,16 @@ def set_to(page: Any, name: str, value: str) -> None:
     changed(page, frame)
 
 
+def simulate(page: Any, frames: int) -> None:
+    """Begin to compute a flight of so many frames."""
+    panel(page, "Scene")
+    page.get_by_placeholder("find a key").fill("exposure.frames")
+    set_to(page, "exposure.frames", str(frames))
+    onto_the_page(page)
+    panel(page, "Run")
+    page.get_by_role("button", name="Simulate").click()
+
+
 def onto_the_page(page: Any) -> None:
     """Leave the field that was typed in."""
     page.locator(".lab-frame").click(position={"x": 5, "y": 5})

@@ -94,7 +94,7 @@ def test_the_worker_of_a_closed_tab_is_the_next_one_s_unless_it_is_busy(
         second = await waiting
         assert (second is first) == answers
         assert Hand.alive == {second}
-        await spare.take_back(second)  # nobody waits
+        await spare.take_back(second)  # no tab waits
         assert Hand.alive == set()
 
     asyncio.run(asyncio.wait_for(story(), 10))

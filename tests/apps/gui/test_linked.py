@@ -18,12 +18,11 @@ from labpage import (
     chosen,
     come,
     exported,
-    onto_the_page,
     opened,
     panel,
     pictured,
     screen,
-    set_to,
+    simulate,
     status,
 )
 
@@ -191,12 +190,7 @@ DOT = """() => { const canvas = document.querySelector(".lab-dots"), dots = getE
 @in_browser
 def test_a_dot_of_a_strip_lights_up_its_light_and_a_light_its_dots(browser: Any, server: Server) -> None:
     with opened(browser, server.login, NARROW) as page:
-        panel(page, "Scene")
-        page.get_by_placeholder("find a key").fill("exposure.frames")
-        set_to(page, "exposure.frames", "5")
-        onto_the_page(page)
-        panel(page, "Run")
-        page.get_by_role("button", name="Simulate").click()
+        simulate(page, 5)
         page.get_by_text(re.compile(r"5/5$")).wait_for()
         for _ in range(10):  # room for all strips
             page.get_by_role("separator", name="Height of the 3-D view").press("ArrowUp")

@@ -21,7 +21,7 @@ from labpage import (
     opened,
     panel,
     pictured,
-    set_to,
+    simulate,
     source,
     status,
 )
@@ -35,12 +35,7 @@ def test_a_dome_is_flown_played_sought_and_its_loop_opened(page: Any) -> None:
     chosen(page, "Scene", "simsat_slew")
     page.get_by_text("SimSat slews on its reaction wheels").wait_for()
     status(page, "solved")
-    panel(page, "Scene")
-    page.get_by_placeholder("find a key").fill("exposure.frames")
-    set_to(page, "exposure.frames", "8")
-    onto_the_page(page)
-    panel(page, "Run")
-    page.get_by_role("button", name="Simulate").click()
+    simulate(page, 8)
     page.get_by_text(re.compile(r"^(motion|frames): ")).wait_for()
     frame = source(page)
     page.keyboard.press("ArrowRight")

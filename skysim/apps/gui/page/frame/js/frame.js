@@ -85,6 +85,7 @@ export default {
   methods: {
     // From the server.
 
+    setContents,
     show(view) {
       this.wanted = view;
       this.update();
@@ -104,10 +105,6 @@ export default {
     },
 
     // Pixels.
-
-    setContents,
-
-    setContents,
 
     // Fetch the newest view, while up to AHEAD others are fetched or drawn; draw them in their order.
     update() {
@@ -308,14 +305,13 @@ export default {
       this.writeReadout();
     },
     paintLoupe() {
-      const corner = this.loupeAt(), dn = [];
+      const corner = this.loupeAt();
       if (!corner) return this.clearLoupe();
-      const [x, y] = corner, { across, down } = LOUPE, { step } = this.drawn.pixels;
-      for (let row = y; row < y + down; row++) for (let column = x; column < x + across; column++) dn.push(this.value(column, row));
-      const [width, height] = this.drawn.size, isThere = dn.every((value, n) => value !== null || n % across >= width || n / across >= height);
-      if (!isThere) return this.clearLoupe(); // the pixels of an earlier frame must not stay
-      const canvas = this.$refs.loupe, pen = this.sized(canvas);
+      const [x, y] = corner, { across, down } = LOUPE, { pixels: { step }, isWhole, near } = this.drawn;
+      if (!isWhole && !(near?.x === x && near.y === y)) return this.clearLoupe(); // no pixels of an earlier frame
+      const canvas = this.$refs.loupe, pen = this.sized(canvas), dn = [];
       if (!pen) return;
+      for (let row = y; row < y + down; row++) for (let column = x; column < x + across; column++) dn.push(this.value(column, row) ?? 0);
       const low = Math.min(...dn), range = Math.max(Math.max(...dn) - low, step);
       const gray = (value) => Math.round(255 * Math.sqrt((value - low) / range));
       const crosses = this.drawn.lights.filter((light) => light[3]);
