@@ -7,7 +7,7 @@ bounds the exposure time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 from skysim.core.errors import InputError
@@ -219,6 +219,15 @@ def check(plan: Plan, points: Iterable[CheckedPoint], resolve: Resolve) -> None:
             raise InputError(text if key.startswith(TRIAL) else f"set: {text}")
         if not has_effect_elsewhere(plan, fault.point, key, resolve):
             raise InputError(f"factors.{name}: {level}: {text}")
+
+
+def unused_overrides(overrides: Mapping[str, str], scene: Scene, trial: Trial) -> set[str]:
+    """The overrides of a scene that have no effect on a trial.
+
+    scene : with the overrides
+    """
+    keys = {key: unused.override_keys({key: text}) for key, text in overrides.items()}
+    return {key for key, below in keys.items() if all(unused.find(RULES, [one], scene, scene, trial) for one in below)}
 
 
 def find(key: str, plan: Plan, point: CheckedPoint) -> Fault | None:

@@ -160,6 +160,11 @@ def status(page: Any, starts: str) -> str:
     return str(found.first.inner_text())
 
 
+def address(page: Any) -> str:
+    """The address now. `page.url` keeps the former one until Playwright has handled the browser's messages."""
+    return str(page.evaluate("location.href"))
+
+
 def angles(page: Any) -> np.ndarray:
     """The three typed angles."""
     return np.array([float(page.get_by_label(f"angle {n}").input_value()) for n in (1, 2, 3)])

@@ -141,7 +141,7 @@ def test_the_theme_and_the_splitter_are_remembered(tab_of_own: Any) -> None:
     def toggle() -> None:
         page.keyboard.press("Control+k")
         page.get_by_label("Action").fill("theme")
-        page.get_by_role("option").first.click()
+        page.get_by_role("option").filter(has_text="theme").click()
         page.get_by_role("dialog").wait_for(state="detached")
 
     dark, before = ground(), wide()

@@ -10,6 +10,8 @@ from skysim.core.errors import InputError
 from skysim.experiments.study import loader, unused_options
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.setups import build_setup
+from skysim.experiments.study.plan import CentroidTrial, FrameTrial
+from skysim.scene.loader import load
 
 DOME = "{kind: frames, tilt_deg: [0, 10]}"
 CENTROIDS = "{kind: centroids, tilt_deg: [0, 10]}"
@@ -163,3 +165,16 @@ def test_what_is_refused_changes_no_outcome(
     assert outcomes[0].status == "solved"
     for key in change:
         assert any(unused_options.unused.section_of(key, rule) for rule in unused_options.RULES)
+
+
+def test_overrides_without_effect_on_a_trial() -> None:
+    overrides = {
+        "light.limit_mag": "5",
+        "camera.detector": "{read_noise_e: 20}",
+        "camera.focal_length": "25 mm",
+        "tracker": "{threshold_sigma: 9, identifier: pyramid}",
+    }
+    scene = load("shefex2", overrides)
+    unused = unused_options.unused_overrides(overrides, scene, CentroidTrial(kind="centroids"))
+    assert unused == {"camera.detector"}
+    assert unused_options.unused_overrides(overrides, scene, FrameTrial(kind="frames")) == set()

@@ -25,9 +25,10 @@ from skysim.apps.gui.worker.study_process import (
 from skysim.core.errors import InputError
 from skysim.core.io import files
 from skysim.core.paths import STUDIES, title_of
-from skysim.experiments.study import loader
-from skysim.experiments.study.plan import Plan
+from skysim.experiments.study import loader, unused_options
+from skysim.experiments.study.plan import Plan, TrialSection
 from skysim.experiments.study.store import STORE
+from skysim.scene.loader import load
 
 if TYPE_CHECKING:
     from skysim.apps.gui.page.page import Tab
@@ -146,6 +147,9 @@ class MonteCarloPanel:
         self.stopped = False
         self.note.set_text("starting …")
         self.tab.log(f"study {path.stem}: {study.trials} trials")
+        unused = [] if self.study_select.value else sorted(self.tab.overrides.keys() - study.spec.base.keys())
+        if unused:
+            self.tab.show_message(f"trials of {self.kind.value} do not use {', '.join(unused)}", "quiet")
         self.tab.set_state(study=self.process.folder.name)
         resumable = (self.process.folder / STORE).is_file()
         await self.process.start(path, "resume" if resumable else "run")
@@ -167,7 +171,7 @@ class MonteCarloPanel:
             trial |= {"false_lights": int(self.false_lights.value or 0)}
         if not (self.count.value and 1 <= self.count.value <= 100_000):
             raise InputError("runs: allowed: 1 to 100000")
-        settings = self.tab.scene_path, self.tab.overrides, trial, int(self.count.value)
+        settings = self.tab.scene_path, self.effective_overrides(trial), trial, int(self.count.value)
         # A stopped run with unchanged settings is resumed from its own file.
         before = self.process.folder / "monte_carlo.yaml"
         if self.stopped and before.is_file() and before.read_text() == monte_carlo(*settings, self.run_number):
@@ -177,6 +181,13 @@ class MonteCarloPanel:
         folder = files.make_folder(self.tab.out / f"{PAGE_STUDY}{self.tab.user}_{self.tab.id}_{self.run_number}")
         files.write_text(folder / "monte_carlo.yaml", text)
         return folder / "monte_carlo.yaml"
+
+    def effective_overrides(self, trial: dict[str, Any]) -> dict[str, str]:
+        """The changes of the scene that have an effect on a trial; a study with others would be refused."""
+        overrides, section = self.tab.overrides, TrialSection.model_validate({"trial": trial})
+        scene = load(self.tab.scene_path, overrides)
+        unused = unused_options.unused_overrides(overrides, scene, section.trial)
+        return {key: text for key, text in overrides.items() if key not in unused}
 
     def show_end(self, fault: str) -> None:
         self.button.set_text("Start")
