@@ -92,12 +92,12 @@ class Server:
 
     def workers(self) -> list[psutil.Process]:
         """Its worker processes, the oldest first."""
-        found = [one for one in self.process.children() if "spawn_main" in " ".join(one.cmdline())]
-        return sorted(found, key=psutil.Process.create_time)
+        templates = [one for one in self.process.children() if "gui.template" in " ".join(one.cmdline())]
+        return sorted((one for template in templates for one in template.children()), key=psutil.Process.create_time)
 
     def cpu_s(self) -> float:
         """Processor time of it and its workers."""
-        return sum(cpu_s(one) for one in [self.process, *self.process.children()])
+        return sum(cpu_s(one) for one in [self.process, *self.process.children(recursive=True)])
 
     def settle(self, workers: int) -> None:
         """Wait until it has so many workers, and all of them wait for work."""
@@ -207,13 +207,13 @@ def speed(tabs: Any, server: Server, size: tuple[int, int]) -> list[dict[str, An
     """Opening, keys and playing on a screen of a size."""
     screen = f"{size[0]} x {size[1]}"
     say(screen)
-    server.settle(1)
+    server.settle(0)
     page = new_page(tabs, size)
     traffic, begin = Traffic(page), time.monotonic()
     page.goto(server.url)
     shown(page)
     open_s = time.monotonic() - begin
-    server.settle(2)
+    server.settle(1)
     page.evaluate(WATCH)
     held = measured(page, server, traffic, partial(hold, page))
     page.wait_for_timeout(500)
@@ -310,7 +310,7 @@ def memory(tabs: Any, server: Server) -> dict[str, Any]:
     levels = []
     for tab in range(WARM_TABS + TABS):
         opened(tabs, server).close()
-        server.settle(1)
+        server.settle(0)
         levels.append(server.memory_mb())
         say(f"tab {tab + 1}: {levels[-1]:.1f} MB")
     return growth(f"memory over {TABS} tabs", levels[WARM_TABS:])
@@ -320,7 +320,7 @@ def playing(tabs: Any, server: Server) -> dict[str, Any]:
     """Growth of the memory of server and worker while a flight plays again and again."""
     page = opened(tabs, server)
     simulate(page)
-    server.settle(2)
+    server.settle(1)
     page.evaluate(WATCH)
     levels, end = [], time.monotonic() + PLAY_S
     ended = page.get_by_role("button", name="Play").locator("i", has_text="play_arrow")

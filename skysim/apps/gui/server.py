@@ -25,7 +25,7 @@ from starlette.routing import Route, Router
 from skysim.apps.gui.page.frame.sensor import FRAMES
 from skysim.apps.gui.page.page import Tab
 from skysim.apps.gui.page.panels.photo import LIMIT_BYTES
-from skysim.apps.gui.worker.session import SpareWorker
+from skysim.apps.gui.worker.session import Workers
 from skysim.apps.gui.worker.study_process import StudyProcess, is_shown
 from skysim.scene.loader import find
 
@@ -201,12 +201,11 @@ async def close(tab: Tab) -> None:
 
 
 def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers: int) -> None:
-    """Register all routes, with a spare worker ready for the next tab."""
-    spare = SpareWorker(str(find(scene).resolve()), workers)
+    """Register all routes, and prepare the workers of tabs."""
+    pool = Workers(workers)
     app.on_startup(be_patient)
     app.on_startup(freeze)
-    app.on_startup(spare.start)
-    app.on_shutdown(spare.close)
+    app.on_startup(partial(pool.prepare, str(find(scene).resolve())))
     app.on_shutdown(stop_studies)
 
     @app.get("/report/{name}")
@@ -227,12 +226,11 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
         except TimeoutError:  # no browser has connected: start no worker
             return
         client.on_delete(partial(close, tab))
-        session = await spare.wait(lambda: tab.is_open, lambda text: tab.sensor.show_waiting(text, QUEUED))
+        session = await pool.wait(lambda: tab.is_open, lambda text: tab.sensor.show_waiting(text, QUEUED))
         if session is None:  # the tab was closed while it waited
             return
-        tab.session, tab.new_session, tab.give_back = session, spare.take, spare.take_back
+        tab.session, tab.new_session = session, pool.take
         await tab.start()
-        spare.start()
 
 
 def serve(

@@ -22,17 +22,9 @@ class Hand:
     """In place of a worker process."""
 
     alive: ClassVar[set[Any]] = set()
-    answers = True
 
     def __init__(self) -> None:
         self.alive.add(self)
-        self.process = self
-
-    def is_alive(self) -> bool:
-        return True
-
-    async def renew(self) -> bool:
-        return self.answers
 
     def close(self) -> None:
         self.alive.discard(self)
@@ -43,11 +35,12 @@ def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(monkeypa
     monkeypatch.setattr(session, "Session", Hand)
     monkeypatch.setattr(session, "QUEUE_S", 0.001)
     monkeypatch.setattr(Hand, "alive", set())
-    spare, served, told = session.SpareWorker("scene", WORKERS), list[tuple[int, Hand | None]](), dict[int, str]()
+    workers, served, told = session.Workers(WORKERS), list[tuple[int, Hand | None]](), dict[int, str]()
     gone = set[int]()
 
     async def tab(number: int) -> None:
-        served.append((number, await spare.wait(lambda: number not in gone, lambda text: told.update({number: text}))))
+        got = await workers.wait(lambda: number not in gone, lambda text: told.update({number: text}))
+        served.append((number, got))
 
     async def story() -> None:
         tabs = [asyncio.create_task(tab(number)) for number in range(TABS)]
@@ -71,33 +64,9 @@ def test_tabs_get_workers_in_their_order_and_one_that_leaves_makes_room(monkeypa
             assert len(Hand.alive) == WORKERS
         gone.add(TABS)
         await tabs[TABS]
-        assert spare.queue == []
+        assert workers.queue == []
 
     asyncio.run(asyncio.wait_for(story(), 60))
-
-
-@pytest.mark.parametrize("answers", [True, False])
-def test_the_worker_of_a_closed_tab_is_the_next_one_s_unless_it_is_busy(
-    monkeypatch: pytest.MonkeyPatch, answers: bool
-) -> None:
-    monkeypatch.setattr(session, "Session", Hand)
-    monkeypatch.setattr(session, "QUEUE_S", 0.001)
-    monkeypatch.setattr(Hand, "alive", set())
-    monkeypatch.setattr(Hand, "answers", answers)
-
-    async def story() -> None:
-        spare = session.SpareWorker("scene", 1)
-        first = await spare.wait(lambda: True, print)
-        waiting = asyncio.create_task(spare.wait(lambda: True, lambda _: None))
-        await asyncio.sleep(0)
-        await spare.take_back(first)
-        second = await waiting
-        assert (second is first) == answers
-        assert Hand.alive == {second}
-        await spare.take_back(second)  # no tab waits
-        assert Hand.alive == set()
-
-    asyncio.run(asyncio.wait_for(story(), 10))
 
 
 @pytest.mark.browser

@@ -18,8 +18,11 @@ from nicegui.page import page
 from skysim.apps.gui.page.page import Tab
 
 
-async def ignore(_: object) -> None:
-    """Take a worker back."""
+class Hand:
+    """In place of a worker process."""
+
+    def close(self) -> None:
+        """End."""
 
 
 def test_a_closed_page_is_freed(tmp_path: Path) -> None:
@@ -31,8 +34,7 @@ def test_a_closed_page_is_freed(tmp_path: Path) -> None:
         with client:
             tab = Tab("shefex2", tmp_path, tmp_path)
             tab.build()
-        tab.give_back = ignore
-        tab.session = object()  # type: ignore[assignment]
+        tab.session = Hand()  # type: ignore[assignment]
         client.on_delete(tab.close)
         freed = weakref.ref(tab)
         del tab

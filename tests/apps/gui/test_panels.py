@@ -9,7 +9,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -420,18 +419,27 @@ def test_a_host_is_told_with_or_without_its_port() -> None:
 
 
 @pytest.mark.slow
-def test_a_renewed_worker_shows_the_scene_s_start_and_nothing_of_the_last_tab() -> None:
-    worker = tasks.Worker()
-    _, start = worker.open("shefex2", {}, True)
-    worker.move(1.0, 0.0, 5.0, False)
-    kept = worker.workbench.testbed
-    worker.solve_file("sky.png", cv2.imencode(".png", np.eye(90, dtype=np.uint8) * 9)[1].tobytes(), None)
-    worker.renew()
-    assert (worker.other, worker.image, worker.flight) == (None, None, None)
-    _, again = worker.open("shefex2", {}, True)
-    assert again.angles_deg == start.angles_deg
-    assert worker.workbench.testbed is kept  # it is not set up again
-    assert worker.open("shefex2", {"camera.detector.noise": "false"}, True)[0].noise is False
+def test_a_worker_is_forked_with_its_scene_set_up_and_a_closed_one_leaves_nothing() -> None:
+    """Of two tabs' workers one points elsewhere; the other, forked afterwards, is at the scene's start."""
+
+    async def story() -> None:
+        scene = str(loader.find("shefex2").resolve())
+        first = Session()
+        try:
+            _, start = await first.run("open", scene, {}, True)
+            assert (await first.run("move", 1.0, 0.0, 5.0, True)).angles_deg != start.angles_deg
+            second = Session()
+            try:
+                assert (await second.run("open", scene, {}, True))[1].angles_deg == start.angles_deg
+            finally:
+                second.close()
+        finally:
+            first.close()
+        assert not first.process.is_alive()
+        assert not second.process.is_alive()
+        assert not Session.alive & {first, second}
+
+    asyncio.run(story())
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from labpage import (
     NARROW,
     TOKEN,
     Server,
+    address,
     angles,
     changed,
     chosen,
@@ -57,6 +58,7 @@ def test_a_dome_is_flown_played_sought_and_its_loop_opened(page: Any) -> None:
     with page.expect_download() as comes:
         page.get_by_role("button", name="CSV").click()
     assert comes.value.path().read_text().count("\n") == 9
+    assert come(lambda: re.search(r"t=1\.00", address(page)))
     page.reload()
     page.get_by_text(re.compile(r"^flight at 1\.00 s$")).wait_for()  # computed again
     page.keyboard.press("l")
@@ -108,15 +110,15 @@ def test_two_tabs_do_not_disturb_one_another(page: Any, second: Any) -> None:
 
 
 def test_closing_a_tab_ends_its_worker_and_its_study(page: Any, second: Any, server: Server) -> None:
-    assert come(lambda: len(server.children("spawn_main")) >= 3)  # two tabs; one waits for the next
+    assert server.come_to("gui.template", 3) == 3  # two tabs' and the one that they are forked from
     assert server.children("study")
     second.close()
     assert server.come_to("study", 0) == 0
-    assert server.come_to("spawn_main", 2) == 2
+    assert server.come_to("gui.template", 2) == 2
 
 
 def test_a_worker_that_is_killed_is_told_and_another_takes_its_place(page: Any, server: Server) -> None:
-    for worker in server.children("spawn_main"):
+    for worker in server.children("gui.template"):
         worker.kill()
     page.keyboard.press("1")
     panel(page, "Log")

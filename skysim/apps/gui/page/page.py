@@ -47,7 +47,7 @@ PANELS = ("Run", "Lights", "Scene", "Tracker", "Plan", "Monte Carlo", "Image", "
 class Tab:
     """One tab: its worker, its scene, and its page elements.
 
-    session : its worker, set when it has got one;  give_back : takes it when the tab is closed
+    session : its worker, set when it has got one
     new_session : gives another worker, None if there are too many
     folder : where scenes are saved;  out : where studies are;  cameras : live ones that it may watch
     user : its browser, see `server.user_of`
@@ -58,7 +58,6 @@ class Tab:
 
     session: Session
     new_session: Callable[[], Session | None]
-    give_back: Callable[[Session], Awaitable[None]]
 
     def __init__(self, scene: str, folder: Path, out: Path, cameras: Sequence[str] = (), user: str = "") -> None:
         self.id, self.user = secrets.token_hex(8), user
@@ -77,7 +76,7 @@ class Tab:
         FRAMES.pop(self.id, None)
         self.study_panel.process.stop(signal.SIGTERM)
         if hasattr(self, "session"):
-            await self.give_back(self.session)
+            await asyncio.to_thread(self.session.close)
 
     async def restart(self) -> None:
         """Show the view again with a new worker after the old one has ended."""

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 import multiprocessing
+import os
 import signal
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from typing import Any, ClassVar
 
 from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
-from skysim.experiments.study.execution.workers import environment, one_thread
 
+TEMPLATE = "skysim.apps.gui.template"  # module of the worker from which the others are forked
+SCENE = "SKYSIM_GUI_SCENE"  # environment variable: the scene that the template of the workers sets up
 QUEUE_S = 0.2  # between two looks for a free worker
-RENEW_S = 1.0  # for the last task of a tab that was closed
-OPENCV_LIMITS = {"OPENCV_IO_MAX_IMAGE_PIXELS": str(2**27)}  # environment: OpenCV refuses larger images
 
 
 class WorkerLost(Exception):
@@ -27,10 +29,8 @@ def serve(pipe: Connection) -> None:
     """Main loop of the worker: receives (task, arguments), sends ("ok", result) or ("error", message), until the pipe
     closes.
     """
-    from skysim.apps.gui.worker.tasks import Worker
-
+    worker = importlib.import_module(TEMPLATE).WORKER
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which closes the pipe
-    worker = Worker()
     while True:
         try:
             task, arguments = pipe.recv()
@@ -55,14 +55,18 @@ class Session:
     alive: ClassVar[set[Session]] = set()
 
     def __init__(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.pipe, worker_pipe = context.Pipe()
-        self.process = context.Process(target=serve, args=(worker_pipe,), daemon=True)
-        with one_thread(), environment(OPENCV_LIMITS):
-            self.process.start()
-        worker_pipe.close()
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload([TEMPLATE])
+        self.pipe, self.worker_pipe = context.Pipe()
+        self.process = context.Process(target=serve, args=(self.worker_pipe,), daemon=True)
         self.thread = ThreadPoolExecutor(1, "session")
+        self.thread.submit(self.start)
         Session.alive.add(self)
+
+    def start(self) -> None:
+        """Fork the worker; waits until the template is ready."""
+        with self.worker_pipe:
+            self.process.start()
 
     async def run(self, task: str, *arguments: Any) -> Any:
         """Run a task and return its result. Raises InputError for a user error, WorkerLost if the worker has ended."""
@@ -79,57 +83,35 @@ class Session:
             raise InputError(reply)
         return reply
 
-    async def renew(self) -> bool:
-        """Make the worker as new for another tab; False if it has ended or does not finish its task soon."""
-        try:
-            await asyncio.wait_for(self.run("renew"), RENEW_S)
-        except (TimeoutError, WorkerLost):
-            return False
-        return True
-
     def close(self) -> None:
         """End the worker; may take seconds."""
         Session.alive.discard(self)
-        self.process.terminate()
-        self.process.join(2.0)
-        self.pipe.close()
+        if self.process.pid:
+            self.process.terminate()
+            self.process.join(2.0)
+        self.pipe.close()  # a worker that starts meanwhile ends thereby
         self.thread.shutdown(wait=False, cancel_futures=True)
 
 
-class SpareWorker:
-    """Keeps a worker ready for the next tab, because its imports and compilation take seconds.
+class Workers:
+    """The workers of all tabs.
 
-    scene : file from which it solves a frame to warm up
-    limit : of workers at once, the spare one included
-    queue : of the tabs that wait for one, the first first
+    limit : of workers at once;  queue : of the tabs that wait for one, the first first
     """
 
-    def __init__(self, scene: str, limit: int) -> None:
-        self.scene, self.limit = scene, limit
-        self.next: Session | None = None
-        self.queue = list[object]()
+    def __init__(self, limit: int) -> None:
+        self.limit, self.queue = limit, list[object]()
 
-    def start(self) -> None:
-        if self.next is None and not self.queue and len(Session.alive) < self.limit:
-            self.next = Session()
-            self.next.thread.submit(self.next.call, "warm_up", (self.scene,))
+    @staticmethod
+    def prepare(scene: str) -> None:
+        """Start the process from which workers are forked, see `template`. scene : the file that it sets up"""
+        os.environ[SCENE] = scene
+        multiprocessing.get_context("forkserver").set_forkserver_preload([TEMPLATE])
+        forkserver.ensure_running()
 
     def take(self) -> Session | None:
-        """Return the spare worker, or else a new one; None if there are as many as the limit already."""
-        session, self.next = self.next, None
-        if session and session.process.is_alive():
-            return session
-        if session:
-            session.close()
+        """A new worker; None if there are as many as the limit already."""
         return Session() if len(Session.alive) < self.limit else None
-
-    async def take_back(self, session: Session) -> None:
-        """A tab was closed: its worker is for the next tab that waits, since starting another takes seconds; else end
-        it."""
-        if self.queue and self.next is None and await session.renew() and self.next is None:
-            self.next = session
-        else:
-            await asyncio.to_thread(session.close)
 
     async def wait(self, wanted: Callable[[], bool], tell: Callable[[str], None]) -> Session | None:
         """`take`, once it is this tab's turn; None if none is wanted any more. tell : gets what it waits for"""
@@ -147,7 +129,3 @@ class SpareWorker:
             return None
         finally:
             self.queue.remove(ticket)
-
-    def close(self) -> None:
-        if self.next:
-            self.next.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -68,14 +68,6 @@ class Worker:
         """Set up a scene, which a page will probably open, and solve a frame, so that code is imported and compiled."""
         self.current = Workbench.open(scene, {})
         self.current.render_at_rest(solve=True)
-
-    def renew(self) -> None:
-        """Forget the last tab; its scene stays set up, at its start, since the next one probably opens the same."""
-        self.release()
-        bench = self.current
-        self.__dict__.update(Worker().__dict__)
-        if bench:
-            self.current = replace(bench, lab_from_body=bench.testbed.trajectory.lab_from_body[0], frame=None)
 
     def open(
         self, scene: str, overrides: Mapping[str, str], solve: bool, angles_deg: Triple | None = None
