@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from nicegui import run, ui
+from pydantic import ValidationError
 
 from skysim.apps.gui.page import forms, keys
 from skysim.apps.gui.page.style import CURVE_COLORS, TOOLTIP, chart_color, format_number
@@ -184,7 +185,11 @@ class MonteCarloPanel:
 
     def effective_overrides(self, trial: dict[str, Any]) -> dict[str, str]:
         """The changes of the scene that have an effect on a trial; a study with others would be refused."""
-        overrides, section = self.tab.overrides, TrialSection.model_validate({"trial": trial})
+        overrides = dict(self.tab.overrides)
+        try:
+            section = TrialSection.model_validate({"trial": trial})
+        except ValidationError:  # the study's loader says in one line what is wrong
+            return overrides
         scene = load(self.tab.scene_path, overrides)
         unused = unused_options.unused_overrides(overrides, scene, section.trial)
         return {key: text for key, text in overrides.items() if key not in unused}
