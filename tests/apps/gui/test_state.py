@@ -13,6 +13,7 @@ from labpage import (
     CHROMIUM,
     NARROW,
     Server,
+    address,
     angles,
     changed,
     chosen,
@@ -117,10 +118,6 @@ def found_key(page: Any, key: str) -> Any:
     field = page.get_by_label(key, exact=True)
     field.wait_for()
     return field
-
-
-def address(page: Any) -> str:
-    return str(page.evaluate("location.href"))
 
 
 @pytest.mark.browser
