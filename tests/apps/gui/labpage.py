@@ -30,6 +30,7 @@ PICTURES = ROOT / "out" / "screenshots"
 SLOW_MS = 600_000  # a first compilation on a busy machine
 QUICK_MS = 90_000
 TOKEN = "right"
+STAGES = ("detector", "centroider", "identifier", "solver")
 WIDE, NARROW = {"width": 1920, "height": 1080}, {"width": 1280, "height": 800}
 
 
@@ -200,10 +201,15 @@ def chosen(page: Any, name: str, option: str) -> None:
 
 def choose_stage(page: Any, stage: str, algorithm: str) -> None:
     """Choose an algorithm of the tracker in the panel that F6 or F7 opens."""
+    key, first = ("F6", "detector") if stage in ("detector", "centroider") else ("F7", "identifier")
     onto_the_page(page)
-    page.keyboard.press("F6" if stage in ("detector", "centroider") else "F7")
+    page.keyboard.press(key)
+    # The panel takes the focus once its part is open; before, it would take it from what the test does next.
+    field = page.get_by_role("combobox", name=f"tracker.{first}")
+    assert come(lambda: field.evaluate("at => at.contains(document.activeElement)"))
     chosen(page, f"tracker.{stage}", algorithm)
-    page.get_by_text(re.compile("^stages")).filter(has_text=algorithm).wait_for()
+    before = "(default|[a-z_ ]+) · " * STAGES.index(stage)
+    page.get_by_text(re.compile(rf"^stages \(F6, F7\): {before}{algorithm}\b")).wait_for()
 
 
 def set_to(page: Any, name: str, value: str) -> None:

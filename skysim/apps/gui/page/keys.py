@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from nicegui import ui
+
 
 class Key(NamedTuple):
     """Keys as the browser names them, their action, and their label and description on the screen and in the help.
@@ -63,3 +65,12 @@ document.addEventListener("keydown", event => {
   if (ours.includes(event.key) && (named || !typing)) event.preventDefault();
 }, true);
 """ % [name for key in KEYS for name in key.keys if name.startswith(("F", "Arrow"))]
+
+
+def focus(field: ui.element) -> None:
+    """Give a field the keyboard focus at once.
+
+    Quasar's own method waits until open lists have closed. If their panel is left meanwhile, it waits until another
+    list closes, and then takes the focus from the page, whose keys no longer act.
+    """
+    field.client.run_javascript(f"getElement({field.id}).$el.querySelector('input').focus()")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from skysim.apps.gui.page import forms
+from skysim.apps.gui.page import forms, keys
 from skysim.apps.gui.page.settings.key_form import KeyForm
 
 if TYPE_CHECKING:
@@ -83,4 +84,4 @@ class TrackerPanel:
             self.form.expansions[group].open()
             entry = self.form.inputs.get(f"tracker.{'detector' if group == SENSOR else 'identifier'}")
             if entry:
-                ui.timer(FOCUS_S, lambda: entry.run_method("focus"), once=True)
+                ui.timer(FOCUS_S, partial(keys.focus, entry), once=True)

@@ -104,7 +104,7 @@ class Actions:
             self.tab.tracker_panel.open(action)
         elif action == "runs":
             self.tab.tabs.set_value("Monte Carlo")
-            self.tab.study_panel.count.run_method("focus")
+            keys.focus(self.tab.study_panel.count)
         elif action == "log":
             self.tab.tabs.set_value("Log")
         elif action == "help":
