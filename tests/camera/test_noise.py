@@ -10,19 +10,20 @@ from skysim.camera.detector import noise
 
 ROWS, COLUMNS = 1000, 1000
 N = ROWS * COLUMNS
+MEMORY = noise.scratch(COLUMNS)
 
 
 def drawn_counts(mean: float, seed: int = 0) -> np.ndarray:
     out = np.full((ROWS, COLUMNS), mean, np.float32)
     for row, state in zip(out, noise.seeds(np.random.default_rng(seed), ROWS), strict=True):
-        noise.count(row, state, noise.tables())
+        noise.count(row, state, noise.guide(), MEMORY)
     return out.astype(float)
 
 
 def drawn_normals(seed: int = 0) -> np.ndarray:
     out = np.empty((ROWS, COLUMNS), np.float32)
     for row, state in zip(out, noise.seeds(np.random.default_rng(seed), ROWS), strict=True):
-        noise.normal(row, state, noise.tables())
+        noise.normal(row, state, MEMORY)
     return out.astype(float)
 
 
@@ -52,18 +53,66 @@ def test_normal_numbers_are_normal() -> None:
     assert chi_square(bins, np.diff(stats.norm.cdf(edges))) > 1e-4
 
 
-def test_the_ziggurat_s_layers_have_one_area() -> None:
-    x = noise.ziggurat()
-    height = np.exp(-(x**2) / 2)
-    area = x[1:-1] * np.diff(height[1:])
-    tail = x[1] * height[1] + np.sqrt(2 * np.pi) * stats.norm.sf(x[1])
-    np.testing.assert_allclose(area, tail, rtol=1e-9, atol=0)
-    assert x[0] * height[1] == pytest.approx(tail, rel=1e-12)
+def test_the_logarithm_is_that_of_double_precision() -> None:
+    """Of mantissa and exponent as `normal` takes a number apart; relative, also near 1, where it vanishes."""
+    u = np.concatenate([np.geomspace(2.0**-32, 0.999, 2000), 1 - np.geomspace(2.0**-24, 0.3, 2000)]).astype(np.float32)
+    above = u.view(np.int32) - np.int32(noise.ROOT_HALF_BITS)
+    exponent = (above >> 23).astype(np.float32)
+    mantissa = ((above & 0x7FFFFF) + np.int32(noise.ROOT_HALF_BITS)).view(np.float32)
+    assert mantissa.min() >= np.sqrt(0.5) - 1e-7
+    assert mantissa.max() <= np.sqrt(2) + 1e-7
+    found = [noise._log(*each) for each in zip(mantissa, exponent, strict=True)]
+    np.testing.assert_allclose(found, np.log(u.astype(float)), rtol=3e-7, atol=0)
+
+
+def test_directions_are_all_of_the_circle_once() -> None:
+    """Words in equal steps: unit vectors whose angles, in order, are equally far apart."""
+    words = np.arange(-(2**31) + 2**20, 2**31, 2**21, dtype=np.int64).astype(np.int32)
+    x, y = np.array([noise._direction(word) for word in words]).T
+    np.testing.assert_allclose(np.hypot(x, y), 1, atol=3e-7)
+    angles = np.sort(np.arctan2(y, x))
+    np.testing.assert_allclose(np.diff(angles), 2 * np.pi / len(words), atol=2e-6)
+
+
+def test_the_least_uniform_numbers_have_the_law_s_tail() -> None:
+    """Radii beyond that of RARE steps: r^2 / 2 less its least value is exponential."""
+    steps = np.random.default_rng(4).integers(0, noise.RARE, 20_000).astype(np.int32)
+    radius = np.zeros(len(steps), np.float32)
+    noise._lengthen(radius, steps, np.uint64(5))
+    beyond = radius.astype(float) ** 2 / 2 + np.log(noise.RARE * 2.0**-31)
+    assert beyond.min() > -1e-5
+    assert stats.kstest(beyond, stats.expon.cdf).pvalue > 1e-3
+    above = np.array([noise.RARE, 2**30], np.int32)
+    radius = np.full(2, 7, np.float32)
+    assert noise._lengthen(radius, above, np.uint64(5)) == 5
+    assert (radius == 7).all()
+
+
+@pytest.mark.parametrize("width", [1, 2, 3, 7, 8, 9, 31, 33])
+def test_rows_of_any_width_have_the_law(width: int) -> None:
+    """Also the last pixel of an odd row, and where small and large means are side by side."""
+    memory, seeds = noise.scratch(width), noise.seeds(np.random.default_rng(width), 4000)
+    normals, counts = np.empty((4000, width), np.float32), np.empty((4000, width), np.float32)
+    means = np.where(np.arange(width) % 3 == 1, 40.0, 3.0)
+    counts[:] = means
+    for normal_row, count_row, seed in zip(normals, counts, seeds, strict=True):
+        noise.normal(normal_row, seed, memory)
+        noise.count(count_row, seed, noise.guide(), memory)
+    sigma = 1 / np.sqrt(4000)
+    assert np.abs(normals.mean(axis=0)).max() < 4.5 * sigma
+    assert np.abs(normals.var(axis=0) - 1).max() < 4.5 * np.sqrt(2) * sigma
+    assert (np.abs(counts.mean(axis=0) - means) < 4.5 * np.sqrt(means) * sigma).all()
+    assert (np.abs(counts.var(axis=0) / means - 1) < 4.5 * np.sqrt(2 + 1 / means) * sigma).all()
 
 
 def test_neighbors_and_rows_know_nothing_of_each_other() -> None:
     made = drawn_normals(3)
-    for a, b in ((made[:, 1:], made[:, :-1]), (made[1:], made[:-1]), (made[:, 7:], made[:, :-7])):
+    for a, b in (
+        (made[:, 1:], made[:, :-1]),
+        (made[1:], made[:-1]),
+        (made[:, 7:], made[:, :-7]),
+        (made[:, 500:], made[:, :500]),
+    ):
         for power in (1, 2):
             r = np.corrcoef(a.ravel() ** power, b.ravel() ** power)[0, 1]
             assert abs(r) < 4.5 / np.sqrt(a.size)
@@ -84,9 +133,9 @@ def test_a_seed_is_a_stream() -> None:
 
 def test_a_guide_is_certain_exactly_where_every_mean_of_its_row_gives_one_count() -> None:
     """n is certain where F(n - 1) of the least mean is below the bucket, and F(n) of the greatest mean above it."""
-    guide, bucket = noise.tables().guide, np.arange(noise.BUCKETS) / noise.BUCKETS
+    guide, bucket = noise.guide(), np.arange(noise.BUCKETS) / noise.BUCKETS
     counts = np.arange(80)
-    for k in (0, 1, 37, 128, 500, 1777, len(guide) - 1):
+    for k in (0, 1, 37, 128, 500, 1777, len(guide) - 2):
         low, high = k / noise.GUIDES_PER_E, (k + 1) / noise.GUIDES_PER_E
         below = stats.poisson.cdf(counts - 1, low)[:, None] <= bucket + 1e-12
         above = stats.poisson.cdf(counts, high)[:, None] >= bucket + 1 / noise.BUCKETS - 1e-12
@@ -94,6 +143,7 @@ def test_a_guide_is_certain_exactly_where_every_mean_of_its_row_gives_one_count(
         assert certain.sum(axis=0).max() == 1
         wanted = np.where(certain.any(axis=0), certain.argmax(axis=0), noise.AMBIGUOUS)
         np.testing.assert_array_equal(guide[k], wanted)
+    assert (guide[-1] == noise.LARGE).all()
 
 
 @pytest.mark.parametrize("mean", [10.0, 37.4, 1e3, 1e6])

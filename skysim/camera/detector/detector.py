@@ -25,6 +25,8 @@ from skysim.core.types import SourceTruth
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig, FrameTransferConfig, InterlineConfig, Shutter
 from skysim.sources.photometry import snr
 
+ROWS = 16  # that share memory for their random numbers
+
 
 @dataclass(frozen=True, slots=True)
 class Detector:
@@ -99,13 +101,13 @@ def expose(
     if not config.noise:
         return expectation(light_e, exposure_s, detector)
     count_seeds, read_seeds = noise.seeds(rng, len(light_e)), noise.seeds(rng, len(light_e))
-    constants, tables = readout_constants(config, exposure_s), noise.tables()
+    constants, guide = readout_constants(config, exposure_s), noise.guide()
     pattern, frame = (detector.sensitivity, detector.dark_e_s), np.empty(light_e.shape, np.uint16)
     # With no step between counting and read-out, one fused loop does both, with the same numbers.
     if not (config.particles or config.blooming == "column" or config.cti_parallel or config.cti_serial):
-        _count_and_read(light_e, *pattern, detector.column_offset_e, constants, count_seeds, read_seeds, tables, frame)
+        _count_and_read(light_e, *pattern, detector.column_offset_e, constants, count_seeds, read_seeds, guide, frame)
         return frame
-    _count(light_e, *pattern, constants, count_seeds, tables)
+    _count(light_e, *pattern, constants, count_seeds, guide)
     if config.particles:
         with added.watch(PARTICLES, light_e) if added else nullcontext():
             cosmic_rays.add_particles(light_e, exposure_s, detector.pixel_m, config.particles, rng)
@@ -115,7 +117,7 @@ def expose(
         np.minimum(light_e, config.full_well_e, out=light_e)
     if config.cti_parallel or config.cti_serial:
         charge_transfer.transfer_loss(light_e, config.cti_parallel, config.cti_serial)
-    _read_out(light_e, detector.column_offset_e, constants, read_seeds, tables, frame)
+    _read_out(light_e, detector.column_offset_e, constants, read_seeds, frame)
     return frame
 
 
@@ -169,7 +171,13 @@ def readout_constants(config: DetectorConfig, exposure_s: float) -> ReadoutConst
 
 @jit
 def _count_row(
-    row: Any, sensitivity: Any, dark_e_s: Any, constants: ReadoutConstants, seed: Any, tables: noise.Tables
+    row: Any,
+    sensitivity: Any,
+    dark_e_s: Any,
+    constants: ReadoutConstants,
+    seed: Any,
+    guide: Any,
+    memory: noise.Scratch,
 ) -> None:
     """Count electrons, light and dark together: Poisson, variance equal to the mean. One row, in place.
 
@@ -178,20 +186,20 @@ def _count_row(
     for x in range(row.size):
         # Interpolated images may be slightly negative (about 1e-6).
         row[x] = max(row[x], float32(0)) * sensitivity[x] + dark_e_s[x] * constants.exposure_s
-    noise.count(row, seed, tables)
+    noise.count(row, seed, guide, memory)
 
 
 @jit
 def _read_row(
-    row: Any, offset_e: Any, constants: ReadoutConstants, seed: Any, tables: noise.Tables, dn_row: Any
+    row: Any, offset_e: Any, constants: ReadoutConstants, seed: Any, memory: noise.Scratch, dn_row: Any
 ) -> None:
     """Convert charge to numbers: full well, column offset and read noise, nonlinearity, gain, rounding, clipping.
 
     Without blooming a well holds at most its capacity. The amplifier gives e (1 - nonlinearity e / full_well);
     DN = round(that / gain + offset), clipped to the converter's bits.
     """
-    noise_row = np.empty(row.size, np.float32)
-    noise.normal(noise_row, seed, tables)
+    noise_row = memory.normals
+    noise.normal(noise_row, seed, memory)
     for x in range(row.size):
         e = min(row[x], constants.well_e) + offset_e[x] + constants.noise_e * noise_row[x]
         dn = e * (float32(1) - constants.nonlinearity_per_e * e) * constants.dn_per_e + constants.offset_dn
@@ -199,26 +207,23 @@ def _read_row(
 
 
 @jit(parallel=True)
-def _count(
-    light_e: Any,
-    sensitivity: Any,
-    dark_e_s: Any,
-    constants: ReadoutConstants,
-    seeds: Any,
-    tables: noise.Tables,
-) -> None:
+def _count(light_e: Any, sensitivity: Any, dark_e_s: Any, constants: ReadoutConstants, seeds: Any, guide: Any) -> None:
     """Light to electrons, in place; see `_count_row`."""
-    for y in numba.prange(light_e.shape[0]):
-        _count_row(light_e[y], sensitivity[y], dark_e_s[y], constants, seeds[y], tables)
+    height, width = light_e.shape
+    for block in numba.prange((height + ROWS - 1) // ROWS):
+        memory = noise.scratch(width)
+        for y in range(block * ROWS, min((block + 1) * ROWS, height)):
+            _count_row(light_e[y], sensitivity[y], dark_e_s[y], constants, seeds[y], guide, memory)
 
 
 @jit(parallel=True)
-def _read_out(
-    electrons: Any, offset_e: Any, constants: ReadoutConstants, seeds: Any, tables: noise.Tables, frame: Any
-) -> None:
+def _read_out(electrons: Any, offset_e: Any, constants: ReadoutConstants, seeds: Any, frame: Any) -> None:
     """Electrons to digital numbers; see `_read_row`."""
-    for y in numba.prange(electrons.shape[0]):
-        _read_row(electrons[y], offset_e, constants, seeds[y], tables, frame[y])
+    height, width = electrons.shape
+    for block in numba.prange((height + ROWS - 1) // ROWS):
+        memory = noise.scratch(width)
+        for y in range(block * ROWS, min((block + 1) * ROWS, height)):
+            _read_row(electrons[y], offset_e, constants, seeds[y], memory, frame[y])
 
 
 @jit(parallel=True)
@@ -230,13 +235,16 @@ def _count_and_read(
     constants: ReadoutConstants,
     count_seeds: Any,
     read_seeds: Any,
-    tables: noise.Tables,
+    guide: Any,
     frame: Any,
 ) -> None:
     """`_count` and `_read_out` fused row by row: the same numbers, faster. Only if no charge leaves its row between."""
-    for y in numba.prange(light_e.shape[0]):
-        _count_row(light_e[y], sensitivity[y], dark_e_s[y], constants, count_seeds[y], tables)
-        _read_row(light_e[y], offset_e, constants, read_seeds[y], tables, frame[y])
+    height, width = light_e.shape
+    for block in numba.prange((height + ROWS - 1) // ROWS):
+        memory = noise.scratch(width)
+        for y in range(block * ROWS, min((block + 1) * ROWS, height)):
+            _count_row(light_e[y], sensitivity[y], dark_e_s[y], constants, count_seeds[y], guide, memory)
+            _read_row(light_e[y], offset_e, constants, read_seeds[y], memory, frame[y])
 
 
 def saturation_dn(config: DetectorConfig) -> float:
