@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, overload
+from typing import Any, Literal, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,41 @@ from skysim.results import stretch
 
 Triple = tuple[float, float, float]
 NAN = float("nan")
+LIMITS = ("automatic", "zscale", "min to max", "manual")  # of the display; the last are set in the browser
+
+
+class Display(NamedTuple):
+    """How the browser draws frames.
+
+    screen_px : width and height of its screen that a whole frame fills; (0, 0): all pixels are needed
+    limits : black and white, by one of LIMITS or in DN;  curve : between them, one of `stretch.CURVES`
+    near_px : column and row of the upper left pixel in the loupe, if it shows any
+    """
+
+    screen_px: tuple[int, int] = (0, 0)
+    limits: str | tuple[float, float] = LIMITS[0]
+    curve: str = next(iter(stretch.CURVES))
+    near_px: tuple[int, int] | None = None
+
+
+ALL_PIXELS = Display()
+
+
+@dataclass(frozen=True, slots=True)
+class Pixels:
+    """A frame's pixels for the browser, see `worker.pixels.pixels_for`.
+
+    data : the encoded pixels;  fields : what the browser draws beside them: limits, histogram, the loupe's pixels
+    display : that they are made for;  number : of the image in its worker
+    """
+
+    data: bytes
+    fields: dict[str, Any]
+    display: Display
+    number: int
+
+
+NO_PIXELS = Pixels(b"", {}, ALL_PIXELS, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,14 +159,12 @@ class Pose:
 class FrameView:
     """One rendered frame: image, true attitude, true lights, and the tracker's solution if the frame was solved.
 
-    pixels : see `worker.pixels.encoded`;  pose : where they point, with the scene's lens
-    saturation_dn : from which a pixel is saturated
+    pose : where its pixels point, with the scene's lens;  saturation_dn : from which a pixel is saturated
     body_wxyz : lab_from_body;  t_s : time in the motion that is played, else 0
     filter_arcsec : error of the filter during the motion
     innovation_arcsec : angle between the star tracker's attitude and the filter's
     """
 
-    pixels: bytes
     pose: Pose
     saturation_dn: float
     size_px: tuple[int, int]
@@ -145,6 +178,7 @@ class FrameView:
     t_s: float = 0.0
     filter_arcsec: float = NAN
     innovation_arcsec: float = NAN
+    pixels: Pixels = NO_PIXELS
 
 
 class PushedView(NamedTuple):

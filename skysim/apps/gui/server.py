@@ -23,6 +23,7 @@ from starlette.responses import FileResponse, PlainTextResponse, RedirectRespons
 from starlette.routing import Route, Router
 
 from skysim.apps.gui.page.frame.sensor import FRAMES
+from skysim.apps.gui.page.frame.served import display_of
 from skysim.apps.gui.page.page import Tab
 from skysim.apps.gui.page.panels.photo import LIMIT_BYTES
 from skysim.apps.gui.worker.session import Workers
@@ -42,7 +43,6 @@ REPORT_POLICY = (
 SECURITY_HEADERS = {"x-frame-options": "DENY", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
 # Noise is not compressible: gzip at its default level takes half a second for a frame.
 FRAME_HEADERS = {"cache-control": "no-store", "content-encoding": "identity"}
-NEAR = r"(\d{1,6}),(\d{1,6})"  # column and row of a pixel
 USER, USER_BYTES, YEAR_S = "skysim_user", 8, 365 * 86400  # cookie with the number of a browser
 QUEUED = "This page opens when another one has been closed."
 CONNECT_TIMEOUT_S = 50.0  # for a browser to load the page
@@ -50,17 +50,17 @@ RECONNECT_S = 6.0  # for a lost browser to reconnect, before its work ends
 PING_INTERVAL_S, PING_TIMEOUT_S = 5.0, 30.0  # of the connection; a busy machine answers late
 
 
-def frame(request: Request) -> Response:
+async def frame(request: Request) -> Response:
     """A frame of a tab, see `ServedFrame`; 404 if it is no longer among the newest.
 
-    Query: width, of the screen; limits, one of LIMITS; near, column and row of the loupe's corner
+    Query: see `display_of`, and `whole`: whether all pixels are needed
     """
     served = FRAMES.get(request.path_params["tab"], {}).get(request.path_params["number"])
     query = request.query_params
-    width, near = re.fullmatch(r"\d{1,6}", query.get("width", "0")), re.fullmatch(NEAR, query.get("near", ""))
-    if served is None or width is None:
+    display = display_of(query)
+    data = await served.response(display, "whole" in query) if served and display else None
+    if data is None:
         return Response(status_code=404)
-    data = served.response(int(width[0]), query.get("limits", ""), (int(near[1]), int(near[2])) if near else None)
     return Response(data, media_type="application/octet-stream", headers=FRAME_HEADERS)
 
 

@@ -18,13 +18,26 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 import httpx
 from astropy.io import fits
 
-from skysim.apps.gui.messages import Lights
+from skysim.apps.gui.messages import ALL_PIXELS, LIMITS, Display, Lights, Pixels
 from skysim.apps.gui.page.frame.live import Contents
 from skysim.apps.gui.page.frame.sensor import FRAMES
-from skysim.apps.gui.page.frame.served import BINS, HEADER_BYTES, ServedFrame, limits_of, reduced
+from skysim.apps.gui.page.frame.served import ServedFrame, display_of
 from skysim.apps.gui.server import Guard
-from skysim.apps.gui.worker import pixels
+from skysim.apps.gui.worker.pixels import (
+    BINS,
+    HEADER_BYTES,
+    SATURATED,
+    SHADES,
+    levels_of,
+    limits_of,
+    pixels_for,
+    shades,
+)
+from skysim.apps.gui.worker.session import WorkerLost
+from skysim.apps.gui.worker.tasks import Worker
 from skysim.results import stretch
+
+SCREEN = (77, 200)  # narrower than the frames
 
 
 def sky(seed: int, shape: tuple[int, int] = (120, 160)) -> np.ndarray:
@@ -36,59 +49,140 @@ def sky(seed: int, shape: tuple[int, int] = (120, 160)) -> np.ndarray:
 
 
 def decoded(data: bytes) -> tuple[dict[str, Any], np.ndarray]:
-    """Fields and pixels of a response, by its description in frame.js."""
+    """Fields and pixels of a response, by its description in pixels.js."""
     length = int.from_bytes(data[-4:], "little")
     fields = json.loads(data[-4 - length : -4])
-    numbers = np.frombuffer(data[HEADER_BYTES : -4 - length], np.uint16)
-    return fields, numbers.reshape(fields["grid"][::-1])
+    kind = np.uint8 if fields["shaded"] else np.uint16
+    return fields, np.frombuffer(data[HEADER_BYTES : -4 - length], kind).reshape(fields["grid"][::-1])
 
 
-def served(image: np.ndarray, saturation_dn: float = np.inf) -> ServedFrame:
-    return ServedFrame(pixels.encoded(image), image.shape[::-1], saturation_dn, {"label": "sky"})
+class Source:
+    """In place of a session: the worker shows an image of number 1, or has ended (None)."""
+
+    def __init__(self, image: np.ndarray | None) -> None:
+        self.image, self.display = image, ALL_PIXELS
+
+    async def run(self, task: str, *arguments: Any) -> Pixels | None:
+        if self.image is None:
+            raise WorkerLost
+        worker = Worker(shown=levels_of(self.image), number=1)
+        return getattr(worker, task)(*arguments)
+
+
+def served(image: np.ndarray, display: Display = ALL_PIXELS, saturation_dn: float = np.inf) -> ServedFrame:
+    pixels = pixels_for(display, levels_of(image), saturation_dn, 1)
+    return ServedFrame(pixels, {"label": "sky"}, Source(image))
+
+
+def response(frame: ServedFrame, display: Display, whole: bool = False) -> tuple[dict[str, Any], np.ndarray]:
+    return decoded(asyncio.run(frame.response(display, whole)))
 
 
 def test_all_pixels_arrive_unchanged_with_the_frame_s_fields() -> None:
     image = sky(1)
-    fields, levels = decoded(served(image, 4095.0).response(0, "automatic"))
+    fields, levels = response(served(image, saturation_dn=4095.0), ALL_PIXELS)
     np.testing.assert_array_equal(levels, image)
     assert fields["size"] == [160, 120]
     assert (fields["label"], fields["saturation"]) == ("sky", 4095)
-    assert decoded(served(image).response(0, "automatic"))[0]["saturation"] is None
+    assert response(served(image), ALL_PIXELS)[0]["saturation"] is None
 
 
-@pytest.mark.parametrize("limits", ["automatic", "zscale", "min to max", "manual"])
-def test_fewer_pixels_have_the_same_limits_and_histogram(limits: str) -> None:
-    whole, fewer = (decoded(served(sky(2)).response(width, limits)) for width in (0, 77))
+@pytest.mark.parametrize("limits", [*LIMITS, (90.0, 300.0)])
+def test_fewer_pixels_have_the_same_limits_and_histogram(limits: str | tuple[float, float]) -> None:
+    display = Display(SCREEN, limits)
+    frame = served(sky(2), display)
+    fewer, whole = (response(frame, display, whole) for whole in (False, True))
+    np.testing.assert_array_equal(whole[1], sky(2))
     assert fewer[1].shape == (58, 77)
     assert [fewer[0][name] for name in ("limits", "histogram")] == [whole[0][name] for name in ("limits", "histogram")]
 
 
-def test_a_reduced_pixel_is_the_mean_over_its_area() -> None:
-    image = sky(3)
-    np.testing.assert_allclose(reduced(image, 40, np.inf), image.reshape(30, 4, 40, 4).mean(axis=(1, 3)), atol=0.5)
-    odd = reduced(image, 77, np.inf)  # areas that share pixels
-    assert odd.mean() == pytest.approx(image.mean(), abs=0.6)
+def test_all_pixels_come_from_the_worker_if_it_still_has_them() -> None:
+    display, image = Display(SCREEN), sky(2)
+    frame = served(image, display)
+    zoomed = Display()
+    np.testing.assert_array_equal(response(frame, zoomed)[1], image)
+    assert frame.source.display == zoomed  # the worker makes the next frame so
+    pixels = pixels_for(display, levels_of(image), np.inf, 2)
+    for worker in (Source(image), Source(None)):  # it shows another one, and it has ended
+        assert asyncio.run(ServedFrame(pixels, {}, worker).response(display, whole=True)) is None
+
+
+def test_other_limits_come_with_all_pixels() -> None:
+    frame = served(sky(2))
+    assert response(frame, Display((0, 0), "min to max"))[0]["limits"] == [sky(2).min(), sky(2).max()]
+
+
+def reduced(image: np.ndarray, columns: int) -> np.ndarray:
+    """Means over areas, from their shades between 0 and 2540 without rounding in between."""
+    found = shades(image, columns, (0.0, 2540.0), np.inf, "linear")
+    return np.where(found == SATURATED, np.inf, found * 10.0)
+
+
+def test_a_shade_is_that_of_the_mean_over_its_area() -> None:
+    image = np.random.default_rng(3).integers(0, 2541, (120, 160)).astype(np.uint16)
+    np.testing.assert_allclose(reduced(image, 40), image.reshape(30, 4, 40, 4).mean(axis=(1, 3)), atol=5.6)
+    shares = [overlaps(length, count) for length, count in zip(image.shape, (58, 77), strict=True)]
+    means = shares[0] @ image @ shares[1].T  # areas that share pixels
+    np.testing.assert_allclose(reduced(image, 77), means, atol=5.6)
+    assert reduced(image.astype(np.uint8), 40).shape == (30, 40)
+
+
+def overlaps(length: int, count: int) -> np.ndarray:
+    """(count, length) share of each pixel of a row in each of as many equal areas, by their ends."""
+    ends, edges = np.arange(count + 1) * length / count, np.arange(length)
+    shared = np.minimum(ends[1:, None], edges + 1) - np.maximum(ends[:-1, None], edges)
+    return np.clip(shared, 0, None) * count / length
+
+
+@pytest.mark.parametrize("curve", stretch.CURVES)
+def test_shades_follow_the_curve_between_the_limits(curve: str) -> None:
+    image = np.repeat(np.arange(0, 500, dtype=np.uint16)[None], 2, axis=0).repeat(2, axis=1)
+    found = shades(image, 500, (100.0, 400.0), np.inf, curve)[0]
+    fraction = np.clip((np.arange(500) - 100) / 300, 0, 1)
+    np.testing.assert_array_equal(found, np.rint((SHADES - 1) * stretch.CURVES[curve](fraction)))
 
 
 def test_a_single_saturated_pixel_is_seen_in_the_reduced_frame() -> None:
     image = sky(4)
     image[51, 80], image[90, 83] = 4095, 4095  # the second is on the edge of two areas
-    fewer = reduced(image, 61, 4095)
-    assert np.argwhere(fewer >= 4095).tolist() == [[19, 30], [34, 31], [34, 32]]
+    found = shades(image, 61, (0.0, 100.0), 4095.0, "linear")
+    assert np.argwhere(found == SATURATED).tolist() == [[19, 30], [34, 31], [34, 32]]
+
+
+@pytest.mark.parametrize(
+    ("query", "display"),
+    [
+        ({}, Display()),
+        (
+            {"screen": "640,480", "limits": "zscale", "curve": "linear", "near": "5,6"},
+            Display((640, 480), "zscale", "linear", (5, 6)),
+        ),
+        ({"limits": "-1.5,2e3", "near": ""}, Display((0, 0), (-1.5, 2000.0))),
+        *[({"screen": screen}, None) for screen in ("x", "5", "-4,5", "1.5,2", "1000000,5")],
+        *[({"limits": limits}, None) for limits in ("other", "2,1", "1", "nan,2", "1,inf", "1,2,3", "")],
+        *[({"near": near}, None) for near in ("5", "5,6,7", "-1,3", "x,y")],
+        ({"curve": "other"}, None),
+    ],
+)
+def test_a_query_is_a_display_or_refused(query: dict[str, str], display: Display | None) -> None:
+    assert display_of(query) == display
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_zscale_is_astropy_s_and_the_others_are_those_of_pictures(seed: int) -> None:
     image = sky(seed, (70, 90 + seed))
-    np.testing.assert_allclose(limits_of(image, "zscale"), ZScaleInterval().get_limits(image), rtol=1e-12)
-    assert limits_of(image, "automatic") == stretch.display_levels(image)
-    assert limits_of(image, "min to max") == (image.min(), image.max())
+    levels = levels_of(image)
+    np.testing.assert_allclose(limits_of(levels, "zscale"), ZScaleInterval().get_limits(image), rtol=1e-12)
+    assert limits_of(levels, "automatic") == stretch.display_levels(image)
+    assert limits_of(levels, "min to max") == (image.min(), image.max())
+    assert limits_of(levels._replace(offset=-50.0, step=0.5), (100.0, 120.0)) == (300.0, 340.0)
 
 
 def test_the_histogram_s_axis_is_linear_in_the_sky_and_holds_all_pixels() -> None:
     """Half of the counts are below the sky's median; the axis ends at the extremes of all pixels."""
     image = sky(5, (640, 640))
-    found = decoded(served(image).response(0, "automatic"))[0]["histogram"]
+    found = response(served(image), ALL_PIXELS)[0]["histogram"]
     counts, (low, high) = np.array(found["counts"]), found["range"]
     assert (len(counts), low, high) == (BINS, image.min(), image.max())
     assert counts.sum() == 40 * 80
@@ -101,7 +195,8 @@ def test_the_histogram_s_axis_is_linear_in_the_sky_and_holds_all_pixels() -> Non
 
 def test_the_loupe_s_pixels_come_unchanged_with_a_reduced_frame() -> None:
     image = sky(6)
-    near = decoded(served(image).response(60, "automatic", (155, 40)))[0]["near"]
+    display = Display(SCREEN, near_px=(155, 40))
+    near = response(served(image, display), display)[0]["near"]
     assert (near["x"], near["y"]) == (155, 40)
     assert near["levels"] == image[40:51, 155:].tolist()  # as far as the frame reaches
 
@@ -111,7 +206,7 @@ def test_frames_are_served_to_logged_in_browsers_alone(monkeypatch: pytest.Monke
         raise AssertionError("not a frame")
 
     guard, image = Guard(nothing, ("*",), "right", 1), sky(8)
-    monkeypatch.setitem(FRAMES, "tab", {3: served(image)})
+    monkeypatch.setitem(FRAMES, "tab", {3: served(image), 4: served(image, Display((40, 40), near_px=(5, 6)))})
 
     async def answers(paths: Sequence[str], token: str) -> list[httpx.Response]:
         transport, cookies = httpx.ASGITransport(app=guard), {"skysim_gui_1": token}
@@ -119,15 +214,17 @@ def test_frames_are_served_to_logged_in_browsers_alone(monkeypatch: pytest.Monke
             return [await client.get(path) for path in paths]
 
     assert asyncio.run(answers(["/frame/tab/3"], "wrong"))[0].status_code == 401
-    paths = ["3?limits=zscale", "3?width=40&limits=automatic&near=5,6", "3?near=5,6,7"]
-    whole, fewer, odd = asyncio.run(answers([f"/frame/tab/{path}" for path in paths], "right"))
-    np.testing.assert_array_equal(decoded(whole.content)[1], image)
+    paths = ["3?limits=zscale", "4?screen=40,40&limits=automatic&near=5,6", "4?screen=40,40&whole=1"]
+    whole, fewer, rest = asyncio.run(answers([f"/frame/tab/{path}" for path in paths], "right"))
+    for answer in (whole, rest):
+        np.testing.assert_array_equal(decoded(answer.content)[1], image)
     assert whole.headers["cache-control"] == "no-store"
     fields, levels = decoded(fewer.content)
     assert (levels.shape, fields["near"]["x"]) == ((30, 40), 5)
-    assert "near" not in decoded(odd.content)[0]
-    wrong = ["/frame/tab/4", "/frame/other/3", "/frame/tab/x", "/frame/tab/3?width=x", "/frame/tab/3?width=-4"]
-    assert {answer.status_code for answer in asyncio.run(answers(wrong, "right"))} == {404}
+    wrong = ["tab/5", "tab/3?near=5,6,7", "other/3", "tab/x", "tab/3?screen=x", "tab/3?screen=-4,5"]
+    assert {answer.status_code for answer in asyncio.run(answers([f"/frame/{path}" for path in wrong], "right"))} == {
+        404
+    }
 
 
 def test_lights_are_a_sequence_that_is_sent_as_columns() -> None:

@@ -27,6 +27,7 @@ from skysim.apps.gui.page.frame.star_names import NAMES
 from skysim.apps.gui.server import Guard, host_of, report_path, user_of
 from skysim.apps.gui.worker import export, photo, pixels, playback, study_process, tasks, workbench
 from skysim.apps.gui.worker.photo import SUFFIXES
+from skysim.apps.gui.worker.scene import lens as lenses
 from skysim.apps.gui.worker.scene import pointing
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
@@ -269,27 +270,27 @@ def test_the_cursor_finds_true_lights_and_detections_whatever_is_marked() -> Non
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_whole_numbers_reach_the_browser_unchanged(dtype: type) -> None:
     image = np.random.default_rng(3).integers(0, np.iinfo(dtype).max + 1, (7, 9)).astype(dtype)
-    data = pixels.encoded(image)
+    data = pixels.levels_of(image).data()
     assert np.frombuffer(data, float, 2).tolist() == [0.0, 1.0]
     np.testing.assert_array_equal(np.frombuffer(data, dtype, offset=16).reshape(7, 9), image)
 
 
 def test_other_numbers_are_rounded_to_a_65535th_of_their_range() -> None:
     image = np.random.default_rng(3).normal(5.0, 100.0, (40, 50))
-    data = pixels.encoded(image)
+    data = pixels.levels_of(image).data()
     offset, step = np.frombuffer(data, float, 2)
     decoded = offset + step * np.frombuffer(data, np.uint16, offset=16).reshape(40, 50)
     assert step == pytest.approx(np.ptp(image) / 65535)
     np.testing.assert_allclose(decoded, image, rtol=0, atol=0.51 * step)
-    np.testing.assert_array_equal(np.frombuffer(pixels.encoded(np.full((2, 2), 7.5)), float, 2), [7.5, 1.0])
+    np.testing.assert_array_equal(np.frombuffer(pixels.levels_of(np.full((2, 2), 7.5)).data(), float, 2), [7.5, 1.0])
 
 
 def test_a_frame_s_pose_and_lens_lead_from_a_light_s_pixel_to_the_light() -> None:
     """Under the dome by the depth at which its ray meets the surface; under the stars by the rotation alone."""
     for scene, within_rad in (("afit_simsat", 2e-4), ("shefex2", 2e-5)):
         testbed = run.prepare(loader.load(scene, {"exposure.frames": "1", "motion.rate_deg_s": "[0, 0, 0]"}))
-        lens, (_, truth) = pixels.scene_lens(testbed), exposure.render_frame(testbed, 0)
-        pose = pixels.scene_pose(testbed, lens, truth)
+        lens, (_, truth) = lenses.scene_lens(testbed), exposure.render_frame(testbed, 0)
+        pose = lenses.scene_pose(testbed, lens, truth)
         camera = testbed.scene.camera
         nodes_px = [np.linspace(-0.5, size - 0.5, lens.n) for size in (camera.width_px, camera.height_px)]
 
@@ -453,12 +454,13 @@ def test_kept_frames_of_a_flight_are_those_that_are_rendered_again(monkeypatch: 
             pass
         assert [frame.place is None for frame in worker.flight.frames] == [kept_bytes == 0] * 2
         worker.flight_frame(0)
-        pixels_of.append(worker.flight_frame(1).pixels)
+        pixels_of.append(worker.flight_frame(1).pixels.data)
         exported.append(fits.getdata(BytesIO(worker.export()["frame.fits"])))
-    assert pixels_of[0] == pixels_of[1] == pixels.encoded(exported[0])
+    assert pixels_of[0] == pixels_of[1] == pixels.levels_of(exported[0]).data()
     np.testing.assert_array_equal(*exported)
     moved = worker.move(0.0, 0.0, 1.0, False)  # afterwards the export is of the live scene
-    assert pixels.encoded(fits.getdata(BytesIO(worker.export()["frame.fits"]))) == moved.pixels
+    exported_now = fits.getdata(BytesIO(worker.export()["frame.fits"]))
+    assert pixels.levels_of(exported_now).data() == moved.pixels.data
 
 
 @pytest.mark.long
@@ -520,7 +522,7 @@ def test_a_flight_is_that_of_the_command_line_and_its_frames_are_kept() -> None:
             files = await session.run("export")
             frame, _ = exposure.render_frame(testbed, 2)
             np.testing.assert_array_equal(fits.getdata(BytesIO(files["frame.fits"])), frame.image_dn)
-            assert view.pixels == pixels.encoded(frame.image_dn)
+            assert view.pixels.data == pixels.levels_of(frame.image_dn).data()
             with pytest.raises(InputError, match="the flight has no frame 4"):
                 await session.run("flight_frame", 4)
         finally:

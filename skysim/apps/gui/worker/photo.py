@@ -15,8 +15,8 @@ from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps import plate_solver
-from skysim.apps.gui.messages import NO_LIGHTS, Lens, Lights, Pose, TrackerResult, Triple
-from skysim.apps.gui.worker import pixels
+from skysim.apps.gui.messages import NO_LIGHTS, NO_PIXELS, Lens, Lights, Pixels, Pose, TrackerResult, Triple
+from skysim.apps.gui.worker.scene import lens as lenses
 from skysim.apps.gui.worker.workbench import (
     detection_views,
     id_prefix,
@@ -50,7 +50,7 @@ class Photo:
     result: TrackerResult
     solution: dict[str, Any]
     statistics: stretch.FrameStatistics
-    pixels: bytes = b""
+    pixels: Pixels = NO_PIXELS
     saturation_dn: float = math.inf
     lens: Lens | None = None
     pose: Pose | None = None
@@ -110,10 +110,9 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
         true_deg=scoring.angles_deg(truth.cam_from_lab, scene, setup.testbed.mount),
         lights=true_lights(truth, magnitude_by_id(setup.testbed)),
         prefix=id_prefix(setup.testbed),
-        pixels=pixels.encoded(frame.image_dn),
         saturation_dn=frame.saturation_dn,
-        lens=(lens := pixels.scene_lens(setup.testbed)),
-        pose=pixels.scene_pose(setup.testbed, lens, truth),
+        lens=(lens := lenses.scene_lens(setup.testbed)),
+        pose=lenses.scene_pose(setup.testbed, lens, truth),
     )
     return photo, frame.image_dn
 
@@ -134,8 +133,8 @@ def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoP
     height, width = image.shape
     saturation_dn = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
     statistics = stretch.frame_statistics(image, saturation_dn)
-    photo = Photo((width, height), result, solution, statistics, pixels=pixels.encoded(image))
+    photo = Photo((width, height), result, solution, statistics)
     if attitude.solved:
         camera = attitude.camera or tracker.camera
-        photo = replace(photo, lens=pixels.lens_of(camera), pose=pixels.solved_pose(attitude))
+        photo = replace(photo, lens=lenses.lens_of(camera), pose=lenses.solved_pose(attitude))
     return replace(photo, saturation_dn=saturation_dn), image

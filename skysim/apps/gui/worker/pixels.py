@@ -1,71 +1,193 @@
-"""Frames for the browser: their pixels as numbers, and where the pixels point."""
+"""A frame's pixels for the browser: all of them as numbers, or the shades of as many as its screen has.
+
+While frames follow one another the browser gets shades: sending and coloring a million numbers takes it longer than a
+frame lasts. Limits and histogram are those of the whole frame, so the picture does not change when it comes to rest and
+all pixels arrive.
+"""
 
 from __future__ import annotations
 
+import math
+from typing import Any, NamedTuple
+
+import numba
 import numpy as np
+from astropy.visualization import ZScaleInterval
+from numba import float32, int64
 from numpy.typing import NDArray
 
-from estimator.core.camera import Camera
-from estimator.core.types import Attitude
-from skysim.apps.gui.messages import Lens, Pose
-from skysim.core.types import Floats, Truth
-from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.testbed import Testbed
-from skysim.sources.dome.shell import surface
-from skysim.tracking.onboard_model import calibration
+from skysim.apps.gui.messages import Display, Pixels
+from skysim.core.jit import jit
+from skysim.results import stretch
 
-NODES = 13  # along each side of a frame, of the tables between which the browser interpolates
 LEVELS = 2**16 - 1
+HEADER_BYTES = 16
+SATURATED, SHADES = 255, 255  # the shade of saturated pixels, and the number of the others
+WORTHWHILE = 0.95  # of the columns, above which all pixels are sent
+BINS = 80  # of the histogram
+QUARTILE_SIGMA = 1.4826  # of a normal distribution, over the distance from quartile to median
+AXIS_MARGIN = 0.3  # on either side of it, in units of its axis
+ZSCALE_SAMPLES = 1000  # pixels, as in IRAF
+LOUPE_PX = 11  # most rows and columns in the loupe
 
 
-def encoded(image: NDArray) -> bytes:
-    """(H, W) pixels for frame.js: float64 offset and step, then an unsigned integer n each; value = offset + step n.
+class Levels(NamedTuple):
+    """An image as unsigned integers n: pixel = offset + step n.
 
-    Integers of 8 and 16 bits are exact; others are rounded to 65,535 steps between the least and the greatest value.
+    integers : (H, W), of 8 or 16 bits
     """
+
+    integers: NDArray
+    offset: float = 0.0
+    step: float = 1.0
+
+    def data(self) -> bytes:
+        """Offset and step as float64, then the integers."""
+        return header(self) + self.integers.tobytes()
+
+
+def levels_of(image: NDArray) -> Levels:
+    """The levels of an image: exact for integers of 8 and 16 bits; other numbers are rounded to 65,535 steps between
+    the least and the greatest value."""
     if image.dtype in (np.uint8, np.uint16):
-        return np.array([0.0, 1.0]).tobytes() + image.tobytes()
+        return Levels(image)
     low, high = float(image.min()), float(image.max())
     step = (high - low) / LEVELS or 1.0
-    return np.array([low, step]).tobytes() + np.rint((image - low) / step).astype(np.uint16).tobytes()
+    return Levels(np.rint((image - low) / step).astype(np.uint16), low, step)
 
 
-def lens_of(camera: Camera) -> Lens:
-    """Tables of the tangents x / z and y / z of a camera's pixels, from the frame's upper left to its lower right
-    corner."""
-    x = np.linspace(-0.5, camera.width_px - 0.5, NODES)
-    y = np.linspace(-0.5, camera.height_px - 0.5, NODES)
-    tangents = camera.tangents(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-    return Lens(NODES, *(tuple(column.tolist()) for column in tangents.T))
+def header(levels: Levels) -> bytes:
+    return np.array([levels.offset, levels.step]).tobytes()
 
 
-def scene_lens(testbed: Testbed) -> Lens:
-    """The tables of a scene's true camera."""
-    return lens_of(calibration(testbed.scene.camera))
+def levels_from(data: bytes, size_px: tuple[int, int]) -> Levels:
+    """The levels that `Levels.data` has encoded. size_px : width and height"""
+    offset, step = np.frombuffer(data, float, 2).tolist()
+    kind = np.uint8 if len(data) - HEADER_BYTES == math.prod(size_px) else np.uint16
+    return Levels(np.frombuffer(data, kind, offset=HEADER_BYTES).reshape(size_px[::-1]), offset, step)
 
 
-def scene_pose(testbed: Testbed, lens: Lens, truth: Truth) -> Pose:
-    """The true attitude of a frame's camera; under a dome also where its rays meet the surface."""
-    lab_from_cam = truth.cam_from_lab.inv()
-    rotation = tuple(lab_from_cam.as_matrix().ravel().tolist())
-    if not isinstance(testbed.scene.light, DomeConfig):
-        return Pose(rotation)
-    place_m = truth.lab_from_body.apply(testbed.mount.camera_body_m)
-    rays_cam = np.column_stack([lens.x, lens.y, np.ones(len(lens.x))])
-    length = np.linalg.norm(rays_cam, axis=1)
-    dome = surface.build_surface(testbed.scene.light.surface)
-    points_m = dome.meet(place_m, lab_from_cam.apply(rays_cam / length[:, None]))
-    depth_m = np.linalg.norm(points_m - place_m, axis=1) / length  # along the boresight; NaN where a ray meets nothing
-    return Pose(rotation, tuple(place_m.tolist()), tuple(rounded(depth_m)))
+def pixels_for(display: Display, levels: Levels, saturation_dn: float, number: int = 0) -> Pixels:
+    """What the browser gets of an image: offset and step of its levels, then these, or shades if its screen has fewer
+    columns than the image.
+
+    saturation_dn : from which a pixel is saturated;  number : of the image in its worker
+    """
+    integers, (height, width) = levels.integers, levels.integers.shape
+    limits = limits_of(levels, display.limits)
+    saturation = (saturation_dn - levels.offset) / levels.step
+    columns = columns_for(display, width, height)
+    shaded = 0 < columns < WORTHWHILE * width
+    drawn = shades(integers, columns, limits, saturation, display.curve) if shaded else integers
+    fields: dict[str, Any] = {
+        "size": (width, height),
+        "grid": drawn.shape[::-1],
+        "shaded": shaded,
+        "limits": limits,
+        "histogram": histogram(integers),
+        "saturation": saturation_dn if math.isfinite(saturation_dn) else None,
+    }
+    if display.near_px:
+        x, y = display.near_px
+        fields["near"] = {"x": x, "y": y, "levels": integers[y:, x:][:LOUPE_PX, :LOUPE_PX].tolist()}
+    return Pixels(header(levels) + drawn.tobytes(), fields, display, number)
 
 
-def rounded(depth_m: Floats) -> list[float | None]:
-    """Depths to 0.01 mm; None for a ray that meets nothing."""
-    return [None if np.isnan(value) else round(float(value), 5) for value in depth_m]
+def columns_for(display: Display, width: int, height: int) -> int:
+    """The columns of the screen that an image fills; 0 if all pixels are needed."""
+    return math.floor(width * min(display.screen_px[0] / width, display.screen_px[1] / height) + 0.5)
 
 
-def solved_pose(attitude: Attitude) -> Pose | None:
-    """The tracker's attitude of an image from elsewhere; None if it was not solved."""
-    if attitude.cam_from_ref is None:
-        return None
-    return Pose(tuple(attitude.cam_from_ref.inv().as_matrix().ravel().tolist()))
+def shades(
+    integers: NDArray, columns: int, limits: tuple[float, float], saturation: float, curve: str
+) -> NDArray[np.uint8]:
+    """The image in fewer columns: the mean over each area, from 0 (black) to SHADES - 1 (white).
+
+    An area with a saturated pixel is SATURATED.
+    """
+    height, width = integers.shape
+    rows = max(round(height * columns / width), 1)
+    low, high = limits
+    fraction = np.clip((np.arange(int(integers.max()) + 1) - low) / max(high - low, 1e-9), 0, 1)
+    table = np.rint((SHADES - 1) * stretch.CURVES[curve](fraction)).astype(np.uint8)
+    shaded = np.empty((rows, columns), np.uint8)
+    _shade(integers, table, shaded)
+    if len(table) - 1 >= saturation:
+        _mark(integers, math.ceil(max(saturation, 0.0)), shaded)
+    return shaded
+
+
+# Lengths are counted in units that divide both pixels and areas: a pixel is as high as there are rows of areas, and an
+# area as there are rows of pixels, so that no rounding assigns a pixel to an area that it does not overlap.
+
+
+@jit(parallel=True)
+def _shade(integers: Any, table: Any, shaded: Any) -> None:
+    """Write the shade of the mean over each area."""
+    height, width = integers.shape
+    rows, columns = shaded.shape
+    first, last = np.empty(columns, np.int32), np.empty(columns, np.int32)
+    head, tail = np.empty(columns, np.float32), np.empty(columns, np.float32)  # shares of the first and last pixel
+    for column in range(columns):
+        left, right = column * width, (column + 1) * width
+        first[column], last[column] = left // columns, (right - 1) // columns
+        head[column] = (min(right, (first[column] + 1) * columns) - left) / width
+        tail[column] = (right - last[column] * columns) / width if last[column] > first[column] else 0.0
+    inner = float32(columns / width)
+    for row in numba.prange(rows):
+        top, bottom = row * height, (row + 1) * height
+        total = np.zeros(width, np.float32)
+        for y in range(top // rows, (bottom - 1) // rows + 1):
+            share = float32((min(bottom, (y + 1) * rows) - max(top, y * rows)) / height)
+            line = integers[y]
+            for x in range(width):
+                total[x] += share * float32(line[x])
+        for column in range(columns):
+            mean = head[column] * total[first[column]] + tail[column] * total[last[column]]
+            for x in range(first[column] + 1, last[column]):
+                mean += inner * total[x]
+            shaded[row, column] = table[int64(mean + float32(0.5))]
+
+
+@jit
+def _mark(integers: Any, saturation: Any, shaded: Any) -> None:
+    """Mark the areas that a saturated pixel overlaps."""
+    height, width = integers.shape
+    rows, columns = shaded.shape
+    for y in range(height):
+        for x in range(width):
+            if integers[y, x] >= saturation:
+                top, bottom = y * rows // height, ((y + 1) * rows - 1) // height
+                left, right = x * columns // width, ((x + 1) * columns - 1) // width
+                shaded[top : bottom + 1, left : right + 1] = SATURATED
+
+
+def limits_of(levels: Levels, limits: str | tuple[float, float]) -> tuple[float, float]:
+    """Black and white level by name, or from values in DN."""
+    integers = levels.integers
+    if not isinstance(limits, str):
+        low, high = ((dn - levels.offset) / levels.step for dn in limits)
+        return low, high
+    if limits == "zscale":
+        samples = integers.ravel()[:: max(1, integers.size // ZSCALE_SAMPLES)][:ZSCALE_SAMPLES]
+        low, high = ZScaleInterval().get_limits(samples)
+        return float(low), float(high)
+    if limits == "min to max":
+        return float(integers.min()), float(integers.max())
+    return stretch.display_levels(integers)
+
+
+def histogram(integers: NDArray) -> dict[str, Any]:
+    """Counts of a sample of the pixels, in BINS of an axis that is an inverse hyperbolic sine about the sky, in units
+    of its scatter: linear there, logarithmic for stars.
+
+    sky, scatter : of the axis;  range : least and greatest value of all pixels, over which it reaches
+    """
+    sample = integers[:: 2 * stretch.SAMPLE_STRIDE, :: stretch.SAMPLE_STRIDE].astype(float)
+    low, high = float(integers.min()), float(integers.max())
+    below, sky = np.percentile(sample, (25, 50))
+    scatter = max(QUARTILE_SIGMA * float(sky - below), 1.0)
+    first, last = np.arcsinh((np.array([low, high]) - sky) / scatter)
+    ends = first - AXIS_MARGIN, last + AXIS_MARGIN
+    counts, _ = np.histogram(np.arcsinh((sample - sky) / scatter), BINS, ends)
+    return {"range": (low, high), "sky": float(sky), "scatter": scatter, "counts": counts.tolist()}

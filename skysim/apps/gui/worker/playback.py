@@ -67,7 +67,7 @@ class Flight:
             view = self.bench.frame_view(result.frame, result.truth, solved, sum(result.seconds.values()))
             t_s = exposure_window(self.moved.scene, result.frame.index, result.frame.exposure_s).open_s
             error, innovation = filter_errors(self.moved, result, t_s)
-            view = replace(view, pixels=b"", t_s=t_s, filter_arcsec=error, innovation_arcsec=innovation)
+            view = replace(view, t_s=t_s, filter_arcsec=error, innovation_arcsec=innovation)
             self.frames.append(KeptFrame(view, result.report, self.keep(result.frame)))
             yield len(self.frames), count
 
@@ -87,23 +87,23 @@ class Flight:
 
     def keep(self, frame: Frame) -> tuple[int, int] | None:
         """Write a frame's pixels to the end of the file, and return their place there; None if the file is full."""
-        data, begin = pixels.encoded(frame.image_dn), self.file.seek(0, 2)
+        data, begin = pixels.levels_of(frame.image_dn).data(), self.file.seek(0, 2)
         if begin + len(data) > KEPT_BYTES:
             return None
         self.file.write(data)
         return begin, len(data)
 
-    def show(self, index: int) -> FrameView:
-        """The view of a kept frame with its pixels; the scene is seen from there from now on."""
+    def show(self, index: int) -> tuple[FrameView, pixels.Levels]:
+        """The view of a kept frame and its pixels; the scene is seen from there from now on."""
         kept, bench = self.frames[index], self.bench
         self.shown, bench.frame = index, None
         bench.lab_from_body = quaternion.to_rotation(np.array(kept.view.body_wxyz))
         if kept.place is None:
             self.render()
             assert bench.frame is not None
-            return replace(kept.view, pixels=pixels.encoded(bench.frame.image_dn))
+            return kept.view, pixels.levels_of(bench.frame.image_dn)
         self.file.seek(kept.place[0])
-        return replace(kept.view, pixels=self.file.read(kept.place[1]))
+        return kept.view, pixels.levels_from(self.file.read(kept.place[1]), kept.view.size_px)
 
     def render(self) -> None:
         """Render the shown frame with its truth, unless another frame of the scene has been rendered since."""

@@ -11,10 +11,13 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
+
+if TYPE_CHECKING:  # the template sets the environment of numba before it is imported
+    from skysim.apps.gui.messages import Display
 
 TEMPLATE = "skysim.apps.gui.template"  # module of the worker from which the others are forked
 SCENE = "SKYSIM_GUI_SCENE"  # environment variable: the scene that the template of the workers sets up
@@ -26,14 +29,15 @@ class WorkerLost(Exception):
 
 
 def serve(pipe: Connection) -> None:
-    """Main loop of the worker: receives (task, arguments), sends ("ok", result) or ("error", message), until the pipe
-    closes.
+    """Main loop of the worker, until the pipe closes.
+
+    It receives (task, arguments, display), and sends ("ok", result) or ("error", message).
     """
     worker = importlib.import_module(TEMPLATE).WORKER
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which closes the pipe
     while True:
         try:
-            task, arguments = pipe.recv()
+            task, arguments, worker.display = pipe.recv()
         except (EOFError, OSError):
             return
         try:
@@ -49,9 +53,11 @@ def serve(pipe: Connection) -> None:
 class Session:
     """One tab's worker process. Calls are queued and run one at a time.
 
+    display : of the browser, for which the worker makes frames; None: not known yet
     alive : all that are not closed
     """
 
+    display: Display | None = None
     alive: ClassVar[set[Session]] = set()
 
     def __init__(self) -> None:
@@ -75,7 +81,7 @@ class Session:
     def call(self, task: str, arguments: tuple[Any, ...]) -> Any:
         """Send a task and wait for its result; runs in the session's thread."""
         try:
-            self.pipe.send((task, arguments))
+            self.pipe.send((task, arguments, self.display))
             status, reply = self.pipe.recv()
         except (EOFError, OSError) as error:
             raise WorkerLost("the worker of this page has stopped") from error

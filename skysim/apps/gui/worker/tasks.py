@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import (
+    ALL_PIXELS,
     AmbiguityMap,
+    Display,
     FlightStep,
     FrameView,
+    Pixels,
     PlanCheck,
     PushedView,
     SceneInfo,
     SurveyPlan,
     Triple,
 )
-from skysim.apps.gui.worker import export, photo, playback
+from skysim.apps.gui.worker import export, photo, pixels, playback
 from skysim.apps.gui.worker.scene import planning, pointing
 from skysim.apps.gui.worker.scene.push import Grip, Push
 from skysim.apps.gui.worker.workbench import Workbench
@@ -32,11 +35,17 @@ from skysim.core.io import images
 class Worker:
     """State between tasks: the workbench, its flight, and the other image if the page shows one.
 
+    display : of the browser, for which frames are made, as far as it is known
+    shown, saturation_dn, number : the image on the page, from where it is saturated, and its number
     pushed : the motion of the pushed vehicle, as long as the workbench has its attitude
     other, image : an image that is not of the scene, and its (H, W) pixels;  camera : an open live camera
     """
 
     current: Workbench | None = None
+    display: Display | None = None
+    shown: pixels.Levels | None = None
+    saturation_dn: float = math.inf
+    number: int = 0
     flight: playback.Flight | None = None
     pushed: Push | None = None
     other: photo.Photo | None = None
@@ -52,22 +61,41 @@ class Worker:
             raise InputError("no scene is set up")
         return self.current
 
-    def show_frame(self, view: FrameView) -> FrameView:
-        """Return the view, and forget the other image, because the page now shows the scene."""
+    def show_frame(self, view: FrameView, levels: pixels.Levels) -> FrameView:
+        """Return the view with its pixels, and forget the other image, because the page now shows the scene."""
         self.other = self.image = None
-        return view
+        return replace(view, pixels=self.show(levels, view.saturation_dn))
 
     def show_photo(self, photo_pixels: photo.PhotoPixels) -> photo.Photo:
         """Keep an image that is not of the scene, and return its view."""
         self.other, self.image = photo_pixels
-        return self.other
+        return replace(self.other, pixels=self.show(pixels.levels_of(self.image), self.other.saturation_dn))
+
+    def show(self, levels: pixels.Levels, saturation_dn: float) -> Pixels:
+        """Keep the image on the page, and return its pixels for the browser's display."""
+        self.shown, self.saturation_dn, self.number = levels, saturation_dn, self.number + 1
+        return pixels.pixels_for(self.display or ALL_PIXELS, levels, saturation_dn, self.number)
+
+    @property
+    def levels(self) -> pixels.Levels:
+        """The newest frame of the workbench. Raises InputError if there is none."""
+        if self.workbench.frame is None:
+            raise InputError("no frame has been rendered")
+        return pixels.levels_of(self.workbench.frame.image_dn)
 
     # Tasks.
 
     def warm_up(self, scene: str) -> None:
         """Set up a scene, which a page will probably open, and solve a frame, so that code is imported and compiled."""
         self.current = Workbench.open(scene, {})
-        self.current.render_at_rest(solve=True)
+        view = self.current.render_at_rest(solve=True)
+        pixels.pixels_for(Display((8, 8)), self.levels, view.saturation_dn)
+
+    def all_pixels(self, number: int, display: Display) -> Pixels | None:
+        """All pixels of the image with a number; None if the page shows another one meanwhile."""
+        if self.shown is None or number != self.number:
+            return None
+        return pixels.pixels_for(display._replace(screen_px=(0, 0)), self.shown, self.saturation_dn, number)
 
     def open(
         self, scene: str, overrides: Mapping[str, str], solve: bool, angles_deg: Triple | None = None
@@ -81,7 +109,8 @@ class Worker:
         return bench.scene_info, self.render(solve)
 
     def render(self, solve: bool) -> FrameView:
-        return self.show_frame(self.workbench.render_at_rest(solve))
+        view = self.workbench.render_at_rest(solve)
+        return self.show_frame(view, self.levels)
 
     def point(self, angles_deg: Triple, solve: bool) -> FrameView:
         bench = self.workbench
@@ -103,7 +132,8 @@ class Worker:
             self.pushed = Push(bench.testbed, bench.lab_from_body)
         self.pushed.advance(grip, elapsed_s)
         bench.lab_from_body = self.pushed.lab_from_body
-        view = self.show_frame(bench.render(self.pushed.seen(bench.next_run()), solve))
+        view = bench.render(self.pushed.seen(bench.next_run()), solve)
+        view = self.show_frame(view, self.levels)
         rate_rad_s = np.linalg.norm(self.pushed.simulation.rate_body_rad_s)
         return PushedView(view, float(np.linalg.norm(self.pushed.torque_nm)), math.degrees(rate_rad_s))
 
@@ -131,7 +161,7 @@ class Worker:
         """A kept frame of the flight. Raises InputError if it has not been computed."""
         if self.flight is None or not 0 <= index < len(self.flight.frames):
             raise InputError(f"the flight has no frame {index}")
-        return self.show_frame(self.flight.show(index))
+        return self.show_frame(*self.flight.show(index))
 
     def replay(self, study: str, folder: str, trial: int) -> photo.Photo:
         """Repeat a study's trial; the page shows its frame."""

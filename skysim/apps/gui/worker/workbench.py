@@ -16,8 +16,7 @@ from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui.messages import Detection, FrameView, LabGeometry, Lens, Lights, SceneInfo, TrackerResult
-from skysim.apps.gui.worker import pixels
-from skysim.apps.gui.worker.scene import geometry
+from skysim.apps.gui.worker.scene import geometry, lens
 from skysim.core import quaternion
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Truth
@@ -71,7 +70,7 @@ class Workbench:
         testbed = build_testbed(scene)
         same = before and before.scene.model_copy(update={"tracker": scene.tracker, "camera": scene.camera}) == scene
         lab_from_body = before.lab_from_body if before and same else testbed.trajectory.lab_from_body[0]
-        views = pixels.scene_lens(testbed), geometry.lab_geometry(testbed)
+        views = lens.scene_lens(testbed), geometry.lab_geometry(testbed)
         return cls(scene, testbed, warm_tracker(testbed), lab_from_body, *views, magnitude=magnitude_by_id(testbed))
 
     @property
@@ -124,11 +123,10 @@ class Workbench:
         return self.frame_view(self.frame, self.truth, self.result, clock.seconds["all"])
 
     def frame_view(self, frame: Frame, truth: Truth, result: TrackerResult | None, seconds: float) -> FrameView:
-        """The view of a frame of this scene for the page."""
+        """The view of a frame of this scene for the page, without its pixels."""
         height, width = frame.image_dn.shape
         return FrameView(
-            pixels.encoded(frame.image_dn),
-            pixels.scene_pose(self.testbed, self.lens, truth),
+            lens.scene_pose(self.testbed, self.lens, truth),
             frame.saturation_dn,
             (width, height),
             scoring.angles_deg(truth.cam_from_lab, self.scene, self.testbed.mount),

@@ -16,12 +16,14 @@ import numpy as np
 from nicegui import ui
 
 from skysim.apps.gui.messages import (
+    LIMITS,
     NO_LIGHTS,
     Detection,
     FrameView,
     Lens,
     Light,
     Lights,
+    Pixels,
     Pose,
     SceneInfo,
     TrackerResult,
@@ -29,7 +31,7 @@ from skysim.apps.gui.messages import (
 from skysim.apps.gui.page import keys
 from skysim.apps.gui.page.frame import overlay
 from skysim.apps.gui.page.frame.live import LiveText
-from skysim.apps.gui.page.frame.served import LIMITS, ServedFrame
+from skysim.apps.gui.page.frame.served import ServedFrame
 from skysim.apps.gui.page.frame.star_names import NAMES
 from skysim.core.types import Floats
 from skysim.results import stretch
@@ -68,7 +70,7 @@ class Sensor:
         self.shown = {"truth", "identified", "false"}
         self.lights: Lights = NO_LIGHTS
         self.result: TrackerResult | None = None
-        self.size_px, self.prefix, self.saturation_dn = (4, 3), "HIP", math.inf
+        self.size_px, self.prefix = (4, 3), "HIP"
         self.lens: Lens | None = None
         self.pose: Pose | None = None
         self.statistics = ""  # numbers of the frame, shown while the mouse is on no light
@@ -131,14 +133,14 @@ class Sensor:
         self.shown = self.shown | {kind} if on else self.shown - {kind}
         self.update_marks()
 
-    def display_image(self, data: bytes) -> None:
+    def display_image(self, pixels: Pixels) -> None:
         """Display a new image, as large as the window allows."""
         if not self.sent_number:
             self.wait.set_visibility(False)
         self.sent_number += 1  # so that each frame has its own address
         frames = FRAMES.setdefault(self.tab.id, {})
         fields = self.fields() | {"contents": self.tab.contents.take()}
-        frames[self.sent_number] = ServedFrame(data, self.size_px, self.saturation_dn, fields)
+        frames[self.sent_number] = ServedFrame(pixels, fields, self.tab.session)
         frames.pop(min(frames) if len(frames) > KEPT_FRAMES else -1, None)
         self.canvas.run_method("show", {"src": self.source})
 
@@ -171,7 +173,7 @@ class Sensor:
     def take(self, view: FrameView | Photo, lens: Lens | None) -> None:
         """Take over lights, solution and pointing of a new image, and display it."""
         self.lights, self.result = view.lights, view.result
-        self.size_px, self.saturation_dn, self.pose = view.size_px, view.saturation_dn, view.pose
+        self.size_px, self.pose = view.size_px, view.pose
         if lens is not self.lens:
             self.lens = lens
             self.canvas.run_method("setLens", asdict(lens) if lens else None)

@@ -1,7 +1,7 @@
 // The frame: its pixels come as numbers, so zoom, limits, colors, values under the cursor, loupe and cut are made here,
 // without the server. Marks are drawn together with their frame, so that they never appear on another one.
 import { setContents } from "skysim-frame/live.js";
-import { colorTable, decode, palette, profile } from "skysim-frame/pixels.js";
+import { colorTable, decode, palette, profile, shadeTable } from "skysim-frame/pixels.js";
 import { drawGrid, drawHighlight, drawLoupe, drawMarks, drawNames } from "skysim-frame/marks.js";
 import { drawHistogram, drawProfile, levelAt, nearestLevel } from "skysim-frame/plots.js";
 import { directionText, gridLines } from "skysim-frame/sky.js";
@@ -9,7 +9,6 @@ import { directionText, gridLines } from "skysim-frame/sky.js";
 const REST_MS = 400; // without another frame, after which all pixels of the frame are fetched
 const AHEAD = 1; // frames that are fetched while another one is drawn
 const PLOT_MS = 250; // between histograms while frames follow one another
-const WORTHWHILE = 0.95; // screen pixels per pixel, below which a reduced frame saves time
 const LARGEST_PX = 60; // screen pixels of an enlarged pixel
 const REACH_PX = 14; // screen pixels within which the cursor finds a light
 const LOUPE = { across: 11, down: 7 };
@@ -32,7 +31,7 @@ export default {
         <canvas ref="loupe" class="lab-loupe" role="img"></canvas>
         <slot></slot>
         <canvas ref="plot" class="lab-plot" role="img" @pointerdown="grab" @pointermove="drag"
-          @pointerup="held = null" @pointercancel="held = null"></canvas>
+          @pointerup="drop" @pointercancel="drop"></canvas>
       </div>
     </div>`,
   // curve, limits: names;  table: of colors, base64;  grid: whether the coordinate grid is drawn
@@ -79,7 +78,7 @@ export default {
     display(now, before) {
       if (now.limits !== "manual") this.manual = null;
       this.recolor();
-      if (now.limits !== before.limits && !this.manual) this.complete(true);
+      if (now.limits !== before.limits || now.curve !== before.curve) this.complete(true);
     },
   },
   methods: {
@@ -110,7 +109,7 @@ export default {
     update() {
       if (this.inFlight > AHEAD || this.wanted === this.begun) return;
       const view = (this.begun = this.wanted), lens = this.lens, isNew = view.src !== this.fetchedSrc;
-      const fetched = isNew ? this.fetchFrame(view.src, this.screenWidth(), this.loupeAt()) : null;
+      const fetched = isNew ? this.fetchFrame(view.src) : null;
       this.fetchedSrc = view.src;
       this.inFlight += 1;
       this.queue = this.queue.then(async () => {
@@ -136,23 +135,23 @@ export default {
       clearTimeout(this.atRest);
       const { drawn } = this;
       if (this.inFlight || !drawn || (drawn.isWhole && always !== true)) return;
-      const frame = await this.fetchFrame(drawn.src, 0, null);
+      const frame = await this.fetchFrame(drawn.src, true);
       if (!frame || this.drawn.src !== drawn.src) return;
       const { pixels, isWhole, limits, histogram } = frame;
       this.drawn = { ...this.drawn, pixels, isWhole, limits, histogram };
       this.recolor();
     },
-    // The number of columns that suffices for the screen; 0: all.
-    screenWidth() {
-      const [width, height] = this.drawn?.size ?? [0, 0];
-      const scale = Math.min(this.space[0] / width, this.space[1] / height) * devicePixelRatio;
-      return this.zoom || this.cut || !(scale > 0 && scale < WORTHWHILE) ? 0 : Math.round(scale * width);
+    // Width and height of the screen that a whole frame fills; zeros if all its pixels are needed.
+    screen() {
+      return this.space.map((side) => (this.zoom || this.cut ? 0 : Math.round(side * devicePixelRatio)));
     },
-    // A frame's pixels with its pointing and its marks; null if the server is unreachable or holds only newer frames,
-    // which it will announce.
-    async fetchFrame(src, width, near) {
+    // A frame's pixels with its pointing and its marks, the pixels as shades of as many as the screen has unless all are
+    // needed; null if the server is unreachable or holds only newer frames, which it will announce.
+    async fetchFrame(src, whole = false) {
       try {
-        const query = new URLSearchParams({ width, limits: this.display.limits, near: near ?? [] });
+        const { curve, limits } = this.display, near = this.loupeAt() ?? [];
+        const query = new URLSearchParams({ screen: this.screen(), limits: this.manual ?? limits, curve, near });
+        if (whole) query.set("whole", 1);
         const response = await fetch(`${window.path_prefix || ""}${src}?${query}`);
         return response.ok ? { ...decode(await response.arrayBuffer()), src } : null;
       } catch {
@@ -161,12 +160,14 @@ export default {
     },
     recolor() {
       if (!this.drawn) return;
-      const { pixels, histogram, saturation } = this.drawn;
+      const { pixels, histogram, saturation, isWhole } = this.drawn;
       const { data, offset, step, width, height } = pixels;
       const levels = this.manual?.map((dn) => (dn - offset) / step);
       this.levels = levels ?? this.drawn.limits;
-      const limit = saturation === null ? Infinity : (saturation - offset) / step;
-      const table = colorTable(histogram.range[1], this.levels, this.display.curve, palette(this.display.table), limit);
+      const limit = saturation === null ? Infinity : (saturation - offset) / step, colors = palette(this.display.table);
+      const table = isWhole
+        ? colorTable(histogram.range[1], this.levels, this.display.curve, colors, limit)
+        : shadeTable(colors);
       if (this.sheet.width !== width || this.sheet.height !== height || !this.sheetData) {
         [this.sheet.width, this.sheet.height] = [width, height];
         this.sheetPen = this.sheet.getContext("2d", { alpha: false, willReadFrequently: true });
@@ -441,6 +442,11 @@ export default {
       if (!this.manual) this.$emit("manual");
       this.manual = limits;
       this.recolor();
+    },
+    // The server makes the next frames with these limits.
+    drop() {
+      if (this.held !== null) this.complete(true);
+      this.held = null;
     },
   },
 };

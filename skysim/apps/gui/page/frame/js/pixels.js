@@ -8,8 +8,9 @@ const INVERSE = {
   logarithm: (brightness) => (201 ** brightness - 1) / 200, // of log(1 + 200 fraction) / log(201)
 };
 
-// Two float64 (offset, step), then an unsigned integer n per pixel, of 8 or 16 bits: its value is offset + step n. Then
-// the frame's fields as JSON, and the length of that, 32 bits. Fewer pixels than the frame has are means over areas.
+// Two float64 (offset, step), then an unsigned integer n per pixel, of 8 or 16 bits: its value is offset + step n. If the
+// frame is shaded, there are fewer pixels than it has, and n is the shade of the mean over an area. Then come the frame's
+// fields as JSON, and the length of that, 32 bits.
 export function decode(buffer) {
   const length = new DataView(buffer).getUint32(buffer.byteLength - LENGTH_BYTES, true);
   const end = buffer.byteLength - LENGTH_BYTES - length;
@@ -18,7 +19,7 @@ export function decode(buffer) {
   const Kind = end - HEADER_BYTES === width * height ? Uint8Array : Uint16Array;
   const data = new Kind(buffer, HEADER_BYTES, (end - HEADER_BYTES) / Kind.BYTES_PER_ELEMENT);
   if (data.length !== width * height) throw new Error("the pixels do not fit the frame's size");
-  return { ...fields, pixels: { data, offset, step, width, height }, isWhole: width === fields.size[0] };
+  return { ...fields, pixels: { data, offset, step, width, height }, isWhole: !fields.shaded };
 }
 
 // A color map from a base64 string of 256 x (red, green, blue): one 32-bit pixel per entry.
@@ -28,6 +29,7 @@ export function palette(base64) {
 }
 
 const rgb = (red, green, blue) => ((255 << 24) | (blue << 16) | (green << 8) | red) >>> 0;
+const WARNING = rgb(255, 60, 60);
 
 // A 32-bit pixel for every stored integer up to `highest`; those from `saturation` on get the warning color.
 export function colorTable(highest, [low, high], curve, colors, saturation) {
@@ -35,7 +37,14 @@ export function colorTable(highest, [low, high], curve, colors, saturation) {
   const first = (shade) => Math.max(Math.ceil(low + range * inverse((shade - 0.5) / 255)), 0); // of a shade, rounded
   table.fill(colors[0]);
   for (let shade = 1; shade < 256; shade++) table.fill(colors[shade], first(shade), shade < 255 ? first(shade + 1) : undefined);
-  if (saturation <= highest) table.fill(rgb(255, 60, 60), Math.max(Math.ceil(saturation), 0));
+  if (saturation <= highest) table.fill(WARNING, Math.max(Math.ceil(saturation), 0));
+  return table;
+}
+
+// A 32-bit pixel for every shade: from black to white, then the warning color of saturated areas.
+export function shadeTable(colors) {
+  const table = Uint32Array.from({ length: 256 }, (_, n) => colors[Math.round((n * 255) / 254)]);
+  table[255] = WARNING;
   return table;
 }
 
