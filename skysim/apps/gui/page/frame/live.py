@@ -23,7 +23,7 @@ class Contents:
         self.waits = False
 
     def set(self, number: int, content: dict[str, str]) -> None:
-        """Change the content of a field: its text and state, or its value."""
+        """Change the content of a field: its text and state, or its value; of the strips the moment that is shown."""
         if self.all.get(number) == content:
             return
         self.all[number] = content

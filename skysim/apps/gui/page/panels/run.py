@@ -73,7 +73,7 @@ class RunPanel:
         with ui.row().classes("w-full no-wrap items-center gap-3"):
             self.summary = ui.label().classes("quiet flex-grow").mark("flight")
             self.csv_button = ui.button("CSV", on_click=self.download).props("dense flat size=sm").mark("csv")
-        self.strips = StripChart()
+        self.strips = StripChart(self.tab.contents)
         self.enable()
 
     def player_button(self, icon: str, label: str, action: Any) -> ui.button:

@@ -10,6 +10,7 @@ from typing import Any
 from nicegui import ui
 
 from skysim.apps.gui.messages import FrameRow, MotionLog
+from skysim.apps.gui.page.frame.live import Contents
 from skysim.apps.gui.page.style import CURVE_COLORS, TOOLTIP, chart_color
 
 BAND_COLOR = "#8b95a5"
@@ -22,11 +23,11 @@ LEFT_PX, RIGHT_PX = 52, 12  # of a strip, to the edges of the chart
 # chart would draw all curves again for it.
 CHART_JS = """() => {
   const chart = getElement(%d).chart;
-  if (!chart.skysim) {
+  if (skysimMoment.chart !== chart) {
     const line = document.createElement("div");
     line.className = "lab-moment";
     chart.getDom().append(line);
-    chart.skysim = { line, t_s: 0 };
+    Object.assign(skysimMoment, { chart, line });
     chart.getZr().on("click", event => {
       const at = [event.offsetX, event.offsetY];
       chart.getOption().grid.forEach((_, gridIndex) => {
@@ -35,14 +36,15 @@ CHART_JS = """() => {
       });
     });
   }
-  skysimMoment(chart, chart.skysim.t_s);
+  skysimMoment(skysimMoment.t_s ?? 0);
   getElement(%d)?.attach(chart);
 }"""
 MOMENT_JS = f"""
-window.skysimMoment = (chart, t_s) => {{
-  if (!chart?.skysim) return;
-  const x = chart.convertToPixel({{ xAxisIndex: 0 }}, t_s), {{ line }} = chart.skysim;
-  chart.skysim.t_s = t_s;
+window.skysimMoment = (t_s) => {{
+  const {{ chart, line }} = skysimMoment;
+  skysimMoment.t_s = t_s;
+  if (!chart) return;
+  const x = chart.convertToPixel({{ xAxisIndex: 0 }}, t_s);
   line.hidden = !(x >= {LEFT_PX} && x <= chart.getWidth() - {RIGHT_PX});
   line.style.transform = `translateX(${{x}}px)`;
 }};
@@ -139,10 +141,11 @@ def thinned(residuals: Sequence[tuple[float, int, float]]) -> Points:
 class StripChart:
     """The chart; a click on a strip emits the page's event `moment` with the time there.
 
-    strips : that are drawn
+    contents : of the tab's live fields;  strips : that are drawn
     """
 
-    def __init__(self) -> None:
+    def __init__(self, contents: Contents) -> None:
+        self.contents = contents
         self.strips: list[Strip] = []
         with ui.element("div").classes("w-full relative-position"):
             self.chart = ui.echart({"series": []}).classes("w-full").mark("strips")
@@ -163,9 +166,9 @@ class StripChart:
         self.chart.update()
 
     def set_moment(self, t_s: float) -> None:
-        """Move the line of the shown moment."""
+        """Move the line of the shown moment, when the next frame is drawn."""
         if self.strips:
-            self.chart.client.run_javascript(f"skysimMoment(getElement({self.chart.id})?.chart, {t_s:.4f})")
+            self.contents.set(self.chart.id, {"moment": f"{t_s:.4f}"})
 
 
 def dot_fields(drawn: list[Strip], name: Callable[[int], str]) -> dict[str, Any]:
