@@ -19,7 +19,7 @@ from nicegui import app, core, ui
 from starlette.datastructures import MutableHeaders
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import HTTPConnection, Request
-from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response, StreamingResponse
 from starlette.routing import Route, Router
 
 from skysim.apps.gui.page.frame.sensor import FRAMES
@@ -55,17 +55,24 @@ async def frame(request: Request) -> Response:
 
     Query: see `display_of`, and `whole`: whether all pixels are needed
     """
-    served = FRAMES.get(request.path_params["tab"], {}).get(request.path_params["number"])
-    query = request.query_params
-    display = display_of(query)
+    frames, query = FRAMES.get(request.path_params["tab"]), request.query_params
+    served, display = frames and frames.newest.get(request.path_params["number"]), display_of(query)
     data = await served.response(display, "whole" in query) if served and display else None
     if data is None:
         return Response(status_code=404)
     return Response(data, media_type="application/octet-stream", headers=FRAME_HEADERS)
 
 
+async def stream(request: Request) -> Response:
+    """The next frames of a tab, see `TabFrames.stream`; 404 if there is no such tab. Query: see `display_of`"""
+    frames, display = FRAMES.get(request.path_params["tab"]), display_of(request.query_params)
+    if not frames or not display:
+        return Response(status_code=404)
+    return StreamingResponse(frames.stream(display), media_type="application/octet-stream", headers=FRAME_HEADERS)
+
+
 # Frames pass by the application's own layers, each of which takes a tenth of the time that a frame may take.
-FRAME_ROUTES = Router([Route("/frame/{tab}/{number:int}", frame)])
+FRAME_ROUTES = Router([Route("/frame/{tab}/{number:int}", frame), Route("/frame/{tab}/next", stream)])
 
 
 class Guard:

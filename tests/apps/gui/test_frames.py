@@ -19,9 +19,10 @@ import httpx
 from astropy.io import fits
 
 from skysim.apps.gui.messages import ALL_PIXELS, LIMITS, Display, Lights, Pixels
+from skysim.apps.gui.page.frame import served as served_module
 from skysim.apps.gui.page.frame.live import Contents
 from skysim.apps.gui.page.frame.sensor import FRAMES
-from skysim.apps.gui.page.frame.served import ServedFrame, display_of
+from skysim.apps.gui.page.frame.served import KEPT_FRAMES, ServedFrame, TabFrames, display_of
 from skysim.apps.gui.server import Guard
 from skysim.apps.gui.worker.pixels import (
     BINS,
@@ -206,7 +207,8 @@ def test_frames_are_served_to_logged_in_browsers_alone(monkeypatch: pytest.Monke
         raise AssertionError("not a frame")
 
     guard, image = Guard(nothing, ("*",), "right", 1), sky(8)
-    monkeypatch.setitem(FRAMES, "tab", {3: served(image), 4: served(image, Display((40, 40), near_px=(5, 6)))})
+    frames = {3: served(image), 4: served(image, Display((40, 40), near_px=(5, 6)))}
+    monkeypatch.setitem(FRAMES, "tab", TabFrames(print, frames))
 
     async def answers(paths: Sequence[str], token: str) -> list[httpx.Response]:
         transport, cookies = httpx.ASGITransport(app=guard), {"skysim_gui_1": token}
@@ -225,6 +227,75 @@ def test_frames_are_served_to_logged_in_browsers_alone(monkeypatch: pytest.Monke
     assert {answer.status_code for answer in asyncio.run(answers([f"/frame/{path}" for path in wrong], "right"))} == {
         404
     }
+
+
+# Over a stream.
+
+
+def split(message: bytes) -> tuple[int, np.ndarray]:
+    """Number and pixels of a message."""
+    length, number = np.frombuffer(message, "<u4", 2)
+    assert len(message) == 8 + length
+    return int(number), decoded(message[8:])[1]
+
+
+def test_a_frame_goes_over_the_stream_or_is_announced() -> None:
+    async def story() -> tuple[list[int], list[bytes]]:
+        announced, got = list[int](), list[bytes]()
+        frames = TabFrames(announced.append)
+        frames.add(1, served(sky(1)), alone=False)  # no stream yet
+        stream = frames.stream(ALL_PIXELS)
+        first = asyncio.ensure_future(anext(stream))
+        await asyncio.sleep(0)
+        frames.add(2, served(sky(2)), alone=False)
+        got.append(await first)
+        frames.add(3, served(sky(3)), alone=True)  # with a message that belongs to it
+        for number in (4, 5):
+            frames.add(number, served(sky(number)), alone=False)
+        got += [await anext(stream), await anext(stream)]
+        return [*announced], got  # what comes when the loop closes is of no interest
+
+    announced, got = asyncio.run(story())
+    assert announced == [1, 3]
+    assert [split(message)[0] for message in got] == [2, 4, 5]
+    for number, image in map(split, got):
+        np.testing.assert_array_equal(image, sky(number))
+
+
+def test_a_stream_ends_without_frames_and_gives_way_to_a_newer_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(served_module, "IDLE_S", 0.02)
+
+    async def story() -> tuple[list[int], list[bytes]]:
+        announced, got = list[int](), list[bytes]()
+        frames = TabFrames(announced.append)
+        former, newer = (asyncio.ensure_future(anext(frames.stream(ALL_PIXELS), None)) for _ in range(2))
+        await asyncio.sleep(0)
+        frames.add(1, served(sky(1)), alone=False)
+        assert await former is None
+        got.append(await newer)
+        await asyncio.gather(*[one async for one in frames.stream(ALL_PIXELS)])  # idle from the start
+        frames.add(2, served(sky(2)), alone=False)
+        return [*announced], got  # what comes when the loop closes is of no interest
+
+    announced, got = asyncio.run(story())
+    assert ([split(message)[0] for message in got], announced) == ([1], [2])
+
+
+def test_a_frame_of_a_lost_stream_is_announced() -> None:
+    async def story() -> list[int]:
+        announced = list[int]()
+        frames = TabFrames(announced.append)
+        stream = frames.stream(ALL_PIXELS)
+        first = asyncio.ensure_future(anext(stream))
+        await asyncio.sleep(0)
+        for number in range(1, KEPT_FRAMES + 3):
+            frames.add(number, served(sky(number)), alone=False)
+        await first
+        await stream.aclose()
+        assert sorted(frames.newest) == list(range(3, KEPT_FRAMES + 3))
+        return announced
+
+    assert asyncio.run(story()) == [KEPT_FRAMES + 2]
 
 
 def test_lights_are_a_sequence_that_is_sent_as_columns() -> None:
@@ -303,6 +374,41 @@ def test_a_key_shows_a_reduced_frame_at_once_and_all_pixels_at_rest(square: Any,
     np.testing.assert_array_equal(values, frame[y : y + 7, x : x + 11].ravel())
     square.keyboard.press("ArrowLeft")  # the loupe follows at once, before all pixels are there
     assert come(lambda: square.locator(".lab-loupe").get_attribute("aria-label") not in (text, ""))
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium")
+def test_frames_that_follow_one_another_come_over_one_request(square: Any) -> None:
+    square.mouse.move(5, 5)
+    asked = list[str]()
+    square.on("request", lambda request: asked.append(request.url))
+    square.wait_for_timeout(2500)  # the last stream has ended
+    for _ in range(6):
+        before = source(square)
+        square.keyboard.press("ArrowLeft")
+        assert come(lambda before=before: source(square) != before)
+    for _ in range(3):  # one after the other comes to rest
+        assert come(lambda: is_whole(square))
+    frames = [url for url in asked if "/frame/" in url]
+    assert sum("/next" in url for url in frames) == 1
+    assert not [url for url in frames if "/next" not in url and "whole=1" not in url]
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium")
+def test_a_zoomed_frame_has_all_pixels_at_once(square: Any) -> None:
+    square.keyboard.press("ArrowLeft")
+    box = square.locator(".lab-frame canvas").bounding_box()
+    square.mouse.move(box["x"] + 200, box["y"] + 200)
+    square.mouse.wheel(0, -600)
+    assert come(lambda: is_whole(square))
+    square.evaluate(DRAWINGS)
+    before = source(square)
+    square.keyboard.press("ArrowLeft")
+    assert come(lambda: source(square) != before)
+    square.wait_for_timeout(300)
+    assert {whole for _, whole in square.evaluate("window.drawings")} <= {"true"}
+    square.get_by_role("button", name="fit", exact=True).click()
 
 
 @pytest.mark.browser

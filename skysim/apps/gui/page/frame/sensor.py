@@ -10,6 +10,7 @@ from collections.abc import Collection
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qsl
 
 import cv2
 import numpy as np
@@ -31,7 +32,7 @@ from skysim.apps.gui.messages import (
 from skysim.apps.gui.page import keys
 from skysim.apps.gui.page.frame import overlay
 from skysim.apps.gui.page.frame.live import LiveText
-from skysim.apps.gui.page.frame.served import ServedFrame
+from skysim.apps.gui.page.frame.served import ServedFrame, TabFrames, display_of
 from skysim.apps.gui.page.frame.star_names import NAMES
 from skysim.core.types import Floats
 from skysim.results import stretch
@@ -48,8 +49,7 @@ COLOR_MAPS = {
     **{"gray": None, "gray, inverted": None, "viridis": cv2.COLORMAP_VIRIDIS, "cividis": cv2.COLORMAP_CIVIDIS},
     **{"inferno": cv2.COLORMAP_INFERNO, "hot": cv2.COLORMAP_HOT},
 }
-FRAMES: dict[str, dict[int, ServedFrame]] = {}  # by tab and number, the newest KEPT_FRAMES
-KEPT_FRAMES = 5
+FRAMES: dict[str, TabFrames] = {}  # by tab
 AHEAD = 2  # frames that the browser fetches while it draws another one
 DRAW_TIMEOUT_S = 1.0  # for the browser to report a drawn frame
 
@@ -63,6 +63,7 @@ class Sensor:
 
     hover_px : place of the light under the mouse, or None
     sent_number, drawn_number : number of the last frame sent to the browser, and of the last it reported as drawn
+    display_query : how the browser draws frames, as it has reported
     """
 
     def __init__(self, tab: Tab) -> None:
@@ -76,6 +77,7 @@ class Sensor:
         self.statistics = ""  # numbers of the frame, shown while the mouse is on no light
         self.hover_px: tuple[float, float] | None = None
         self.sent_number = self.drawn_number = 0
+        self.display_query = ""
         self.frame_drawn = asyncio.Event()
         with ui.element("div").classes("lab-sensor"):
             self.build_controls()
@@ -133,21 +135,27 @@ class Sensor:
         self.shown = self.shown | {kind} if on else self.shown - {kind}
         self.update_marks()
 
-    def display_image(self, pixels: Pixels) -> None:
-        """Display a new image, as large as the window allows."""
+    def display_image(self, pixels: Pixels, alone: bool) -> None:
+        """Display a new image, as large as the window allows. alone : see `TabFrames.add`"""
         if not self.sent_number:
             self.wait.set_visibility(False)
         self.sent_number += 1  # so that each frame has its own address
-        frames = FRAMES.setdefault(self.tab.id, {})
         fields = self.fields() | {"contents": self.tab.contents.take()}
-        frames[self.sent_number] = ServedFrame(pixels, fields, self.tab.session)
-        frames.pop(min(frames) if len(frames) > KEPT_FRAMES else -1, None)
-        self.canvas.run_method("show", {"src": self.source})
+        frames = FRAMES.setdefault(self.tab.id, TabFrames(self.announce))
+        frames.add(self.sent_number, ServedFrame(pixels, fields, self.tab.session), alone)
+
+    def announce(self, number: int) -> None:
+        """Let the browser request a frame."""
+        self.canvas.run_method("show", {"src": self.address(number)})
 
     def drawn(self, event: Any) -> None:
-        """The browser reports a drawn frame."""
+        """The browser reports a drawn frame, and how it draws the next ones."""
         self.drawn_number = int(event.args["src"].rpartition("/")[2])
         self.frame_drawn.set()
+        query = str(event.args["display"])
+        if query != self.display_query:
+            self.display_query = query
+            self.tab.session.display = display_of(dict(parse_qsl(query))) or self.tab.session.display
 
     async def wait_drawn(self) -> None:
         """Wait until the browser has few frames to draw, so that they do not queue up there."""
@@ -174,21 +182,20 @@ class Sensor:
         """Take over lights, solution and pointing of a new image, and display it."""
         self.lights, self.result = view.lights, view.result
         self.size_px, self.pose = view.size_px, view.pose
-        if lens is not self.lens:
+        is_new_lens = lens is not self.lens
+        if is_new_lens:
             self.lens = lens
             self.canvas.run_method("setLens", asdict(lens) if lens else None)
         self.update_text()
-        self.display_image(view.pixels)
+        self.display_image(view.pixels, alone=is_new_lens)
 
     def update_text(self) -> None:
         """Show data on the light under the mouse, or else the frame's numbers."""
         at = self.hover_px
         self.hover.set_text(self.light_text(*self.nearest(*at)) if at else self.statistics)
 
-    @property
-    def source(self) -> str:
-        """Address of the newest frame."""
-        return f"/frame/{self.tab.id}/{self.sent_number}"
+    def address(self, number: int) -> str:
+        return f"/frame/{self.tab.id}/{number}"
 
     def fields(self) -> dict[str, Any]:
         """What frame.js needs beside the pixels: pointing and marks."""
@@ -201,7 +208,7 @@ class Sensor:
     def update_marks(self) -> None:
         """Send other marks of the newest frame; not as properties, which would be sent again whole with each change
         of any of them."""
-        self.canvas.run_method("show", {"src": self.source} | self.fields())
+        self.canvas.run_method("show", {"src": self.address(self.sent_number)} | self.fields())
 
     def description(self) -> str:
         """Text alternative of the view for screen readers."""

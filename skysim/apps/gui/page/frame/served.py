@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+import struct
+from collections.abc import AsyncIterator, Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from nicegui import json
@@ -14,6 +16,8 @@ from skysim.apps.gui.worker.session import WorkerLost
 from skysim.results.stretch import CURVES
 
 MAX_SCREEN_PX = 10**5
+KEPT_FRAMES = 5
+IDLE_S = 2.0  # without a frame, after which a stream ends: a browser has six connections for all of its tabs
 
 
 class Source(Protocol):
@@ -55,6 +59,54 @@ class ServedFrame:
                 return None
         text = json.dumps({**self.fields, **pixels.fields}).encode()
         return b"".join((pixels.data, text, len(text).to_bytes(4, "little")))
+
+
+@dataclass
+class TabFrames:
+    """The newest frames of a tab, and the stream over which its browser gets them while they follow one another.
+
+    A stream is one response for many frames: a request for each would take a fifth of the time that a frame may take.
+
+    announce : sends the number of a frame to the browser, which then requests it
+    newest : by number;  waiting : numbers of those to be sent over the stream; None: no stream is open
+    """
+
+    announce: Callable[[int], Any]
+    newest: dict[int, ServedFrame] = field(default_factory=dict)
+    waiting: asyncio.Queue[int] | None = None
+
+    def add(self, number: int, frame: ServedFrame, alone: bool) -> None:
+        """Keep a frame and send it, or its number. alone : not over the stream, because messages belong to it"""
+        self.newest[number] = frame
+        self.newest.pop(min(self.newest) if len(self.newest) > KEPT_FRAMES else -1, None)
+        if self.waiting is None or alone:
+            self.announce(number)
+        else:
+            self.waiting.put_nowait(number)
+
+    async def stream(self, display: Display) -> AsyncIterator[bytes]:
+        """Frames as they come, until there is none for a while: length and number as unsigned integers of 32 bits, then
+        the frame's response. Of several streams the newest gets the frames.
+        """
+        waiting = self.waiting = asyncio.Queue[int]()
+        number = 0
+        try:
+            while True:
+                number = await asyncio.wait_for(waiting.get(), IDLE_S)
+                frame = self.newest.get(number)
+                data = await frame.response(frame.source.display or display, whole=False) if frame else None
+                if data is not None:
+                    yield struct.pack("<II", len(data), number) + data
+                number = 0
+        except TimeoutError:
+            return
+        finally:
+            if self.waiting is waiting:
+                self.waiting = None
+            while not waiting.empty():
+                number = waiting.get_nowait()
+            if number:  # the connection was lost before the browser got the newest one
+                self.announce(number)
 
 
 def display_of(query: Mapping[str, str]) -> Display | None:

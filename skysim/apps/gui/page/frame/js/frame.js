@@ -1,7 +1,7 @@
 // The frame: its pixels come as numbers, so zoom, limits, colors, values under the cursor, loupe and cut are made here,
 // without the server. Marks are drawn together with their frame, so that they never appear on another one.
 import { setContents } from "skysim-frame/live.js";
-import { colorTable, decode, palette, profile, shadeTable } from "skysim-frame/pixels.js";
+import { colorTable, decode, palette, profile, reader, shadeTable } from "skysim-frame/pixels.js";
 import { drawGrid, drawHighlight, drawLoupe, drawMarks, drawNames } from "skysim-frame/marks.js";
 import { drawHistogram, drawProfile, levelAt, nearestLevel } from "skysim-frame/plots.js";
 import { directionText, gridLines } from "skysim-frame/sky.js";
@@ -13,6 +13,8 @@ const LARGEST_PX = 60; // screen pixels of an enlarged pixel
 const REACH_PX = 14; // screen pixels within which the cursor finds a light
 const LOUPE = { across: 11, down: 7 };
 const PALE = "#ffe27a", GRID = "rgb(127 160 200 / 45%)", CUT = "#ff8fd0", CROSS = "#dd5a60", NAME = "#6ff0d8";
+
+const numberOf = (src) => Number(src.slice(src.lastIndexOf("/") + 1));
 
 export default {
   template: `
@@ -56,6 +58,8 @@ export default {
       begun: null, // the newest view whose frame is fetched or drawn
       fetchedSrc: null,
       inFlight: 0, // frames that are fetched or drawn
+      newest: 0, // greatest number of a frame that has come
+      isListening: false, // whether a stream of frames is open
       queue: Promise.resolve(),
       space: [0, 0], // width and height of the canvas
     });
@@ -69,8 +73,10 @@ export default {
     });
     for (const canvas of [this.$refs.frame, this.$refs.loupe, this.$refs.plot]) this.watcher.observe(canvas);
     window.addEventListener("skysim-hover", this.ring);
+    window.addEventListener("keydown", this.listen); // the key's frame then comes without a request of its own
   },
   beforeUnmount() {
+    window.removeEventListener("keydown", this.listen);
     window.removeEventListener("skysim-hover", this.ring);
     this.watcher.disconnect();
   },
@@ -86,8 +92,38 @@ export default {
 
     setContents,
     show(view) {
+      if (numberOf(view.src) < this.newest) return; // a newer one has come over the stream
       this.wanted = view;
       this.update();
+    },
+    // Receive the frames that follow one another over one response, which ends after a while without frames. A hidden
+    // tab leaves the browser's connections to others.
+    async listen() {
+      if (this.isListening || !this.drawn || document.hidden) return;
+      this.isListening = true;
+      try {
+        const folder = this.drawn.src.slice(0, this.drawn.src.lastIndexOf("/"));
+        const response = await fetch(`${window.path_prefix || ""}${folder}/next?${this.query()}`);
+        const read = response.ok ? reader(response.body) : () => null;
+        for (let head; (head = await read(8)); ) {
+          const [length, number] = new Uint32Array(head), body = await read(length);
+          if (body) this.receive(`${folder}/${number}`, body);
+        }
+      } catch {
+        // The server is unreachable, or has lost the tab; frames are announced again.
+      } finally {
+        this.isListening = false;
+      }
+    },
+    receive(src, body) {
+      const number = numberOf(src);
+      if (number <= this.newest) return;
+      const frame = { ...decode(body), src };
+      if (!frame.isWhole && !this.screen()[0]) return this.show({ src }); // zoomed since
+      this.newest = number;
+      this.wanted = this.begun = { src };
+      this.fetchedSrc = src;
+      this.enqueue(this.begun, frame, true);
     },
     setLens(lens) {
       this.lens = lens;
@@ -108,12 +144,17 @@ export default {
     // Fetch the newest view, while up to AHEAD others are fetched or drawn; draw them in their order.
     update() {
       if (this.inFlight > AHEAD || this.wanted === this.begun) return;
-      const view = (this.begun = this.wanted), lens = this.lens, isNew = view.src !== this.fetchedSrc;
-      const fetched = isNew ? this.fetchFrame(view.src) : null;
+      const view = (this.begun = this.wanted), isNew = view.src !== this.fetchedSrc;
+      this.newest = Math.max(this.newest, numberOf(view.src));
       this.fetchedSrc = view.src;
+      this.enqueue(view, isNew ? this.fetchFrame(view.src) : null, isNew);
+    },
+    // frame: with its pixels, or when they will have come; null: the one that is drawn then
+    enqueue(view, frame, isNew) {
+      const { lens } = this;
       this.inFlight += 1;
       this.queue = this.queue.then(async () => {
-        this.take(view, lens, isNew ? await fetched : this.drawn, isNew);
+        this.take(view, lens, isNew ? await frame : this.drawn, isNew);
         this.inFlight -= 1;
         this.update();
       });
@@ -126,7 +167,8 @@ export default {
       if (isNew) this.recolor();
       else this.paint();
       if (isNew) setContents(frame.contents); // last: sizes are read above, which a changed text would delay
-      this.$emit("drawn", { src: view.src });
+      this.$emit("drawn", { src: view.src, display: String(this.query()) });
+      if (isNew) this.listen();
       clearTimeout(this.atRest);
       if (!this.drawn.isWhole) this.atRest = setTimeout(this.complete, REST_MS);
     },
@@ -141,6 +183,11 @@ export default {
       this.drawn = { ...this.drawn, pixels, isWhole, limits, histogram };
       this.recolor();
     },
+    // How the next frames are drawn.
+    query() {
+      const { curve, limits } = this.display, near = this.loupeAt() ?? [];
+      return new URLSearchParams({ screen: this.screen(), limits: this.manual ?? limits, curve, near });
+    },
     // Width and height of the screen that a whole frame fills; zeros if all its pixels are needed.
     screen() {
       return this.space.map((side) => (this.zoom || this.cut ? 0 : Math.round(side * devicePixelRatio)));
@@ -149,8 +196,7 @@ export default {
     // needed; null if the server is unreachable or holds only newer frames, which it will announce.
     async fetchFrame(src, whole = false) {
       try {
-        const { curve, limits } = this.display, near = this.loupeAt() ?? [];
-        const query = new URLSearchParams({ screen: this.screen(), limits: this.manual ?? limits, curve, near });
+        const query = this.query();
         if (whole) query.set("whole", 1);
         const response = await fetch(`${window.path_prefix || ""}${src}?${query}`);
         return response.ok ? { ...decode(await response.arrayBuffer()), src } : null;

@@ -22,6 +22,27 @@ export function decode(buffer) {
   return { ...fields, pixels: { data, offset, step, width, height }, isWhole: !fields.shaded };
 }
 
+// A function that returns the next bytes of a stream, as many as asked for; null at its end.
+export function reader(stream) {
+  const source = stream.getReader();
+  let rest = new Uint8Array(0);
+  return async (size) => {
+    const bytes = new Uint8Array(size);
+    for (let at = 0; at < size; ) {
+      if (!rest.length) {
+        const { done, value } = await source.read();
+        if (done) return null;
+        rest = value;
+      }
+      const part = rest.subarray(0, size - at);
+      bytes.set(part, at);
+      at += part.length;
+      rest = rest.subarray(part.length);
+    }
+    return bytes.buffer;
+  };
+}
+
 // A color map from a base64 string of 256 x (red, green, blue): one 32-bit pixel per entry.
 export function palette(base64) {
   const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
