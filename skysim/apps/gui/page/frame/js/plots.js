@@ -3,7 +3,7 @@
 const MARGIN = { left: 4, right: 4, top: 16, bottom: 16 };
 const QUIET = "#8b95a5", BAR = "#46566e", LIMIT = "#f0b429";
 
-// The axis is an inverse hyperbolic sine about the sky, in units of its scatter, see `histogram` in served.py.
+// The axis is an inverse hyperbolic sine about the sky, in units of its scatter, see `histogram` in worker/pixels.py.
 const AXIS_MARGIN = 0.3;
 
 function axisOf({ sky, scatter, range }, width) {
