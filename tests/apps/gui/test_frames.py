@@ -66,7 +66,7 @@ class Source:
     async def run(self, task: str, *arguments: Any) -> Pixels | None:
         if self.image is None:
             raise WorkerLost
-        worker = Worker(shown=levels_of(self.image), number=1)
+        worker = Worker(shown={1: (levels_of(self.image), np.inf)}, number=1)
         return getattr(worker, task)(*arguments)
 
 
@@ -111,7 +111,9 @@ def test_all_pixels_come_from_the_worker_if_it_still_has_them() -> None:
 
 def test_other_limits_come_with_all_pixels() -> None:
     frame = served(sky(2))
-    assert response(frame, Display((0, 0), "min to max"))[0]["limits"] == [sky(2).min(), sky(2).max()]
+    for screen_px in ((0, 0), (999, 999)):
+        found = response(frame, Display(screen_px, "min to max"))[0]["limits"]
+        assert found == [sky(2).min(), sky(2).max()]
 
 
 def reduced(image: np.ndarray, columns: int) -> np.ndarray:
@@ -250,14 +252,15 @@ def test_a_frame_goes_over_the_stream_or_is_announced() -> None:
         frames.add(2, served(sky(2)), alone=False)
         got.append(await first)
         frames.add(3, served(sky(3)), alone=True)  # with a message that belongs to it
-        for number in (4, 5):
-            frames.add(number, served(sky(number)), alone=False)
-        got += [await anext(stream), await anext(stream)]
+        frames.add(4, served(sky(4)), alone=False)  # which this one must not overtake
+        frames.drawn = 4
+        frames.add(5, served(sky(5)), alone=False)
+        got.append(await anext(stream))
         return [*announced], got  # what comes when the loop closes is of no interest
 
     announced, got = asyncio.run(story())
-    assert announced == [1, 3]
-    assert [split(message)[0] for message in got] == [2, 4, 5]
+    assert announced == [1, 3, 4]
+    assert [split(message)[0] for message in got] == [2, 5]
     for number, image in map(split, got):
         np.testing.assert_array_equal(image, sky(number))
 
@@ -273,6 +276,7 @@ def test_a_stream_ends_without_frames_and_gives_way_to_a_newer_one(monkeypatch: 
         frames.add(1, served(sky(1)), alone=False)
         assert await former is None
         got.append(await newer)
+        frames.drawn = 1
         await asyncio.gather(*[one async for one in frames.stream(ALL_PIXELS)])  # idle from the start
         frames.add(2, served(sky(2)), alone=False)
         return [*announced], got  # what comes when the loop closes is of no interest
@@ -296,6 +300,34 @@ def test_a_frame_of_a_lost_stream_is_announced() -> None:
         return announced
 
     assert asyncio.run(story()) == [KEPT_FRAMES + 2]
+
+
+def test_an_idle_stream_announces_what_was_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The connection was lost, and the server has not noticed."""
+    monkeypatch.setattr(served_module, "IDLE_S", 0.02)
+
+    async def story(drawn: int) -> list[int]:
+        announced = list[int]()
+        frames = TabFrames(announced.append)
+        stream = frames.stream(ALL_PIXELS)
+        first = asyncio.ensure_future(anext(stream))
+        await asyncio.sleep(0)
+        frames.add(1, served(sky(1)), alone=False)
+        await first
+        frames.drawn = drawn
+        assert await anext(stream, None) is None
+        return announced
+
+    assert [asyncio.run(story(drawn)) for drawn in (0, 1)] == [[1], []]
+
+
+def test_a_worker_keeps_the_pixels_of_its_newest_images() -> None:
+    worker = Worker(display=Display(SCREEN))
+    for number in range(1, 5):
+        assert worker.show(levels_of(sky(number)), np.inf).number == number
+    kept = [worker.all_pixels(number, ALL_PIXELS) for number in range(1, 6)]
+    assert [pixels is not None for pixels in kept] == [False, True, True, True, False]
+    assert kept[1].data[HEADER_BYTES:] == sky(2).tobytes()
 
 
 def test_lights_are_a_sequence_that_is_sent_as_columns() -> None:

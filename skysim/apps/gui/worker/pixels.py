@@ -133,7 +133,7 @@ def _shade(integers: Any, table: Any, shaded: Any) -> None:
         first[column], last[column] = left // columns, (right - 1) // columns
         head[column] = (min(right, (first[column] + 1) * columns) - left) / width
         tail[column] = (right - last[column] * columns) / width if last[column] > first[column] else 0.0
-    inner = float32(columns / width)
+    inner, last_level = float32(columns / width), int64(table.size - 1)
     for row in numba.prange(rows):
         top, bottom = row * height, (row + 1) * height
         total = np.zeros(width, np.float32)
@@ -146,7 +146,7 @@ def _shade(integers: Any, table: Any, shaded: Any) -> None:
             mean = head[column] * total[first[column]] + tail[column] * total[last[column]]
             for x in range(first[column] + 1, last[column]):
                 mean += inner * total[x]
-            shaded[row, column] = table[int64(mean + float32(0.5))]
+            shaded[row, column] = table[min(int64(mean + float32(0.5)), last_level)]
 
 
 @jit

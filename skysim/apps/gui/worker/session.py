@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # the template sets the environment of numba before it is imp
 
 TEMPLATE = "skysim.apps.gui.template"  # module of the worker from which the others are forked
 SCENE = "SKYSIM_GUI_SCENE"  # environment variable: the scene that the template of the workers sets up
+STOPPED = "the worker of this page has stopped"
 QUEUE_S = 0.2  # between two looks for a free worker
 
 
@@ -76,7 +77,12 @@ class Session:
 
     async def run(self, task: str, *arguments: Any) -> Any:
         """Run a task and return its result. Raises InputError for a user error, WorkerLost if the worker has ended."""
-        return await asyncio.get_running_loop().run_in_executor(self.thread, self.call, task, arguments)
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self.thread, self.call, task, arguments)
+        except (RuntimeError, asyncio.CancelledError) as error:
+            if self in Session.alive:
+                raise
+            raise WorkerLost(STOPPED) from error
 
     def call(self, task: str, arguments: tuple[Any, ...]) -> Any:
         """Send a task and wait for its result; runs in the session's thread."""
@@ -84,7 +90,7 @@ class Session:
             self.pipe.send((task, arguments, self.display))
             status, reply = self.pipe.recv()
         except (EOFError, OSError) as error:
-            raise WorkerLost("the worker of this page has stopped") from error
+            raise WorkerLost(STOPPED) from error
         if status == "error":
             raise InputError(reply)
         return reply

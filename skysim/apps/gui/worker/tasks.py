@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,21 +30,22 @@ from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core.errors import InputError
 from skysim.core.io import images
 
+KEPT_IMAGES = 3  # the page may still show one before the newest
+
 
 @dataclass
 class Worker:
     """State between tasks: the workbench, its flight, and the other image if the page shows one.
 
     display : of the browser, for which frames are made, as far as it is known
-    shown, saturation_dn, number : the image on the page, from where it is saturated, and its number
+    shown : the newest images for the page by number, and from where each is saturated;  number : of the last one
     pushed : the motion of the pushed vehicle, as long as the workbench has its attitude
     other, image : an image that is not of the scene, and its (H, W) pixels;  camera : an open live camera
     """
 
     current: Workbench | None = None
     display: Display | None = None
-    shown: pixels.Levels | None = None
-    saturation_dn: float = math.inf
+    shown: dict[int, tuple[pixels.Levels, float]] = field(default_factory=dict)
     number: int = 0
     flight: playback.Flight | None = None
     pushed: Push | None = None
@@ -72,8 +73,10 @@ class Worker:
         return replace(self.other, pixels=self.show(pixels.levels_of(self.image), self.other.saturation_dn))
 
     def show(self, levels: pixels.Levels, saturation_dn: float) -> Pixels:
-        """Keep the image on the page, and return its pixels for the browser's display."""
-        self.shown, self.saturation_dn, self.number = levels, saturation_dn, self.number + 1
+        """Keep an image for the page, and return its pixels for the browser's display."""
+        self.number += 1
+        self.shown[self.number] = levels, saturation_dn
+        self.shown.pop(self.number - KEPT_IMAGES, None)
         return pixels.pixels_for(self.display or ALL_PIXELS, levels, saturation_dn, self.number)
 
     @property
@@ -92,10 +95,10 @@ class Worker:
         pixels.pixels_for(Display((8, 8)), self.levels, view.saturation_dn)
 
     def all_pixels(self, number: int, display: Display) -> Pixels | None:
-        """All pixels of the image with a number; None if the page shows another one meanwhile."""
-        if self.shown is None or number != self.number:
+        """All pixels of the image with a number; None if it is no longer among the newest."""
+        if number not in self.shown:
             return None
-        return pixels.pixels_for(display._replace(screen_px=(0, 0)), self.shown, self.saturation_dn, number)
+        return pixels.pixels_for(display._replace(screen_px=(0, 0)), *self.shown[number], number)
 
     def open(
         self, scene: str, overrides: Mapping[str, str], solve: bool, angles_deg: Triple | None = None

@@ -20,6 +20,7 @@ from skysim.apps.gui.messages import (
     LIMITS,
     NO_LIGHTS,
     Detection,
+    Display,
     FrameView,
     Lens,
     Light,
@@ -63,7 +64,7 @@ class Sensor:
 
     hover_px : place of the light under the mouse, or None
     sent_number, drawn_number : number of the last frame sent to the browser, and of the last it reported as drawn
-    display_query : how the browser draws frames, as it has reported
+    display_query, display : how the browser draws frames, as it has reported, and what that says
     """
 
     def __init__(self, tab: Tab) -> None:
@@ -78,6 +79,7 @@ class Sensor:
         self.hover_px: tuple[float, float] | None = None
         self.sent_number = self.drawn_number = 0
         self.display_query = ""
+        self.display: Display | None = None
         self.frame_drawn = asyncio.Event()
         with ui.element("div").classes("lab-sensor"):
             self.build_controls()
@@ -152,10 +154,13 @@ class Sensor:
         """The browser reports a drawn frame, and how it draws the next ones."""
         self.drawn_number = int(event.args["src"].rpartition("/")[2])
         self.frame_drawn.set()
+        if self.tab.id in FRAMES:
+            FRAMES[self.tab.id].drawn = self.drawn_number
         query = str(event.args["display"])
         if query != self.display_query:
-            self.display_query = query
-            self.tab.session.display = display_of(dict(parse_qsl(query))) or self.tab.session.display
+            self.display_query, self.display = query, display_of(dict(parse_qsl(query)))
+        if self.display:
+            self.tab.session.display = self.display
 
     async def wait_drawn(self) -> None:
         """Wait until the browser has few frames to draw, so that they do not queue up there."""

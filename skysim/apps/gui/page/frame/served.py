@@ -13,6 +13,7 @@ from nicegui import json
 
 from skysim.apps.gui.messages import LIMITS, Display, Pixels
 from skysim.apps.gui.worker.session import WorkerLost
+from skysim.core.errors import InputError
 from skysim.results.stretch import CURVES
 
 MAX_SCREEN_PX = 10**5
@@ -46,14 +47,14 @@ class ServedFrame:
 
         display : for which the worker makes the next frames;  whole : whether all pixels of this one are needed
 
-        None if all pixels are needed, and the worker has a newer image.
+        None if pixels are missing, and the worker has newer images.
         """
         self.source.display, pixels = display, self.pixels
-        is_partial = pixels.fields["shaded"] or pixels.display.limits != display.limits
-        if is_partial and (whole or not all(display.screen_px)):
+        needs_all = whole or not all(display.screen_px)
+        if needs_all if pixels.fields["shaded"] else pixels.display.limits != display.limits:
             try:
                 pixels = await self.source.run("all_pixels", pixels.number, display)
-            except WorkerLost:
+            except (WorkerLost, InputError):
                 return None
             if pixels is None:
                 return None
@@ -69,17 +70,22 @@ class TabFrames:
 
     announce : sends the number of a frame to the browser, which then requests it
     newest : by number;  waiting : numbers of those to be sent over the stream; None: no stream is open
+    drawn : number of the last frame that the browser has drawn
+    alone : of the last one that did not go over the stream, which later ones must not overtake
     """
 
     announce: Callable[[int], Any]
     newest: dict[int, ServedFrame] = field(default_factory=dict)
     waiting: asyncio.Queue[int] | None = None
+    drawn: int = 0
+    alone: int = 0
 
     def add(self, number: int, frame: ServedFrame, alone: bool) -> None:
         """Keep a frame and send it, or its number. alone : not over the stream, because messages belong to it"""
         self.newest[number] = frame
         self.newest.pop(min(self.newest) if len(self.newest) > KEPT_FRAMES else -1, None)
-        if self.waiting is None or alone:
+        self.alone = number if alone else self.alone
+        if self.waiting is None or self.drawn < self.alone:
             self.announce(number)
         else:
             self.waiting.put_nowait(number)
@@ -89,7 +95,6 @@ class TabFrames:
         the frame's response. Of several streams the newest gets the frames.
         """
         waiting = self.waiting = asyncio.Queue[int]()
-        number = 0
         try:
             while True:
                 number = await asyncio.wait_for(waiting.get(), IDLE_S)
@@ -97,16 +102,13 @@ class TabFrames:
                 data = await frame.response(frame.source.display or display, whole=False) if frame else None
                 if data is not None:
                     yield struct.pack("<II", len(data), number) + data
-                number = 0
         except TimeoutError:
             return
         finally:
             if self.waiting is waiting:
                 self.waiting = None
-            while not waiting.empty():
-                number = waiting.get_nowait()
-            if number:  # the connection was lost before the browser got the newest one
-                self.announce(number)
+                if self.drawn < max(self.newest, default=0):  # the connection was lost before the browser got it
+                    self.announce(max(self.newest))
 
 
 def display_of(query: Mapping[str, str]) -> Display | None:

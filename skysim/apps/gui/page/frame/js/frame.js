@@ -104,15 +104,22 @@ export default {
       try {
         const folder = this.drawn.src.slice(0, this.drawn.src.lastIndexOf("/"));
         const response = await fetch(`${window.path_prefix || ""}${folder}/next?${this.query()}`);
-        const read = response.ok ? reader(response.body) : () => null;
+        if (response.ok) await this.followStream(response.body.getReader(), folder);
+      } catch {
+        // The server is unreachable; it announces the newest frame when it is not.
+      } finally {
+        this.isListening = false;
+      }
+    },
+    async followStream(source, folder) {
+      const read = reader(source);
+      try {
         for (let head; (head = await read(8)); ) {
           const [length, number] = new Uint32Array(head), body = await read(length);
           if (body) this.receive(`${folder}/${number}`, body);
         }
-      } catch {
-        // The server is unreachable, or has lost the tab; frames are announced again.
       } finally {
-        this.isListening = false;
+        source.cancel().catch(() => {});
       }
     },
     receive(src, body) {
@@ -153,10 +160,13 @@ export default {
     enqueue(view, frame, isNew) {
       const { lens } = this;
       this.inFlight += 1;
-      this.queue = this.queue.then(async () => {
-        this.take(view, lens, isNew ? await frame : this.drawn, isNew);
-        this.inFlight -= 1;
-        this.update();
+      this.queue = this.queue.catch(() => {}).then(async () => {
+        try {
+          this.take(view, lens, isNew ? await frame : this.drawn, isNew);
+        } finally {
+          this.inFlight -= 1;
+          this.update();
+        }
       });
     },
     // Draw a fetched frame, or other marks of the one that is drawn.
@@ -175,10 +185,11 @@ export default {
     // Fetch all pixels of the drawn frame, if there are fewer or the limits are others.
     async complete(always = false) {
       clearTimeout(this.atRest);
-      const { drawn } = this;
+      const { drawn, manual } = this, { limits: named, curve } = this.display;
       if (this.inFlight || !drawn || (drawn.isWhole && always !== true)) return;
       const frame = await this.fetchFrame(drawn.src, true);
       if (!frame || this.drawn.src !== drawn.src) return;
+      if (this.display.limits !== named || this.display.curve !== curve || this.manual !== manual) return; // chosen since
       const { pixels, isWhole, limits, histogram } = frame;
       this.drawn = { ...this.drawn, pixels, isWhole, limits, histogram };
       this.recolor();

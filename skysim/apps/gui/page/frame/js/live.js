@@ -9,7 +9,7 @@ function isHeld(element) {
 
 function apply(number) {
   const element = elements.get(number), content = contents.get(number);
-  if (content?.moment !== undefined) window.skysimMoment(Number(content.moment)); // the line over the strips
+  if (content?.moment !== undefined) window.skysimMoment?.(Number(content.moment)); // the line over the strips
   if (!element || !content) return;
   if (content.value !== undefined && !isHeld(element)) element.value = content.value;
   if (content.text !== undefined && element.textContent !== content.text) element.textContent = content.text;

@@ -23,8 +23,7 @@ export function decode(buffer) {
 }
 
 // A function that returns the next bytes of a stream, as many as asked for; null at its end.
-export function reader(stream) {
-  const source = stream.getReader();
+export function reader(source) {
   let rest = new Uint8Array(0);
   return async (size) => {
     const bytes = new Uint8Array(size);
