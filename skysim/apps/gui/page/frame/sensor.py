@@ -20,7 +20,6 @@ from skysim.apps.gui.messages import (
     LIMITS,
     NO_LIGHTS,
     Detection,
-    Display,
     FrameView,
     Lens,
     Light,
@@ -63,8 +62,7 @@ class Sensor:
     """The view and its controls. It shows a frame of the scene, or another image such as a user's.
 
     hover_px : place of the light under the mouse, or None
-    sent_number, drawn_number : number of the last frame sent to the browser, and of the last it reported as drawn
-    display_query, display : how the browser draws frames, as it has reported, and what that says
+    sent_number : of the last frame sent to the browser;  frames : the newest ones
     """
 
     def __init__(self, tab: Tab) -> None:
@@ -77,9 +75,7 @@ class Sensor:
         self.pose: Pose | None = None
         self.statistics = ""  # numbers of the frame, shown while the mouse is on no light
         self.hover_px: tuple[float, float] | None = None
-        self.sent_number = self.drawn_number = 0
-        self.display_query = ""
-        self.display: Display | None = None
+        self.sent_number, self.frames = 0, TabFrames(self.announce)
         self.frame_drawn = asyncio.Event()
         with ui.element("div").classes("lab-sensor"):
             self.build_controls()
@@ -143,8 +139,8 @@ class Sensor:
             self.wait.set_visibility(False)
         self.sent_number += 1  # so that each frame has its own address
         fields = self.fields() | {"contents": self.tab.contents.take()}
-        frames = FRAMES.setdefault(self.tab.id, TabFrames(self.announce))
-        frames.add(self.sent_number, ServedFrame(pixels, fields, self.tab.session), alone)
+        FRAMES[self.tab.id] = self.frames
+        self.frames.add(self.sent_number, ServedFrame(pixels, fields, self.tab.session), alone)
 
     def announce(self, number: int) -> None:
         """Let the browser request a frame."""
@@ -152,19 +148,15 @@ class Sensor:
 
     def drawn(self, event: Any) -> None:
         """The browser reports a drawn frame, and how it draws the next ones."""
-        self.drawn_number = int(event.args["src"].rpartition("/")[2])
+        self.frames.drawn = int(event.args["src"].rpartition("/")[2])
         self.frame_drawn.set()
-        if self.tab.id in FRAMES:
-            FRAMES[self.tab.id].drawn = self.drawn_number
-        query = str(event.args["display"])
-        if query != self.display_query:
-            self.display_query, self.display = query, display_of(dict(parse_qsl(query)))
-        if self.display:
-            self.tab.session.display = self.display
+        display = display_of(dict(parse_qsl(str(event.args["display"]))))
+        if display:
+            self.tab.session.display = display
 
     async def wait_drawn(self) -> None:
         """Wait until the browser has few frames to draw, so that they do not queue up there."""
-        while self.sent_number > self.drawn_number + AHEAD:
+        while self.sent_number > self.frames.drawn + AHEAD:
             self.frame_drawn.clear()
             try:
                 await asyncio.wait_for(self.frame_drawn.wait(), DRAW_TIMEOUT_S)

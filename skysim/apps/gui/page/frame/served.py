@@ -22,7 +22,7 @@ IDLE_S = 2.0  # without a frame, after which a stream ends: a browser has six co
 
 
 class Source(Protocol):
-    """The session of the tab: the worker has all pixels of its newest image."""
+    """The session of the tab: the worker has all pixels of its newest images."""
 
     display: Display | None
 

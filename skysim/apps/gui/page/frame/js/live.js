@@ -9,7 +9,6 @@ function isHeld(element) {
 
 function apply(number) {
   const element = elements.get(number), content = contents.get(number);
-  if (content?.moment !== undefined) window.skysimMoment?.(Number(content.moment)); // the line over the strips
   if (!element || !content) return;
   if (content.value !== undefined && !isHeld(element)) element.value = content.value;
   if (content.text !== undefined && element.textContent !== content.text) element.textContent = content.text;
@@ -28,7 +27,9 @@ export function detach(number) {
 // all: { number: { text, state }, { value } or { moment } }
 export function setContents(all) {
   for (const [number, content] of Object.entries(all)) {
+    const isMoved = content.moment !== contents.get(Number(number))?.moment;
     contents.set(Number(number), content);
+    if (isMoved) window.skysimMoment?.(Number(content.moment)); // the line over the strips
     apply(Number(number));
   }
 }
