@@ -69,6 +69,8 @@ def print_coverage(result: dict[str, Any]) -> None:
 
 def print_survey(survey: dict[str, Any]) -> None:
     """Print a survey: what it found, its coverage, the faults, and the errors if it was simulated."""
+    from skysim.experiments.dome_survey.results.findings import fault_lines
+
     truth = survey.get("truth")
     lines = [
         [
@@ -92,7 +94,8 @@ def print_survey(survey: dict[str, Any]) -> None:
         print_truth(survey)
     print()
     print_coverage(survey)
-    print_faults(survey["faults"])
+    for line in fault_lines(survey["faults"]):
+        print_wrapped(line)
     print_wrapped(f"{survey['map']}: for tracker.map; report: {survey['report']}")
 
 
@@ -118,29 +121,6 @@ def print_truth(survey: dict[str, Any]) -> None:
         print_wrapped(
             f"{when}: " + ", ".join([f"{result['solved']} of {result['stops']} test attitudes solved", *errors])
         )
-
-
-def print_faults(faults: dict[str, Any]) -> None:
-    """Print the faults by LED number."""
-    for led in faults["dark"]:
-        print(f"LED {led} is dark")
-    for led, distance_m in faults["displaced"].items():
-        print(f"LED {led} is {1e3 * distance_m:.1f} mm from its place in the list")
-    for led, shows, others in faults["exchanged"]:
-        alike = f" (or {', '.join(map(str, others))})" if others else ""
-        print(f"LED {shows}{alike} shines at the place of LED {led}: wires or numbers exchanged")
-    for place_m in faults["unlisted"]:
-        print(f"a light that is not in the list shines at {', '.join(f'{one:.3f}' for one in place_m)} m")
-    share = faults["exchange_share"]
-    observable = (
-        f"{100 * share:.0f} % of exchanges would be found"
-        if share
-        else "exchanged LEDs cannot be found: all shine alike; codes or brightness levels would tell them apart"
-    )
-    print_wrapped(
-        f"{len(faults['dark'])} dark, {len(faults['displaced'])} displaced, {len(faults['exchanged'])} exchanged; the"
-        f" other places of the list err by {1e3 * faults['list_sigma_m']:.2g} mm about each axis; {observable}"
-    )
 
 
 PRINTERS: dict[str, Callable[[dict[str, Any]], None]] = {

@@ -315,10 +315,35 @@ class SurveyPlan(NamedTuple):
     """Attitudes to hold for a survey of the dome.
 
     angles_deg : roll, pitch and yaw of each;  shown : LEDs that each shows;  leds : on the dome
-    led_mm     : rms error of an LED predicted after a number of frames; None where they do not determine it
+    steps      : predicted after a number of frames: LEDs measured, and their rms error, mm; None if not determined
     """
 
     angles_deg: tuple[tuple[float, ...], ...]
     shown: tuple[int, ...]
     leds: int
-    led_mm: tuple[tuple[int, float | None], ...]
+    steps: tuple[tuple[int, int, float | None], ...]
+
+
+class SurveyFound(NamedTuple):
+    """What the frames of a survey have measured, and the attitudes to hold next.
+
+    frames, connected : so far, and those that share enough LEDs with others;  measured, seen_once, unseen : LEDs
+    sigma_mm : estimated rms error of the measured LEDs about each axis;  before_mm, error_mm : the true one before the
+        survey and now. None, with the reason in `refusal`, if the frames do not determine them
+    faults : of the dome, a line each
+    ids, known : (N,) the LEDs, and by how much the survey has reduced the uncertainty of each, 0 to 1
+    """
+
+    frames: int
+    connected: int
+    measured: int
+    seen_once: int
+    unseen: int
+    sigma_mm: float | None
+    before_mm: float | None
+    error_mm: float | None
+    faults: tuple[str, ...]
+    refusal: str
+    ids: NDArray[np.int64]
+    known: Floats
+    plan: SurveyPlan

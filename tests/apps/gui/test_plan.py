@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,18 +11,20 @@ import pytest
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from labpage import CHROMIUM, chosen, come, panel, status
+from labpage import CHROMIUM, SLOW_MS, chosen, come, panel, status
 
-from skysim.apps.gui.messages import AmbiguityMap
-from skysim.apps.gui.page.panels.plan import HOLD_S, ambiguity_text, survey_flight
+from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan
+from skysim.apps.gui.page.panels.plan import ambiguity_text, prediction_text, survey_flight, survey_lines
 from skysim.apps.gui.page.style import color_scale
-from skysim.apps.gui.worker.scene import planning
+from skysim.apps.gui.worker.scene import planning, survey
+from skysim.apps.gui.worker.tasks import Worker
 from skysim.core.errors import InputError
 from skysim.dynamics import guidance
 from skysim.experiments.dome_survey import stops
 from skysim.scene import loader
 from skysim.simulation import checks
 from skysim.simulation.testbed import build_testbed
+from skysim.tracking import dome_map_file
 
 pytest_plugins = ["labpage"]
 ANGLES = ((5.0, -3.0, 20.0), (-4.0, 2.0, 140.0))
@@ -61,24 +65,97 @@ def test_the_most_similar_fields_are_named() -> None:
     assert "LED 8 and 3, 95 %" in text
 
 
-def test_a_survey_is_flown_through_its_attitudes_with_frames_over_all_of_it() -> None:
-    flown = loader.load("afit_simsat", survey_flight("afit_simsat", {}, ANGLES))
-    reference = guidance.plan(flown.motion)
-    t_s, found = 0.0, []
-    for leg in reference.legs[:-1]:
-        t_s += leg.duration_s
-        if leg.duration_s == HOLD_S:
-            found.append(reference.state_at(t_s - HOLD_S / 2)[0])
-    assert len(found) == len(ANGLES)
-    wxyz = stops.from_angles(np.array(ANGLES)).as_quat(scalar_first=True)
-    np.testing.assert_allclose(np.abs(np.sum(np.array(found) * wxyz, axis=1)), 1, rtol=0, atol=1e-9)
-    last_s = flown.exposure.first_s + (flown.exposure.frames - 1) / flown.exposure.rate_hz
-    assert reference.duration_s - HOLD_S < last_s <= reference.duration_s
+@pytest.mark.parametrize("overrides", [{}, {"exposure.rate_hz": "0.2", "exposure.time": "4.9 s"}])
+def test_a_survey_is_flown_through_its_attitudes_with_a_frame_at_each(overrides: dict[str, str]) -> None:
+    flown = loader.load("afit_simsat", survey_flight("afit_simsat", overrides, ANGLES))
+    reference, shown = guidance.plan(flown.motion), flown.exposure
+    begin_s = shown.first_s + np.arange(shown.frames) / shown.rate_hz
+    holds = [leg for leg, one in enumerate(flown.motion.maneuver) if one.kind == "hold"]
+    assert len(holds) == len(ANGLES)
+    for leg, angles in zip(holds, ANGLES, strict=True):
+        start_s, end_s = reference.start_s[leg], reference.start_s[leg + 1]
+        wxyz = stops.from_angles(np.array([angles])).as_quat(scalar_first=True)[0]
+        assert abs(reference.state_at(start_s)[0] @ wxyz) == pytest.approx(1, abs=1e-9)
+        assert np.any((begin_s >= start_s) & (begin_s + shown.time_s <= end_s))
+
+
+def flight_of(worker: Worker, overrides: dict[str, str]) -> None:
+    """Open the scene and compute its flight."""
+    worker.open("afit_simsat", overrides, False)
+    worker.begin_flight()
+    while worker.advance_flight(10.0).phase != "done":
+        pass
+
+
+@pytest.mark.slow
+def test_a_survey_goes_on_with_the_frames_flown() -> None:
+    """Its frames are those at the planned attitudes, and more of them measure more LEDs, with errors as estimated."""
+    worker, bench = Worker(), {"motion.control": "prescribed", "motion.maneuver": "[]"}
+    worker.open("afit_simsat", bench, False)
+    plan, measured = worker.plan_survey(6), 0
+    for count in (6, 12):
+        flight_of(worker, survey_flight("afit_simsat", bench, plan.angles_deg))
+        assert worker.flight is not None
+        rows = survey.frames_at_rest(worker.flight)
+        wxyz = np.array([worker.flight.frames[row].view.body_wxyz for row in rows])
+        wanted = stops.from_angles(np.array(plan.angles_deg)).as_quat(scalar_first=True)
+        np.testing.assert_allclose(np.abs(np.sum(wxyz * wanted, axis=1)), 1, rtol=0, atol=1e-9)
+        found = worker.adjust_survey(6)
+        assert (found.frames, found.refusal) == (count, "")
+        assert found.measured > measured
+        assert found.measured + found.seen_once + found.unseen <= len(found.ids) == 1465
+        assert np.sum(found.known > 0) == found.measured
+        plan, measured = found.plan, found.measured
+    assert found.error_mm is not None
+    assert found.sigma_mm is not None
+    assert found.before_mm is not None
+    assert 0.6 < found.error_mm / found.sigma_mm < 1.6
+    assert found.error_mm < 0.5 * found.before_mm
+    with pytest.raises(InputError, match="has the frames of this flight already"):
+        worker.adjust_survey(6)
+    check_map(worker, found)
+    worker.open("afit_simsat", {**bench, "seed": "9"}, False)
+    with pytest.raises(InputError, match="no survey of this scene: plan one"):
+        worker.survey_map()
+
+
+def check_map(worker: Worker, found: SurveyFound) -> None:
+    """The map's LEDs are those measured, at the true places but for the error that the page shows."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "leds.ecsv"
+        path.write_bytes(worker.survey_map())
+        dome = dome_map_file.read_dome_map(path)
+    assert set(dome.id) == set(found.ids[found.known > 0])
+    sources = worker.workbench.testbed.sources
+    place_m = dict(zip(sources.id.tolist(), sources.place[:, :3], strict=True))
+    error_m = dome.position_m - np.array([place_m[led] for led in dome.id.tolist()])
+    error_mm = 1e3 * float(np.sqrt(np.mean(error_m**2)))
+    assert error_mm == pytest.approx(found.error_mm, rel=1e-6)
+
+
+def test_a_survey_has_no_frames_of_other_flights() -> None:
+    worker = Worker()
+    worker.open("afit_simsat", {}, False)
+    with pytest.raises(InputError, match="no flight"):
+        worker.adjust_survey(4)
+    worker.begin_flight()
+    with pytest.raises(InputError, match="no survey of this scene: plan one"):
+        worker.adjust_survey(4)
+
+
+def test_a_survey_that_determines_nothing_says_so() -> None:
+    plan = SurveyPlan(ANGLES, (30, 31), 1465, ((4, 0, None), (6, 50, 0.46)))
+    refused = SurveyFound(2, 0, 0, 60, 1405, None, None, None, (), "too few", np.arange(3), np.zeros(3), plan)
+    assert survey_lines(refused) == [
+        "2 frames: no LED measured; 60 seen once, 1405 not seen.",
+        "Not determined yet: too few.",
+    ]
+    assert prediction_text(plan) == "Predicted of the 1465 LEDs: after 6 frames 50 LEDs to 0.46 mm rms."
 
 
 def test_a_plan_needs_two_frames() -> None:
     with pytest.raises(InputError, match="frames 1: allowed: 2 to"):
-        planning.survey(loader.load("afit_simsat"), 1)
+        survey.begin(loader.load("afit_simsat"), 1)
 
 
 def test_colors_are_told_apart_by_their_lightness() -> None:
@@ -98,12 +175,23 @@ def test_check_map_and_survey_in_the_page(page: Any) -> None:
     page.locator(".lab-facts").get_by_text("field of view").wait_for()
     page.get_by_role("button", name="Map", exact=True).click()
     page.get_by_text("fields look like another one").wait_for()
+    page.get_by_label("frames", exact=True).fill("5")
     page.get_by_role("button", name="Plan", exact=True).click()
-    page.get_by_text("Predicted rms error").wait_for()
+    page.get_by_text("Predicted of the 1465 LEDs").wait_for()
     wanted = page.locator(".lab-stops .num").nth(5).inner_text()  # the first roll, after five heads
     page.get_by_role("button", name="Point to attitude 1", exact=True).click()
     assert come(lambda: abs(float(page.get_by_label("angle 1").input_value()) - float(wanted)) < 0.006)
-    page.get_by_role("button", name="Fly", exact=True).click()
+    fly, adjust, save = (page.get_by_role("button", name=name, exact=True) for name in ("Fly", "Adjust", "Map file"))
+    assert adjust.is_disabled()
+    fly.click()
     page.get_by_role("button", name="Stop", exact=True).wait_for()  # of the flight that is computed
-    page.get_by_role("button", name="Stop", exact=True).click()
-    page.get_by_role("button", name="Simulate", exact=True).wait_for()
+    page.get_by_role("button", name="Simulate", exact=True).wait_for(timeout=SLOW_MS)
+    panel(page, "Plan")
+    adjust.click()
+    page.get_by_text("5 frames, ").wait_for()
+    page.get_by_text("after 10 frames").wait_for()  # the next attitudes, which can be flown
+    assert adjust.is_disabled()
+    assert page.locator(".lab-stops .num").nth(5).inner_text() != wanted
+    with page.expect_download() as download:
+        save.click()
+    assert download.value.suggested_filename == "afit_simsat_leds.ecsv"

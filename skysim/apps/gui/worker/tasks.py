@@ -20,11 +20,12 @@ from skysim.apps.gui.messages import (
     PlanCheck,
     PushedView,
     SceneInfo,
+    SurveyFound,
     SurveyPlan,
     Triple,
 )
 from skysim.apps.gui.worker import export, photo, pixels, playback
-from skysim.apps.gui.worker.scene import planning, pointing
+from skysim.apps.gui.worker.scene import planning, pointing, survey
 from skysim.apps.gui.worker.scene.push import Grip, Push
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core.errors import InputError
@@ -40,6 +41,7 @@ class Worker:
     display : of the browser, for which frames are made, as far as it is known
     shown : the newest images for the page by number, and from where each is saturated;  number : of the last one
     pushed : the motion of the pushed vehicle, as long as the workbench has its attitude
+    surveyed : the survey of the scene's dome, if one was planned
     other, image : an image that is not of the scene, and its (H, W) pixels;  camera : an open live camera
     """
 
@@ -49,6 +51,7 @@ class Worker:
     number: int = 0
     flight: playback.Flight | None = None
     pushed: Push | None = None
+    surveyed: survey.Survey | None = None
     other: photo.Photo | None = None
     image: NDArray | None = None
     scene: str = ""
@@ -78,6 +81,13 @@ class Worker:
         self.shown[self.number] = levels, saturation_dn
         self.shown.pop(self.number - KEPT_IMAGES, None)
         return pixels.pixels_for(self.display or ALL_PIXELS, levels, saturation_dn, self.number)
+
+    @property
+    def survey_of_scene(self) -> survey.Survey:
+        """The survey of the current scene. Raises InputError if none was planned."""
+        if self.surveyed is None or not self.surveyed.is_of(self.workbench.scene):
+            raise InputError("no survey of this scene: plan one")
+        return self.surveyed
 
     @property
     def levels(self) -> pixels.Levels:
@@ -146,8 +156,20 @@ class Worker:
     def ambiguity(self) -> AmbiguityMap:
         return planning.ambiguity(self.workbench.testbed)
 
-    def survey(self, frames: int) -> SurveyPlan:
-        return planning.survey(self.workbench.scene, frames)
+    def plan_survey(self, frames: int) -> SurveyPlan:
+        """Begin a survey of the scene's dome."""
+        self.surveyed, plan = survey.begin(self.workbench.scene, frames)
+        return plan
+
+    def adjust_survey(self, frames: int) -> SurveyFound:
+        """Adjust the dome to the frames flown so far, and plan further ones. Raises InputError if none are new."""
+        if self.flight is None:
+            raise InputError("no flight: fly the survey's attitudes")
+        return self.survey_of_scene.adjust(self.flight, frames)
+
+    def survey_map(self) -> bytes:
+        """The file for `tracker.map`. Raises InputError if nothing is measured."""
+        return self.survey_of_scene.map_file()
 
     def begin_flight(self) -> FlightStep:
         """Begin to compute the scene's flight; `advance_flight` does the work."""

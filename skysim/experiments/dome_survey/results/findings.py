@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -128,6 +128,29 @@ def find_faults(run: SurveyRun) -> DomeFaults:
         {int(leds.id[row]): survey.leds.position_m[row].tolist() for row in (*rows, *(x.led for x in exchanges))},
         [stray.position_m.tolist() for stray in stray_lights(run)],
         share,
+    )
+
+
+def fault_lines(faults: Mapping[str, Any]) -> Iterator[str]:
+    """Faults as lines of text, by LED number, and a summary. faults : the fields of a `DomeFaults`"""
+    for led in faults["dark"]:
+        yield f"LED {led} is dark"
+    for led, distance_m in faults["displaced"].items():
+        yield f"LED {led} is {1e3 * distance_m:.1f} mm from its place in the list"
+    for led, shows, others in faults["exchanged"]:
+        alike = f" (or {', '.join(map(str, others))})" if others else ""
+        yield f"LED {shows}{alike} shines at the place of LED {led}: wires or numbers exchanged"
+    for place_m in faults["unlisted"]:
+        yield f"a light that is not in the list shines at {', '.join(f'{one:.3f}' for one in place_m)} m"
+    share = faults["exchange_share"]
+    observable = (
+        f"{100 * share:.0f} % of exchanges would be found"
+        if share
+        else "exchanged LEDs cannot be found: all shine alike; codes or brightness levels would tell them apart"
+    )
+    yield (
+        f"{len(faults['dark'])} dark, {len(faults['displaced'])} displaced, {len(faults['exchanged'])} exchanged; the"
+        f" other places of the list err by {1e3 * faults['list_sigma_m']:.2g} mm about each axis; {observable}"
     )
 
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from nicegui import run, ui
 
-from skysim.apps.gui.messages import AmbiguityMap, PlanCheck, SurveyPlan
+from skysim.apps.gui.messages import AmbiguityMap, PlanCheck, SurveyFound, SurveyPlan
 from skysim.apps.gui.page import forms
 from skysim.apps.gui.page.style import color_scale
 from skysim.dynamics import guidance
@@ -19,12 +20,16 @@ from skysim.scene.sections.motion import PRESCRIBED
 if TYPE_CHECKING:
     from skysim.apps.gui.page.page import Tab
 
-HOLD_S = 2.0  # at each attitude of a survey that is flown
+# Of a survey that is flown: few frames while the vehicle slews, and a whole exposure in each hold.
+SURVEY_RATE_HZ, HOLD_PERIODS = 0.5, 2.0
 FRAMES = 20  # of a survey, at first
 ALIKE = 0.9  # of the LEDs that coincide: a tracker without a prior refuses the field as ambiguous
 UNCHECKED = "Check computes what this scene will show and how accurate its tracker will be. Nothing is rendered."
 UNMAPPED = "Map compares the fields of the dome with one another: a field that looks like another one is ambiguous."
-UNPLANNED = "Plan chooses the attitudes from which a survey measures the dome's LEDs best."
+UNPLANNED = (
+    "Plan chooses the attitudes from which a survey measures the dome's LEDs best. Fly takes frames at them, Adjust"
+    " measures the LEDs by all frames flown so far and plans the next attitudes."
+)
 
 
 class PlanPanel:
@@ -33,6 +38,7 @@ class PlanPanel:
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
         self.plan: SurveyPlan | None = None
+        self.lines: Sequence[str] = ()
         with self.part():
             ui.button("Check", on_click=self.check).props("dense outline size=sm").mark("check")
         self.facts = ui.column().classes("w-full gap-1").mark("check-result")
@@ -40,19 +46,26 @@ class PlanPanel:
             ui.button("Map", on_click=self.map).props("dense outline size=sm").mark("map")
         self.fields = ui.column().classes("w-full gap-1").mark("map-result")
         with self.part():
-            ui.button("Plan", on_click=self.survey).props("dense outline size=sm").mark("survey")
+            ui.button("Plan", on_click=self.plan_survey).props("dense outline size=sm").mark("survey")
             self.frames = ui.number(value=FRAMES, min=2, step=1, label="frames").props("dense outlined").classes("w-24")
-            self.fly = ui.button("Fly", on_click=self.fly_plan).props("dense outline size=sm").mark("fly-survey")
+            self.fly = self.survey_button("Fly", self.fly_plan, "fly the vehicle to these attitudes")
+            self.adjust_button = self.survey_button("Adjust", self.adjust, "adjust LEDs, lever and lens to all frames")
+            self.save_map = self.survey_button("Map file", self.download_map, "save the LEDs for tracker.map")
         self.stops = ui.column().classes("w-full gap-1").mark("survey-result")
         self.clear()
 
     def part(self) -> ui.row:
         return ui.row().classes("w-full no-wrap items-center gap-2").style("margin-top: 8px")
 
+    def survey_button(self, label: str, action: Callable[[], Any], title: str) -> ui.button:
+        button = ui.button(label, on_click=action).props(f'dense outline size=sm title="{title}"')
+        return button.classes("flex-none")
+
     def clear(self) -> None:
         """Say what each part does, because nothing is known of this scene yet."""
-        self.plan = None
-        self.fly.set_enabled(False)
+        self.plan, self.lines = None, ()
+        for button in (self.fly, self.adjust_button, self.save_map):
+            button.set_enabled(False)
         for column, text in ((self.facts, UNCHECKED), (self.fields, UNMAPPED), (self.stops, UNPLANNED)):
             column.clear()
             with column:
@@ -96,20 +109,41 @@ class PlanPanel:
 
     # The survey.
 
-    async def survey(self) -> None:
-        frames = int(self.frames.value or 0)
-        found: SurveyPlan | None = await self.tab.run_task("survey", frames, activity="planning the survey …")
+    async def plan_survey(self) -> None:
+        """Plan the first attitudes of a new survey."""
+        found: SurveyPlan | None = await self.tab.run_task(
+            "plan_survey", int(self.frames.value or 0), activity="planning the survey …"
+        )
+        if found is not None:
+            self.show_survey([prediction_text(found)], found)
+
+    async def adjust(self) -> None:
+        """Adjust the dome to the frames flown, and show what they measure and the attitudes to hold next."""
+        found: SurveyFound | None = await self.tab.run_task(
+            "adjust_survey", int(self.frames.value or 0), activity="adjusting the survey …"
+        )
         if found is None:
             return
-        self.plan = found
+        lines = survey_lines(found)
+        self.show_survey([*lines, prediction_text(found.plan)], found.plan)
+        self.save_map.set_enabled(not found.refusal)
+        self.tab.scene_3d.color_lights(found.ids, found.known)
+        self.tab.log(f"survey of {Path(self.tab.scene).name}: {lines[0]}")
+
+    def show_survey(self, lines: Sequence[str], plan: SurveyPlan) -> None:
+        """Show what a survey has found and its next attitudes, which can then be flown."""
+        self.plan, self.lines = plan, lines
         self.fly.set_enabled(True)
+        self.adjust_button.set_enabled(False)
+        self.save_map.set_enabled(False)
         self.stops.clear()
         with self.stops:
-            ui.label(prediction_text(found))
+            for line in lines:
+                ui.label(line).style("overflow-wrap: anywhere")
             with ui.element("div").classes("lab-stops mono"):
                 for head in ("", "roll °", "pitch °", "yaw °", "LEDs"):
                     ui.label(head).classes("quiet num")
-                for number, (angles, leds) in enumerate(zip(found.angles_deg, found.shown, strict=True), 1):
+                for number, (angles, leds) in enumerate(zip(plan.angles_deg, plan.shown, strict=True), 1):
                     button = ui.button(str(number), on_click=partial(self.point, number - 1)).props(
                         "dense flat size=sm"
                     )
@@ -126,11 +160,20 @@ class PlanPanel:
     async def fly_plan(self) -> None:
         """Change the scene's maneuver to the plan's attitudes, in order, and compute this flight."""
         assert self.plan is not None
-        angles, tab = self.plan.angles_deg, self.tab
-        overrides = await run.io_bound(survey_flight, tab.scene, dict(tab.overrides), angles)
-        if await tab.open(tab.scene, overrides):
-            tab.tabs.set_value("Run")
-            await tab.run_panel.simulate()
+        plan, lines, tab = self.plan, self.lines, self.tab
+        flight = survey_flight, tab.scene, dict(tab.overrides), plan.angles_deg
+        overrides = await tab.await_result(run.io_bound(*flight))
+        if overrides is None or not await tab.open(tab.scene, overrides):
+            return
+        self.show_survey(lines, plan)  # the survey goes on, although the scene has changed
+        tab.tabs.set_value("Run")
+        await tab.run_panel.simulate()
+        self.adjust_button.set_enabled(self.plan is plan and bool(tab.run_panel.rows))
+
+    async def download_map(self) -> None:
+        data: bytes | None = await self.tab.run_task("survey_map")
+        if data is not None:
+            ui.download(data, f"{Path(self.tab.scene).stem}_leds.ecsv")
 
 
 def ambiguity_text(found: AmbiguityMap) -> str:
@@ -146,24 +189,42 @@ def ambiguity_text(found: AmbiguityMap) -> str:
 
 
 def prediction_text(plan: SurveyPlan) -> str:
-    """The error that the survey is predicted to reach."""
-    steps = ", ".join(f"{mm:.2g} mm after {count}" for count, mm in plan.led_mm if mm is not None)
-    return f"Predicted rms error of the {plan.leds} LEDs that are measured: {steps or 'not determined'} frames."
+    """What a survey is predicted to reach with the attitudes of its plan."""
+    steps = [f"after {frames} frames {measured} LEDs to {mm:.2g} mm rms" for frames, measured, mm in plan.steps if mm]
+    return f"Predicted of the {plan.leds} LEDs: {'; '.join(steps) or 'none measured, the frames are too few'}."
+
+
+def survey_lines(found: SurveyFound) -> list[str]:
+    """What the frames of a survey have measured, and the faults of the dome."""
+    unmeasured = f"{found.seen_once} seen once, {found.unseen} not seen."
+    if found.refusal:
+        return [f"{found.frames} frames: no LED measured; {unmeasured}", f"Not determined yet: {found.refusal}."]
+    return [
+        f"{found.frames} frames, {found.connected} of them connected: {found.measured} of {len(found.ids)} LEDs"
+        f" measured to {found.sigma_mm:.2g} mm rms about each axis (1σ); their true error is"
+        f" {found.error_mm:.2g} mm, {found.before_mm:.2g} mm before. {unmeasured}",
+        *found.faults,
+        "The 3-D view shows by how much the uncertainty of each LED is reduced: measured ones are bright.",
+    ]
 
 
 def survey_flight(
     scene: str, overrides: Mapping[str, str], angles_deg: tuple[tuple[float, ...], ...]
 ) -> dict[str, str]:
-    """Overrides with which the vehicle slews to each attitude and holds it, with frames over the whole time."""
-    legs = []
-    for roll, pitch, yaw in angles_deg:
-        legs.append(
-            {"kind": "slew", "roll_deg": round(roll, 3), "pitch_deg": round(pitch, 3), "yaw_deg": round(yaw, 3)}
-        )
-        legs.append({"kind": "hold", "duration": f"{HOLD_S:g} s"})
-    flown = {**overrides, "motion.maneuver": forms.yaml_line(legs)}
-    if forms.validated_scene(scene, overrides).motion.control is None:
+    """Overrides with which the vehicle slews to each attitude and holds it, with frames over the whole time.
+
+    An exposure is no longer than the frame period, so one lies wholly in a hold of two periods. Raises InputError.
+    """
+    before = forms.validated_scene(scene, overrides)
+    rate_hz = min(SURVEY_RATE_HZ, before.exposure.rate_hz)
+    legs = list[dict[str, object]]()
+    for angles in angles_deg:
+        named = zip(("roll_deg", "pitch_deg", "yaw_deg"), angles, strict=True)
+        legs.append({"kind": "slew", **{name: round(angle, 3) for name, angle in named}})
+        legs.append({"kind": "hold", "duration": f"{HOLD_PERIODS / rate_hz:g} s"})
+    flown = {**overrides, "motion.maneuver": forms.yaml_line(legs), "exposure.rate_hz": f"{rate_hz:g}"}
+    if before.motion.control is None:
         flown["motion.control"] = PRESCRIBED
     loaded = forms.validated_scene(scene, flown)
     duration_s = guidance.plan(loaded.motion).duration_s - loaded.exposure.first_s
-    return {**flown, "exposure.frames": str(max(math.floor(duration_s * loaded.exposure.rate_hz), 1))}
+    return {**flown, "exposure.frames": str(max(math.floor(duration_s * rate_hz), 1))}
