@@ -44,6 +44,7 @@ OUT_OF_REACH = {
     "skysim.apps.gui.page.panels.monte_carlo.MonteCarloPanel.study_file": OURS,
     "skysim.apps.gui.page.shell.history.History.read": "the page's address, which `View.from_query` checks",
     "skysim.apps.gui.worker.pixels.levels_from": "frames that the worker has written to a file of its own",
+    "skysim.apps.gui.worker.scene.survey.Survey.map_file": "the map that it has just written",
     "skysim.apps.gui.worker.study_process.monte_carlo": "values of the page's form, checked by `loader.load`",
     "skysim.core.io.guard.fits_tiles.decode": GUARDED,
     "skysim.dynamics.multibody.mjcf_trial.run_trial": GUARDED,
