@@ -13,6 +13,7 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from skysim.apps.gui.page import style
 from skysim.apps.gui.page.frame import overlay
+from skysim.apps.gui.page.page import PANELS
 from skysim.apps.gui.page.shell.palette import Command, matching
 from skysim.apps.gui.page.shell.wording import for_page
 from skysim.apps.gui.worker.study_process import MAX_STUDIES, StudyProcess
@@ -98,6 +99,25 @@ def test_the_time_of_a_first_frame_is_not_that_of_compiling() -> None:
 
 # In the browser.
 
+# Texts of the panels by their contrast, the least first: (L1 + 0.05) / (L2 + 0.05) of the relative luminances (WCAG 2).
+# Controls that are switched off need none.
+CONTRASTS = """() => {
+  const rgba = text => { const [r, g, b, a = 1] = text.match(/[\\d.]+/g).map(Number); return [r, g, b, a]; };
+  const over = ([r, g, b, a], [x, y, z]) => [a * r + (1 - a) * x, a * g + (1 - a) * y, a * b + (1 - a) * z, 1];
+  const ground = at => { const own = rgba(getComputedStyle(at).backgroundColor);
+    return own[3] === 1 || !at.parentElement ? own : over(own, ground(at.parentElement)); };
+  const linear = c => (c /= 255) <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4;
+  const light = ([r, g, b]) => 0.2126 * linear(r) + 0.7152 * linear(g) + 0.0722 * linear(b) + 0.05;
+  const hasText = at => [...at.childNodes].some(one => one.nodeType === Node.TEXT_NODE && one.data.trim());
+  const found = [...document.querySelectorAll('.lab-head *, .lab-card *, .lab-bar *, .lab-panels *, .lab-keys *')]
+    .filter(at => hasText(at) && at.checkVisibility() && !at.closest('[disabled], .disabled')).map(at => {
+      const { color, filter } = getComputedStyle(at), dim = Number(filter.match(/brightness\\(([\\d.]+)\\)/)?.[1] ?? 1);
+      const [r, g, b, a] = rgba(color), below = ground(at);
+      const ends = [light(below), light(over([dim * r, dim * g, dim * b, a], below))];
+      return [Math.max(...ends) / Math.min(...ends), at.innerText]; });
+  return found.sort((a, b) => a[0] - b[0]);
+}"""
+
 
 @pytest.fixture(scope="module")
 def tab_of_own(browser: Any, server: Server) -> Any:
@@ -129,25 +149,44 @@ def test_every_action_is_found_by_ctrl_k(tab_of_own: Any) -> None:
 
 @pytest.mark.browser
 @in_browser
+def test_texts_are_read_in_both_themes(tab_of_own: Any) -> None:
+    """WCAG 2 demands a contrast of 4.5 for text of this size."""
+    page = tab_of_own
+    for _ in range(2):
+        for name in PANELS:
+            panel(page, name)
+            page.wait_for_timeout(300)  # the tab's own color changes gradually
+            contrast, text = page.evaluate(CONTRASTS)[0]
+            assert contrast > 4.5, (name, text)
+        change_theme(page)
+
+
+def change_theme(page: Any) -> None:
+    """Change between the dark and the light theme."""
+    before = ground(page)
+    page.keyboard.press("Control+k")
+    page.get_by_label("Action").fill("theme")
+    page.get_by_role("option").filter(has_text="theme").click()
+    page.get_by_role("dialog").wait_for(state="detached")
+    assert come(lambda: ground(page) != before)
+
+
+def ground(page: Any) -> str:
+    """Color behind the panels."""
+    return str(page.evaluate("getComputedStyle(document.body).backgroundColor"))
+
+
+@pytest.mark.browser
+@in_browser
 def test_the_theme_and_the_splitter_are_remembered(tab_of_own: Any) -> None:
     page = tab_of_own
-
-    def ground() -> str:
-        return str(page.evaluate("getComputedStyle(document.body).backgroundColor"))
 
     def wide() -> float:
         return float(page.locator(".lab-side").bounding_box()["width"])
 
-    def toggle() -> None:
-        page.keyboard.press("Control+k")
-        page.get_by_label("Action").fill("theme")
-        page.get_by_role("option").filter(has_text="theme").click()
-        page.get_by_role("dialog").wait_for(state="detached")
-
-    dark, before = ground(), wide()
-    toggle()
-    assert come(lambda: ground() != dark)
-    light = ground()
+    before = wide()
+    change_theme(page)
+    light = ground(page)
     page.mouse.move(1280 - before, 400)
     page.mouse.down()
     page.mouse.move(1280 - before - 80, 400, steps=4)
@@ -161,11 +200,10 @@ def test_the_theme_and_the_splitter_are_remembered(tab_of_own: Any) -> None:
     kept = wide()
     page.reload()
     page.locator(".lab-frame canvas[data-frame]").wait_for()
-    assert come(lambda: ground() == light)
+    assert come(lambda: ground(page) == light)
     assert wide() == kept
     pictured(page, "light")
-    toggle()
-    assert come(lambda: ground() == dark)
+    change_theme(page)
 
 
 @pytest.mark.browser

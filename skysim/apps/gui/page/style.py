@@ -52,7 +52,7 @@ def format_number(value: float) -> str:
 CSS = f"""
 body.body--dark {{ {variables(DARK)} }}
 body.body--light {{ {variables(LIGHT)}; --q-primary: {LIGHT["accent"]} !important }}
-body.body--light .lab-bar .q-checkbox__label {{ filter: brightness(.62) }}
+body.body--light .lab-bar .q-checkbox__label {{ filter: brightness(.5) }}
 :root {{ --nicegui-default-padding: 0; --nicegui-default-gap: 0 }}
 body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   font: 13px/1.45 Inter, system-ui, sans-serif }}
@@ -114,8 +114,8 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-space > canvas {{ position: absolute; inset: 0; width: 100%; height: 100%; touch-action: none }}
 .lab-space > .lab-names {{ pointer-events: none }}
 .lab-tag {{ position: absolute; left: 0; top: 0; pointer-events: none; color: #fff; background: #0d1015b0 }}
-.lab-looks {{ position: absolute; right: 10px; top: 8px; display: flex; gap: 4px }}
-.lab-looks > .q-btn {{ color: #9cc4ff; background: #0d1015b0 }}
+.lab-looks {{ position: absolute; right: 10px; top: 8px; display: flex; gap: 4px; z-index: 1 }}
+.lab-looks > .q-btn {{ color: #9cc4ff; background: #0d1015 }}
 .lab-push {{ position: absolute; right: 10px; top: 38px; display: flex; gap: 10px; align-items: center;
   color: #d7dce4; background: #0d1015b0 }} .lab-push > .q-btn {{ color: #9cc4ff }}
 .lab-lights {{ width: 100%; border-collapse: collapse; cursor: default; text-align: right }}
@@ -174,7 +174,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .q-field--dense.q-field--float .q-field__label {{ transform: translateY(-38%) scale(.85) }}
 .q-select.q-field--dense.q-field--labeled .q-field__native > span {{ margin-top: -12px }}
 .lab-trial .q-field__control {{ padding: 0 4px 0 8px }} .lab-panels .q-btn {{ padding: 2px 8px }}
-.lab-panels .q-uploader__header {{ background: {COLORS["line"]} }}
+.lab-panels .q-uploader__header {{ background: {COLORS["line"]}; color: inherit }}
 .q-field--dense .q-field__suffix {{ align-self: center; padding: 0 }}
 .lab-trial {{ display: grid; width: 100%; grid-template-columns: 1fr 1.4fr 1fr 1fr .7fr 1fr; gap: 6px;
   margin: 8px 0 }}

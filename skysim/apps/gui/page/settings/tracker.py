@@ -53,7 +53,11 @@ class TrackerPanel:
         with ui.row().classes("w-full no-wrap items-center gap-2"):
             self.arcsec = ui.number("noise, ″ an axis", min=0, step=1).props("dense outlined").mark("noise-arcsec")
             self.arcsec.on("blur", self.typed).on("keydown.enter", self.typed)
-            magnitude = ui.number("noise, magnitudes", min=0, max=5, step=0.05).props("dense outlined")
+            magnitude = (
+                ui.number("noise, magnitudes", min=0, max=5, step=0.05)
+                .props("dense outlined")
+                .classes("w-36 flex-none")
+            )
             magnitude.bind_value(study.magnitude)
             ui.checkbox("with noise").props("dense size=xs").bind_value(study.with_noise).mark("model-noise")
         study.noise.on_value_change(self.show_noise)
