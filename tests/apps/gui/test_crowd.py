@@ -86,6 +86,9 @@ def test_twenty_tabs_on_two_workers(browser: Any, tmp_path: Path) -> None:
                 page.get_by_text("This page opens when another one has been closed.").wait_for()
             assert come(lambda: sorted(map(place, waiting)) == list(range(TABS - WORKERS)))
             pictured(waiting[-1], "test_twenty_tabs_on_two_workers")
+            for page in waiting:  # an animation would take the processor from those who work
+                assert page.evaluate("document.getAnimations().length") == 0
+                assert page.locator(".lab-waited").inner_text().endswith(" s")
             status(second, "solved")
             waiting.sort(key=place)
         status(waiting[0], "solved")  # the second is closed

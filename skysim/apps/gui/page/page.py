@@ -138,7 +138,7 @@ class Tab:
             self.live_button.set_visibility(False)
             self.title = ui.label().classes("lab-title quiet ellipsis")
             self.message = ui.label().classes("lab-said").props('role="status"').mark("message")
-            self.spinner = ui.spinner(size="16px").classes("lab-busy").mark("busy")
+            self.busy = ui.icon("hourglass_empty", size="16px").classes("lab-busy").mark("busy")
             self.latency = LiveText(self.contents).classes("lab-rate mono quiet").mark("rate")
             self.latency.props('title="latency: from the request for a frame to its arrival"')
             self.noise = ui.switch("noise", value=True, on_change=self.switch_noise).props("dense size=xs")
@@ -250,7 +250,7 @@ class Tab:
         if result is None:
             self.picker.set_value(self.scene)
             if self.view is None:
-                self.sensor.show_waiting(f"{Path(scene).name} cannot be set up:", self.message_text)
+                self.sensor.show_waiting(f"{Path(scene).name} cannot be set up:", self.message_text, in_vain=True)
             return False
         self.scene_info, view = result
         control = (await asyncio.to_thread(load, path, overrides)).motion.control
@@ -337,12 +337,12 @@ class Tab:
         activity : message shown until the task ends
         """
         self.show_message(activity, "quiet")
-        self.spinner.set_visibility(True)
+        self.busy.set_visibility(True)
         try:
             return await self.await_result(self.session.run(task, *arguments))
         finally:
             if self.is_open:
-                self.spinner.set_visibility(False)
+                self.busy.set_visibility(False)
                 if activity and self.message_text == activity:
                     self.show_message("")
 

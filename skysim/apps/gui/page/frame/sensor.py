@@ -82,7 +82,8 @@ class Sensor:
             with Canvas().mark("sensor") as self.canvas:
                 self.hover = LiveText(tab.contents).classes("mono").mark("hover")
             with self.canvas.add_slot("wait"), ui.element("div").classes("lab-wait") as self.wait:
-                ui.spinner(size="28px")
+                # No spinner: each takes a sixth of a core from the worker that it waits for, without a graphics card.
+                self.waited = ui.element("div").classes("lab-waited mono")
                 self.wait_label = ui.label().mark("wait")
         tab.contents.send = lambda contents: self.canvas.run_method("setContents", contents)
         self.canvas.on("hover", self.hover_changed)
@@ -92,9 +93,10 @@ class Sensor:
         self.update_display()
         self.show_waiting(f"Setting up {Path(tab.scene).name} …", FIRST_START)
 
-    def show_waiting(self, *lines: str) -> None:
-        """Show what the first frame waits for, or the reason for none."""
+    def show_waiting(self, *lines: str, in_vain: bool = False) -> None:
+        """Show what the first frame waits for, and for how long; or why there is none (in_vain)."""
         self.wait_label.set_text("\n".join(lines))
+        self.waited.set_visibility(not in_vain)
 
     def build_controls(self) -> None:
         with ui.element("div").classes("lab-bar"):

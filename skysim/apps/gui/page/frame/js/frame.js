@@ -46,6 +46,8 @@ export default {
       drawn: null, // the view on the canvas, with its pixels, all or fewer
       atRest: null, // timer
       plottedAt: 0,
+      openedAt: performance.now(),
+      clock: null, // timer while there is no frame
       lens: null,
       zoom: null, // { scale, x, y }: screen pixels per pixel, and the pixel in the middle; null: the whole frame
       cursor: null, // [x, y] in the frame's pixels
@@ -73,9 +75,11 @@ export default {
     });
     for (const canvas of [this.$refs.frame, this.$refs.loupe, this.$refs.plot]) this.watcher.observe(canvas);
     window.addEventListener("skysim-hover", this.ring);
+    this.clock = setInterval(this.showWaited, 1000);
     window.addEventListener("keydown", this.listen); // the key's frame then comes without a request of its own
   },
   beforeUnmount() {
+    clearInterval(this.clock);
     window.removeEventListener("keydown", this.listen);
     window.removeEventListener("skysim-hover", this.ring);
     this.watcher.disconnect();
@@ -91,6 +95,12 @@ export default {
     // From the server.
 
     setContents,
+    // Timer: for how long the first frame has been waited for.
+    showWaited() {
+      const waited = this.$el.querySelector(".lab-waited");
+      if (this.drawn || !waited) clearInterval(this.clock);
+      else waited.textContent = `${Math.round((performance.now() - this.openedAt) / 1000)} s`;
+    },
     show(view) {
       if (numberOf(view.src) < this.newest) return; // a newer one has come over the stream
       this.wanted = view;
