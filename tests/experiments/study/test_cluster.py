@@ -18,9 +18,11 @@ import yaml
 from study_stores import contents, done
 from test_engines import ENVIRONMENT, Cluster, cluster_of, on_dask, study
 
+from skysim.core.errors import InputError
 from skysim.core.paths import ROOT
 from skysim.experiments.study import plan
 from skysim.experiments.study.execution import runner, workers
+from skysim.experiments.study.execution.setups import code_version
 
 PAGE = (ROOT / "docs/howto/cluster.md").read_text(encoding="utf-8")
 SMALL = ("replicates: 150", "replicates: 20")
@@ -148,3 +150,29 @@ def test_a_worker_that_hangs_is_given_up(plan_: plan.Plan, serial_contents: str,
         assert done(plan_, tmp_path / "hung.sqlite", engine, watch=hang).done == plan_.trials
         assert not hung
     assert contents(tmp_path / "hung.sqlite") == serial_contents
+
+
+class Replies:
+    """A client whose workers give these replies."""
+
+    def __init__(self, replies: dict[str, Any]) -> None:
+        self.replies = replies
+
+    def wait_for_workers(self, *_: Any) -> None:
+        """They are there."""
+
+    def run(self, *_: Any, **__: Any) -> dict[str, Any]:
+        return self.replies
+
+
+def test_a_worker_that_is_lost_before_a_run_does_not_end_it() -> None:
+    """But one of another version does, and none that replies."""
+    pytest.importorskip("distributed")
+    from skysim.experiments.study.execution import dask_engine as engine
+
+    lost, version = OSError("Stream is closed"), code_version()
+    engine.check_workers(Replies({"first": lost, "second": version}), "tcp://here:1")
+    with pytest.raises(InputError, match="no worker of tcp://here:1 replies"):
+        engine.check_workers(Replies({"first": lost}), "tcp://here:1")
+    with pytest.raises(InputError, match=f"worker second has skysim 0; allowed: {version}"):
+        engine.check_workers(Replies({"first": lost, "second": "0"}), "tcp://here:1")

@@ -57,14 +57,20 @@ def connect(scheduler: str) -> Client:
 
 
 def check_workers(client: Client, scheduler: str) -> None:
-    """Raise InputError if a cluster has no workers, or a worker has another code version."""
+    """Raise InputError if a cluster has no workers, or a worker has another code version.
+
+    A worker that is lost meanwhile does not matter: if it comes back, `JobPlugin` checks its version.
+    """
+    silent = f"scheduler: no worker of {scheduler} replies; allowed: one started with dask worker {scheduler}"
     try:
         client.wait_for_workers(1, WAIT_S)
         versions = client.run(code_version, on_error="return")
     except OSError:
-        allowed = f"one started with dask worker {scheduler}"
-        raise InputError(f"scheduler: no worker of {scheduler} replies; allowed: {allowed}") from None
-    for worker, code in versions.items():
+        raise InputError(silent) from None
+    replies = {worker: code for worker, code in versions.items() if not isinstance(code, OSError)}
+    if not replies:
+        raise InputError(silent)
+    for worker, code in replies.items():
         where = f"scheduler: worker {worker}"
         if isinstance(code, Exception):
             raise InputError(f"{where} cannot run trials: {code}; allowed: a worker with this skysim")
