@@ -66,6 +66,7 @@ def normalized_error_squared(
 # Statistics of a sample.
 
 CONFIDENCE = 0.95
+TAILS = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2  # probabilities below the ends of an interval
 SIGMAS = float(scipy.special.ndtri((1 + CONFIDENCE) / 2))  # half of the interval of a normal variable, in sigmas
 RESAMPLES = 999
 MANY_VALUES = 2000  # beyond, the bootstrap is `bootstrap_of_many`
@@ -156,15 +157,38 @@ def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
 
 def mean_of(values: Floats) -> Summary:
     """The mean with its bootstrap interval: that of `resampled`, or beyond MANY_VALUES of `bootstrap_of_many`."""
-    return resampled(values, np.mean) if len(values) <= MANY_VALUES else bootstrap_of_many(values)
+    return bootstrap_of_few(values) if len(values) <= MANY_VALUES else bootstrap_of_many(values)
 
 
 def rms_of(values: Floats) -> Summary:
     """The RMS likewise: the root of the mean of the squares, and of the ends of its interval."""
     if len(values) <= MANY_VALUES:
-        return resampled(values, rms)
+        return bootstrap_of_few(np.square(values), np.sqrt)
     squares = bootstrap_of_many(np.square(values))
     return Summary(math.sqrt(squares.value), math.sqrt(squares.low), math.sqrt(squares.high), squares.trials)
+
+
+def bootstrap_of_few(values: Floats, function: Callable[[Any], Any] = np.positive) -> Summary:
+    """A function of the mean, with the interval of `resampled` from the same draws.
+
+    A resample's sum is that of the values times how often it draws each, and the seed is fixed, so these numbers are
+    the same for all samples of a size.
+    """
+    count, value = len(values), float(function(np.mean(values)))
+    if count < 2:
+        return Summary(value, math.nan, math.nan, count, 2 - count)
+    if np.ptp(values) == 0:
+        return Summary(value, value, value, count)
+    low, high = np.quantile(function(values @ resampling_counts(count) / count), TAILS)
+    return Summary(value, float(low), float(high), count)
+
+
+@lru_cache(maxsize=64)
+def resampling_counts(count: int) -> NDArray[np.uint8]:
+    """(count, RESAMPLES) how often each resample has drawn each value."""
+    drawn = random_stream(1).integers(0, count, (RESAMPLES, count)) + count * np.arange(RESAMPLES)[:, None]
+    counts = np.bincount(drawn.ravel(), minlength=RESAMPLES * count)
+    return np.ascontiguousarray(counts.reshape(RESAMPLES, count).T, dtype=np.uint8)
 
 
 def bootstrap_of_many(values: Floats) -> Summary:
@@ -189,7 +213,7 @@ def bootstrap_of_many(values: Floats) -> Summary:
     weights = weights[:, : len(extremes)]
     left = np.maximum(count - weights.sum(axis=1), 0)
     means = middle + (weights @ (extremes - middle) + spread * np.sqrt(left) * normal) / count
-    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    low, high = np.quantile(means, TAILS)
     return Summary(mean, float(low), float(high), count)
 
 

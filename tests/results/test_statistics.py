@@ -150,6 +150,15 @@ def test_the_bootstrap_of_many_is_the_bootstrap_where_it_takes_over(name: str, s
     assert [found.low, found.high] == pytest.approx([by_hand.low, by_hand.high], abs=4 * math.sqrt(2) * 0.022 * width)
 
 
+@pytest.mark.parametrize("name", SKEW)
+@pytest.mark.parametrize("count", [2, 3, 100, metrics.MANY_VALUES])
+def test_the_bootstrap_of_few_is_that_of_scipy(name: str, count: int) -> None:
+    """With the same draws, but for the order of additions."""
+    values = SKEW[name](np.random.default_rng(count), count)
+    for found, statistic in ((metrics.mean_of(values), np.mean), (metrics.rms_of(values), metrics.rms)):
+        assert found == pytest.approx(metrics.resampled(values, statistic), rel=1e-12, nan_ok=True)
+
+
 def test_the_interval_of_many_is_skew_as_that_of_the_bootstrap() -> None:
     """One error of 1e5 among n of nothing: it is drawn k times with the probability of Poisson's law, e^-1 / k!, so the
     interval of the mean is 0 to 3 e5 / n; the normal one would be symmetrical and reach below zero."""
