@@ -197,6 +197,7 @@ class SceneInfo:
     field_deg : horizontal field of view;  pixel_arcsec : angle of a pixel in the frame's middle
     stages : the tracker's algorithm by stage
     duration_s : of its motion;  noise : whether the camera has noise, else a frame is the expected value
+    surveyed : whether a survey of its dome has begun
     """
 
     scene: str
@@ -211,6 +212,7 @@ class SceneInfo:
     noise: bool
     geometry: LabGeometry
     lens: Lens
+    surveyed: bool = False
 
 
 class LookFrom(NamedTuple):
@@ -327,7 +329,9 @@ class SurveyPlan(NamedTuple):
 class SurveyFound(NamedTuple):
     """What the frames of a survey have measured, and the attitudes to hold next.
 
-    frames, connected : so far, and those that share enough LEDs with others;  measured, seen_once, unseen : LEDs
+    frames, connected : so far, and those that share enough LEDs with others
+    missed : attitudes of the last flight without a frame at which the vehicle rested
+    measured, seen_once, unseen : LEDs, of those in connected frames;  renamed : measured ones with another's number
     sigma_mm : estimated rms error of the measured LEDs about each axis;  before_mm, error_mm : the true one before the
         survey and now. None, with the reason in `refusal`, if the frames do not determine them
     faults : of the dome, a line each
@@ -336,9 +340,11 @@ class SurveyFound(NamedTuple):
 
     frames: int
     connected: int
+    missed: int
     measured: int
     seen_once: int
     unseen: int
+    renamed: int
     sigma_mm: float | None
     before_mm: float | None
     error_mm: float | None

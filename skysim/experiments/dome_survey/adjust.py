@@ -10,6 +10,7 @@ were found. The result is a `DomeMap`, the file that `tracker.map` reads.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -38,6 +39,7 @@ MOVED_ROUNDS = 2  # further rounds if LEDs are far from their places in the list
 
 # Share of a frame's lights that are matched, and of these that fit the adjustment: far less by chance.
 MIN_MATCHED = 0.5
+PLAUSIBLE = 6.0  # standard deviations between a parameter found and the assumed one
 MAX_DISPLACEMENT_M = 0.1  # of an LED from its place in the list
 
 
@@ -53,7 +55,7 @@ def run_survey(
     fit_distortion : fit k1, k2, p1, p2 as well. A narrow field hardly determines them, and they correlate with the
         focal length: on the AFIT dome its sigma grows from 10 to 80 px, while the attitude does not change
     watch(rounds done, rounds) is called after each round of identification and adjustment
-    Raises InputError if the frames do not determine the unknowns.
+    Raises InputError if the frames do not determine the unknowns, or the result contradicts the prior.
     """
 
     def adjusted(rows: list[int], matches: list[Correspondences], prior: CalibrationPrior) -> SurveyRun:
@@ -79,7 +81,31 @@ def run_survey(
         run = adjusted(*rematched(run))
     if watch:
         watch(total, total)
+    check_plausible(run, prior, uncertainty)
     return run
+
+
+def check_plausible(run: SurveyRun, prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> None:
+    """Raise InputError if the survey found a focal length or a lever arm that contradicts what was assumed before.
+
+    If frames are misidentified, the adjustment can fit them with a model that is far from the real one, such as half
+    the focal length with the camera close to the dome, and with small residuals and standard deviations. A parameter
+    found differs from the assumed one by more than PLAUSIBLE sqrt(assumed sigma^2 + sigma^2) only by such an error.
+    """
+    found, accuracy = run.survey, run.accuracy
+    lever = zip(prior.lever.camera_body_m, found.lever.camera_body_m, accuracy.lever_sigma_m, "xyz", strict=True)
+    focal_px = prior.camera.focal_px
+    rows = [(focal_px, found.camera.focal_px, accuracy.lens_sigma[0], uncertainty.focal_error * focal_px, "focal px")]
+    rows += [
+        (1e3 * before, 1e3 * now, 1e3 * sigma, 1e3 * uncertainty.lever_sigma_m, f"lever {axis} mm")
+        for before, now, sigma, axis in lever
+    ]
+    for before, now, sigma, assumed, name in rows:
+        if abs(now - before) > PLAUSIBLE * math.hypot(sigma, assumed):
+            raise InputError(
+                f"survey: {name} {now:.5g} ± {sigma:.2g} contradicts the assumed {before:.5g} ± {abs(assumed):.2g}:"
+                " lights are misidentified; allowed: further frames, or a larger uncertainty of what is assumed"
+            )
 
 
 def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], CalibrationPrior]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,20 @@ import pytest
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from labpage import CHROMIUM, SLOW_MS, chosen, come, panel, status
+from labpage import CHROMIUM, SLOW_MS, chosen, come, panel, set_to, status
 
 from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan
-from skysim.apps.gui.page.panels.plan import ambiguity_text, prediction_text, survey_flight, survey_lines
+from skysim.apps.gui.page.panels.plan import (
+    ambiguity_text,
+    greatest_tilt_deg,
+    prediction_text,
+    survey_flight,
+    survey_lines,
+)
 from skysim.apps.gui.page.style import color_scale
 from skysim.apps.gui.worker.scene import planning, survey
 from skysim.apps.gui.worker.tasks import Worker
+from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.dynamics import guidance
 from skysim.experiments.dome_survey import stops
@@ -65,18 +73,51 @@ def test_the_most_similar_fields_are_named() -> None:
     assert "LED 8 and 3, 95 %" in text
 
 
-@pytest.mark.parametrize("overrides", [{}, {"exposure.rate_hz": "0.2", "exposure.time": "4.9 s"}])
-def test_a_survey_is_flown_through_its_attitudes_with_a_frame_at_each(overrides: dict[str, str]) -> None:
-    flown = loader.load("afit_simsat", survey_flight("afit_simsat", overrides, ANGLES))
+SLOW_CAMERA = {"exposure.rate_hz": "0.2", "exposure.time": "4.9 s", "exposure.first": "300 s"}
+TILTED = ((-21.0, 8.0, 22.0), (-7.0, -23.0, -154.0), (10.0, 20.0, 60.0))
+
+
+@pytest.mark.parametrize(("overrides", "angles"), [({}, ANGLES), (SLOW_CAMERA, ANGLES), ({}, TILTED)])
+def test_a_survey_is_flown_through_its_attitudes_with_a_frame_at_each(overrides: dict[str, str], angles: Any) -> None:
+    flown = loader.load("afit_simsat", survey_flight("afit_simsat", overrides, angles))
     reference, shown = guidance.plan(flown.motion), flown.exposure
     begin_s = shown.first_s + np.arange(shown.frames) / shown.rate_hz
     holds = [leg for leg, one in enumerate(flown.motion.maneuver) if one.kind == "hold"]
-    assert len(holds) == len(ANGLES)
-    for leg, angles in zip(holds, ANGLES, strict=True):
+    assert len(holds) == len(angles)
+    for leg, wanted in zip(holds, angles, strict=True):
         start_s, end_s = reference.start_s[leg], reference.start_s[leg + 1]
-        wxyz = stops.from_angles(np.array([angles])).as_quat(scalar_first=True)[0]
+        wxyz = stops.from_angles(np.array([wanted])).as_quat(scalar_first=True)[0]
         assert abs(reference.state_at(start_s)[0] @ wxyz) == pytest.approx(1, abs=1e-9)
         assert np.any((begin_s >= start_s) & (begin_s + shown.time_s <= end_s))
+
+
+def test_a_survey_does_not_tilt_the_vehicle_beyond_its_stop_between_attitudes() -> None:
+    """The rotation about one axis from one tilted attitude to the opposite one may tilt it by more than both."""
+    first, last = (stops.from_angles(np.array([angles]))[0] for angles in TILTED[:2])
+    assert greatest_tilt_deg(first, last) == pytest.approx(32.2, abs=0.1)
+    assert max(greatest_tilt_deg(one, one) for one in (first, last)) < 24.1
+    overrides = {"vehicle.tilt_stop_deg": "25", "motion.control": "prescribed", "motion.maneuver": "[]"}
+    flown = loader.load("afit_simsat", survey_flight("afit_simsat", overrides, TILTED))
+    reference = guidance.plan(flown.motion)
+    t_s = np.arange(0, reference.duration_s, 0.2)
+    up = [quaternion.to_rotation(reference.state_at(t)[0]).apply([0.0, 0.0, 1.0]) for t in t_s]
+    assert np.min(np.array(up)[:, 2]) > np.cos(np.radians(25))
+
+
+@pytest.mark.parametrize(("pixels", "taken"), [(0.9, [3, 6]), (1.1, [])])
+def test_a_survey_takes_the_last_frame_of_a_hold_if_the_vehicle_rests(pixels: float, taken: list[int]) -> None:
+    """Its image moves by less than a pixel. A frame whose exposure lasts beyond the hold does not count."""
+    legs = ", ".join(f"{{kind: slew, roll_deg: {roll}}}, {{kind: hold, duration: 5 s}}" for roll in (3, 0))
+    scene = loader.load("afit_simsat_ideal", {"motion.maneuver": f"[{legs}]", "motion.control": "prescribed"})
+    start_s, exposure_s = guidance.plan(scene.motion).start_s, 0.1
+    rate_rad_s = pixels / exposure_s / scene.camera.focal_px
+    t_s = [0.0, start_s[1] - 0.01, start_s[1], start_s[2] - 0.11, start_s[2] - 0.09, start_s[3], start_s[4] - 0.2]
+    flight = SimpleNamespace(
+        bench=SimpleNamespace(scene=scene),
+        moved=SimpleNamespace(trajectory=SimpleNamespace(rate_at=lambda _: np.array([0.0, rate_rad_s, 0.0]))),
+        frames=[SimpleNamespace(view=SimpleNamespace(t_s=begin, exposure_s=exposure_s)) for begin in t_s],
+    )
+    assert survey.frames_at_rest(flight) == (taken, 2)  # type: ignore[arg-type]
 
 
 def flight_of(worker: Worker, overrides: dict[str, str]) -> None:
@@ -92,15 +133,16 @@ def test_a_survey_goes_on_with_the_frames_flown() -> None:
     """Its frames are those at the planned attitudes, and more of them measure more LEDs, with errors as estimated."""
     worker, bench = Worker(), {"motion.control": "prescribed", "motion.maneuver": "[]"}
     worker.open("afit_simsat", bench, False)
-    plan, measured = worker.plan_survey(6), 0
-    for count in (6, 12):
+    plan, measured = worker.plan_survey(8), 0
+    for count in (8, 16):
         flight_of(worker, survey_flight("afit_simsat", bench, plan.angles_deg))
         assert worker.flight is not None
-        rows = survey.frames_at_rest(worker.flight)
+        rows, holds = survey.frames_at_rest(worker.flight)
+        assert holds == len(rows) == 8
         wxyz = np.array([worker.flight.frames[row].view.body_wxyz for row in rows])
         wanted = stops.from_angles(np.array(plan.angles_deg)).as_quat(scalar_first=True)
         np.testing.assert_allclose(np.abs(np.sum(wxyz * wanted, axis=1)), 1, rtol=0, atol=1e-9)
-        found = worker.adjust_survey(6)
+        found = worker.adjust_survey(8)
         assert (found.frames, found.refusal) == (count, "")
         assert found.measured > measured
         assert found.measured + found.seen_once + found.unseen <= len(found.ids) == 1465
@@ -111,10 +153,17 @@ def test_a_survey_goes_on_with_the_frames_flown() -> None:
     assert found.before_mm is not None
     assert 0.6 < found.error_mm / found.sigma_mm < 1.6
     assert found.error_mm < 0.5 * found.before_mm
-    with pytest.raises(InputError, match="has the frames of this flight already"):
-        worker.adjust_survey(6)
     check_map(worker, found)
-    worker.open("afit_simsat", {**bench, "seed": "9"}, False)
+    flight_of(worker, survey_flight("afit_simsat", bench, ANGLES))
+    assert worker.flight is not None
+    worker.flight.frames = worker.flight.frames[:1]  # stopped before it came to an attitude
+    with pytest.raises(InputError, match="rests at none of the flight's 2 holds"):
+        worker.adjust_survey(8)
+    check_map(worker, found)  # as before
+    info, _ = worker.open("afit_simsat", {**bench, "exposure.time": "9 ms"}, False)
+    assert info.surveyed
+    info, _ = worker.open("afit_simsat", {**bench, "seed": "9"}, False)
+    assert not info.surveyed
     with pytest.raises(InputError, match="no survey of this scene: plan one"):
         worker.survey_map()
 
@@ -133,21 +182,38 @@ def check_map(worker: Worker, found: SurveyFound) -> None:
     assert error_mm == pytest.approx(found.error_mm, rel=1e-6)
 
 
-def test_a_survey_has_no_frames_of_other_flights() -> None:
-    worker = Worker()
-    worker.open("afit_simsat", {}, False)
-    with pytest.raises(InputError, match="no flight"):
-        worker.adjust_survey(4)
+@pytest.mark.slow
+def test_a_survey_has_the_frames_of_its_flights_once() -> None:
+    """None of another maneuver. Those of two attitudes are too few, which is said, and the next ones are planned."""
+    worker, bench = Worker(), {"motion.control": "prescribed", "exposure.frames": "2"}
+    worker.open("afit_simsat", bench, False)
     worker.begin_flight()
     with pytest.raises(InputError, match="no survey of this scene: plan one"):
+        worker.adjust_survey(4)
+    worker.plan_survey(2)
+    with pytest.raises(InputError, match="rests at none of the flight's 0 holds"):
+        worker.adjust_survey(4)
+    flown = survey_flight("afit_simsat", bench, ANGLES)
+    flight_of(worker, flown)
+    found = worker.adjust_survey(4)
+    assert (found.frames, found.connected, found.measured, found.missed) == (2, 0, 0, 0)
+    assert survey_lines(found)[1].startswith("Not determined yet: ")
+    assert len(found.plan.angles_deg) == 4
+    with pytest.raises(InputError, match="has measured no LED yet"):
+        worker.survey_map()
+    flight_of(worker, flown)  # the same frames again
+    with pytest.raises(InputError, match="has the frames of this flight"):
         worker.adjust_survey(4)
 
 
 def test_a_survey_that_determines_nothing_says_so() -> None:
     plan = SurveyPlan(ANGLES, (30, 31), 1465, ((4, 0, None), (6, 50, 0.46)))
-    refused = SurveyFound(2, 0, 0, 60, 1405, None, None, None, (), "too few", np.arange(3), np.zeros(3), plan)
+    few = {"sigma_mm": None, "before_mm": None, "error_mm": None, "faults": (), "refusal": "too few"}
+    counts = {"frames": 2, "connected": 0, "missed": 1, "measured": 0, "seen_once": 60, "unseen": 1405, "renamed": 0}
+    refused = SurveyFound(**counts, **few, ids=np.arange(3), known=np.zeros(0), plan=plan)  # type: ignore[arg-type]
     assert survey_lines(refused) == [
         "2 frames: no LED measured; 60 seen once, 1405 not seen.",
+        "1 attitudes have no frame: the vehicle did not rest there.",
         "Not determined yet: too few.",
     ]
     assert prediction_text(plan) == "Predicted of the 1465 LEDs: after 6 frames 50 LEDs to 0.46 mm rms."
@@ -182,7 +248,7 @@ def test_check_map_and_survey_in_the_page(page: Any) -> None:
     page.get_by_role("button", name="Point to attitude 1", exact=True).click()
     assert come(lambda: abs(float(page.get_by_label("angle 1").input_value()) - float(wanted)) < 0.006)
     fly, adjust, save = (page.get_by_role("button", name=name, exact=True) for name in ("Fly", "Adjust", "Map file"))
-    assert adjust.is_disabled()
+    assert save.is_disabled()
     fly.click()
     page.get_by_role("button", name="Stop", exact=True).wait_for()  # of the flight that is computed
     page.get_by_role("button", name="Simulate", exact=True).wait_for(timeout=SLOW_MS)
@@ -190,8 +256,18 @@ def test_check_map_and_survey_in_the_page(page: Any) -> None:
     adjust.click()
     page.get_by_text("5 frames, ").wait_for()
     page.get_by_text("after 10 frames").wait_for()  # the next attitudes, which can be flown
-    assert adjust.is_disabled()
     assert page.locator(".lab-stops .num").nth(5).inner_text() != wanted
     with page.expect_download() as download:
         save.click()
     assert download.value.suggested_filename == "afit_simsat_leds.ecsv"
+    panel(page, "Scene")
+    page.get_by_placeholder("find a key").fill("exposure.frames")
+    set_to(page, "exposure.frames", "3")  # with another exposure the survey goes on
+    panel(page, "Plan")
+    page.get_by_text("after 10 frames").wait_for()
+    adjust.click()
+    page.get_by_text("no flight: fly the survey's attitudes").first.wait_for()
+    chosen(page, "Scene", "shefex2")
+    page.get_by_text("Plan begins a survey").wait_for()
+    assert adjust.is_disabled()
+    assert save.is_disabled()

@@ -1,15 +1,18 @@
-"""Repeated simulated surveys: one that fails is counted, and the others are kept."""
+"""Surveys that fail: one of several that are repeated, and one that contradicts what was assumed."""
 
 from __future__ import annotations
 
 import json
+import math
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from skysim.apps.cli.main import app
 from skysim.core.errors import InputError
-from skysim.experiments.dome_survey import procedure
+from skysim.experiments.dome_survey import adjust, prior, procedure
 from skysim.experiments.dome_survey.procedure import Errors
 
 
@@ -32,3 +35,26 @@ def test_a_survey_that_fails_does_not_lose_the_others(monkeypatch: pytest.Monkey
     assert result["failures"] == ["survey: too few"]
     assert result["measured"] == [90, 92]
     assert result["rows"][0]["simulated"] == pytest.approx(1e3 * 2e-8**0.5)
+
+
+@pytest.mark.parametrize(("parameter", "refused"), [("focal px", True), ("lever z mm", True), ("focal px", False)])
+def test_a_survey_that_contradicts_what_was_assumed_is_refused(parameter: str, refused: bool) -> None:
+    """Misidentified frames fitted half the focal length, 4242 px with a sigma of 180, where 9222 to 1 % was assumed."""
+    assumed, sigma_px, sigma_m, focal_px = prior.survey_uncertainty(), 180.0, 0.001, 9222.6
+    share = adjust.PLAUSIBLE * (1.01 if refused else 0.99)
+    off_px = share * math.hypot(sigma_px, assumed.focal_error * focal_px) * (parameter == "focal px")
+    off_m = share * math.hypot(sigma_m, assumed.lever_sigma_m) * (parameter == "lever z mm")
+    before, found = (
+        SimpleNamespace(
+            camera=SimpleNamespace(focal_px=focal_px - focal),
+            lever=SimpleNamespace(camera_body_m=np.array([0.0, 0.0, 0.381 - lever])),
+        )
+        for focal, lever in ((0.0, 0.0), (off_px, off_m))
+    )
+    accuracy = SimpleNamespace(lens_sigma=np.full(3, sigma_px), lever_sigma_m=np.full(3, sigma_m))
+    run = SimpleNamespace(survey=found, accuracy=accuracy)
+    if refused:
+        with pytest.raises(InputError, match=f"survey: {parameter} .* contradicts the assumed"):
+            adjust.check_plausible(run, before, assumed)  # type: ignore[arg-type]
+    else:
+        adjust.check_plausible(run, before, assumed)  # type: ignore[arg-type]

@@ -168,11 +168,15 @@ class Replies:
 def test_a_worker_that_is_lost_before_a_run_does_not_end_it() -> None:
     """But one of another version does, and none that replies."""
     pytest.importorskip("distributed")
+    from distributed.comm import CommClosedError
+
     from skysim.experiments.study.execution import dask_engine as engine
 
-    lost, version = OSError("Stream is closed"), code_version()
+    lost, version = CommClosedError("Stream is closed"), code_version()
     engine.check_workers(Replies({"first": lost, "second": version}), "tcp://here:1")
     with pytest.raises(InputError, match="no worker of tcp://here:1 replies"):
         engine.check_workers(Replies({"first": lost}), "tcp://here:1")
+    with pytest.raises(InputError, match="worker second cannot run trials: no file"):
+        engine.check_workers(Replies({"first": version, "second": FileNotFoundError("no file")}), "tcp://here:1")
     with pytest.raises(InputError, match=f"worker second has skysim 0; allowed: {version}"):
         engine.check_workers(Replies({"first": lost, "second": "0"}), "tcp://here:1")

@@ -243,8 +243,9 @@ class Tab:
         self.stop_playback()
         self.run_panel.stop_computing()
         overrides = dict(overrides or {})
-        # At first the sensor view shows this message.
         activity = f"setting up {Path(scene).name} …" if self.view else ""
+        if not self.view:  # the sensor view shows the message
+            self.sensor.show_setting_up(scene)
         path = str(find(scene).resolve())
         result = await self.run_task("open", path, overrides, self.solving, angles_deg, activity=activity)
         if result is None:
@@ -264,7 +265,7 @@ class Tab:
         self.scene_3d.set_scene(self.scene_info)
         self.sensor.clear_zoom()
         self.run_panel.set_scene()
-        self.plan_panel.clear()
+        self.plan_panel.set_scene()
         self.study_panel.set_scene()
         self.display_live(view)
         fields = await run.io_bound(forms.fields, scene, overrides)

@@ -119,7 +119,8 @@ class Worker:
             bench.lab_from_body = pointing.from_angles(bench.scene, bench.testbed.mount, angles_deg)
         self.current = bench
         self.scene, self.overrides, self.flight, self.pushed = scene, dict(overrides), None, None
-        return bench.scene_info, self.render(solve)
+        surveyed = self.surveyed is not None and self.surveyed.is_of(bench.scene)
+        return replace(bench.scene_info, surveyed=surveyed), self.render(solve)
 
     def render(self, solve: bool) -> FrameView:
         view = self.workbench.render_at_rest(solve)

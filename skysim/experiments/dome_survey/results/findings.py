@@ -93,7 +93,8 @@ class DomeFaults:
     exchanged : LED at whose place another one shines, that other one, and others that would do as well
     found_m   : places, m, at which displaced LEDs and lights of exchanged ones were found
     unlisted  : places, m, of lights at rest that are no LED of the list
-    exchange_share : share of the pairs of LEDs whose exchange would be found; 0 if all are alike
+    exchange_share : share of the pairs of LEDs whose exchange would be found; 0 if all are alike, None if none are
+        compared: too few are in enough frames, or the time of their code is unknown
     """
 
     dark: list[int]
@@ -102,7 +103,7 @@ class DomeFaults:
     exchanged: list[tuple[int, int, list[int]]]
     found_m: dict[int, list[float]]
     unlisted: list[list[float]]
-    exchange_share: float
+    exchange_share: float | None
 
     @property
     def count(self) -> int:
@@ -119,7 +120,8 @@ def find_faults(run: SurveyRun) -> DomeFaults:
     # The time of a code that runs freely is unknown, and with it what each LED shows.
     code = run.prior.code
     is_free = code is not None and code.bit_time_s is not None
-    exchanges, share = ([], 0.0) if is_free else survey_faults.exchanged(table)
+    compared = int(np.sum(np.isfinite(table.light).sum(axis=0) >= survey_faults.MIN_FRAMES))
+    exchanges, share = ([], None) if is_free or compared < 2 else survey_faults.exchanged(table)
     return DomeFaults(
         leds.id[survey_faults.dark(table.shown & (table.expected > 0), run.seen)].tolist(),
         {int(leds.id[row]): float(off_m[row]) for row in rows},
@@ -143,11 +145,14 @@ def fault_lines(faults: Mapping[str, Any]) -> Iterator[str]:
     for place_m in faults["unlisted"]:
         yield f"a light that is not in the list shines at {', '.join(f'{one:.3f}' for one in place_m)} m"
     share = faults["exchange_share"]
-    observable = (
-        f"{100 * share:.0f} % of exchanges would be found"
-        if share
-        else "exchanged LEDs cannot be found: all shine alike; codes or brightness levels would tell them apart"
-    )
+    observable = "exchanged LEDs cannot be found: all shine alike; codes or brightness levels would tell them apart"
+    if share is None:
+        observable = (
+            f"exchanged LEDs are not searched for: that takes LEDs in {survey_faults.MIN_FRAMES} frames each, and a code"
+            " in step with the frames"
+        )
+    elif share > 0:
+        observable = f"{100 * share:.0f} % of exchanges would be found"
     yield (
         f"{len(faults['dark'])} dark, {len(faults['displaced'])} displaced, {len(faults['exchanged'])} exchanged; the"
         f" other places of the list err by {1e3 * faults['list_sigma_m']:.2g} mm about each axis; {observable}"

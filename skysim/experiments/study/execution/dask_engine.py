@@ -25,7 +25,7 @@ from skysim.experiments.study.execution.trials import Segment
 
 try:
     from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed
-    from distributed.comm import get_address_host_port
+    from distributed.comm import CommClosedError, get_address_host_port
 except ImportError:
     raise InputError("engine: dask is not installed; allowed: pip install 'skysim[dask]', or another engine") from None
 
@@ -67,7 +67,7 @@ def check_workers(client: Client, scheduler: str) -> None:
         versions = client.run(code_version, on_error="return")
     except OSError:
         raise InputError(silent) from None
-    replies = {worker: code for worker, code in versions.items() if not isinstance(code, OSError)}
+    replies = {worker: code for worker, code in versions.items() if not isinstance(code, CommClosedError)}
     if not replies:
         raise InputError(silent)
     for worker, code in replies.items():

@@ -91,10 +91,14 @@ class Sensor:
         self.canvas.on("manual", lambda: self.limits.set_value("manual"))
         self.canvas.on("drawn", self.drawn)
         self.update_display()
-        self.show_waiting(f"Setting up {Path(tab.scene).name} …", FIRST_START)
+        self.show_setting_up(tab.scene)
+
+    def show_setting_up(self, scene: str) -> None:
+        """Show that the first frame of a scene is being made."""
+        self.show_waiting(f"Setting up {Path(scene).name} …", FIRST_START)
 
     def show_waiting(self, *lines: str, in_vain: bool = False) -> None:
-        """Show what the first frame waits for, and for how long; or why there is none (in_vain)."""
+        """Show what the first frame waits for, and for how long the page has waited; or why there is none (in_vain)."""
         self.wait_label.set_text("\n".join(lines))
         self.waited.set_visibility(not in_vain)
 

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from nicegui import run, ui
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from skysim.apps.gui.messages import AmbiguityMap, PlanCheck, SurveyFound, SurveyPlan
 from skysim.apps.gui.page import forms
 from skysim.apps.gui.page.style import color_scale
+from skysim.core.types import Floats
 from skysim.dynamics import guidance
+from skysim.experiments.dome_survey import stops
 from skysim.scene.sections.motion import PRESCRIBED
 
 if TYPE_CHECKING:
@@ -22,13 +27,14 @@ if TYPE_CHECKING:
 
 # Of a survey that is flown: few frames while the vehicle slews, and a whole exposure in each hold.
 SURVEY_RATE_HZ, HOLD_PERIODS = 0.5, 2.0
+TILT_MARGIN_DEG, TILT_STEPS = 0.5, 61  # to the vehicle's stop, and points of a slew at which its tilt is looked at
 FRAMES = 20  # of a survey, at first
 ALIKE = 0.9  # of the LEDs that coincide: a tracker without a prior refuses the field as ambiguous
 UNCHECKED = "Check computes what this scene will show and how accurate its tracker will be. Nothing is rendered."
 UNMAPPED = "Map compares the fields of the dome with one another: a field that looks like another one is ambiguous."
 UNPLANNED = (
-    "Plan chooses the attitudes from which a survey measures the dome's LEDs best. Fly takes frames at them, Adjust"
-    " measures the LEDs by all frames flown so far and plans the next attitudes."
+    "Plan begins a survey: it chooses the attitudes from which the dome's LEDs are measured best. Fly takes frames at"
+    " them. Adjust adds these to the survey's frames, measures the LEDs by all of them, and plans the next attitudes."
 )
 
 
@@ -38,7 +44,7 @@ class PlanPanel:
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
         self.plan: SurveyPlan | None = None
-        self.lines: Sequence[str] = ()
+        self.colored: tuple[NDArray[np.int64], Floats] | None = None  # LEDs and how well the survey knows them
         with self.part():
             ui.button("Check", on_click=self.check).props("dense outline size=sm").mark("check")
         self.facts = ui.column().classes("w-full gap-1").mark("check-result")
@@ -46,13 +52,15 @@ class PlanPanel:
             ui.button("Map", on_click=self.map).props("dense outline size=sm").mark("map")
         self.fields = ui.column().classes("w-full gap-1").mark("map-result")
         with self.part():
-            ui.button("Plan", on_click=self.plan_survey).props("dense outline size=sm").mark("survey")
+            self.begin = self.survey_button("Plan", self.plan_survey, "begin a new survey")
             self.frames = ui.number(value=FRAMES, min=2, step=1, label="frames").props("dense outlined").classes("w-24")
             self.fly = self.survey_button("Fly", self.fly_plan, "fly the vehicle to these attitudes")
-            self.adjust_button = self.survey_button("Adjust", self.adjust, "adjust LEDs, lever and lens to all frames")
+            self.adjust_button = self.survey_button(
+                "Adjust", self.adjust, "adjust LEDs, lever and lens to the frames of the last flight and those before"
+            )
             self.save_map = self.survey_button("Map file", self.download_map, "save the LEDs for tracker.map")
         self.stops = ui.column().classes("w-full gap-1").mark("survey-result")
-        self.clear()
+        self.set_scene()
 
     def part(self) -> ui.row:
         return ui.row().classes("w-full no-wrap items-center gap-2").style("margin-top: 8px")
@@ -61,15 +69,43 @@ class PlanPanel:
         button = ui.button(label, on_click=action).props(f'dense outline size=sm title="{title}"')
         return button.classes("flex-none")
 
-    def clear(self) -> None:
-        """Say what each part does, because nothing is known of this scene yet."""
-        self.plan, self.lines = None, ()
-        for button in (self.fly, self.adjust_button, self.save_map):
-            button.set_enabled(False)
-        for column, text in ((self.facts, UNCHECKED), (self.fields, UNMAPPED), (self.stops, UNPLANNED)):
+    def set_scene(self) -> None:
+        """Say what each part does, because nothing is known of a new scene; its survey goes on if there is one."""
+        for column, text in ((self.facts, UNCHECKED), (self.fields, UNMAPPED)):
             column.clear()
             with column:
                 ui.label(text).classes("quiet")
+        info = self.tab.scene_info
+        if not (info and info.surveyed):
+            self.clear_survey()
+        elif self.colored:
+            self.tab.scene_3d.color_lights(*self.colored)
+
+    def clear_survey(self) -> None:
+        """Forget the survey, and say what it does."""
+        self.plan = self.colored = None
+        self.enable()
+        self.save_map.set_enabled(False)
+        self.stops.clear()
+        with self.stops:
+            ui.label(UNPLANNED).classes("quiet")
+
+    def enable(self) -> None:
+        """Let the buttons of a planned survey act."""
+        self.begin.set_enabled(True)
+        for button in (self.fly, self.adjust_button):
+            button.set_enabled(self.plan is not None)
+
+    @contextmanager
+    def working(self) -> Iterator[None]:
+        """Within this context no second step of the survey begins."""
+        for button in (self.begin, self.fly, self.adjust_button):
+            button.set_enabled(False)
+        try:
+            yield
+        finally:
+            if self.tab.is_open:
+                self.enable()
 
     # The check.
 
@@ -110,32 +146,34 @@ class PlanPanel:
     # The survey.
 
     async def plan_survey(self) -> None:
-        """Plan the first attitudes of a new survey."""
-        found: SurveyPlan | None = await self.tab.run_task(
-            "plan_survey", int(self.frames.value or 0), activity="planning the survey …"
-        )
-        if found is not None:
-            self.show_survey([prediction_text(found)], found)
+        """Begin a new survey: plan its first attitudes."""
+        with self.working():
+            found: SurveyPlan | None = await self.tab.run_task(
+                "plan_survey", int(self.frames.value or 0), activity="planning the survey …"
+            )
+            if found is not None:
+                self.clear_survey()
+                self.show_survey([prediction_text(found)], found)
 
     async def adjust(self) -> None:
         """Adjust the dome to the frames flown, and show what they measure and the attitudes to hold next."""
-        found: SurveyFound | None = await self.tab.run_task(
-            "adjust_survey", int(self.frames.value or 0), activity="adjusting the survey …"
-        )
-        if found is None:
-            return
-        lines = survey_lines(found)
-        self.show_survey([*lines, prediction_text(found.plan)], found.plan)
-        self.save_map.set_enabled(not found.refusal)
-        self.tab.scene_3d.color_lights(found.ids, found.known)
-        self.tab.log(f"survey of {Path(self.tab.scene).name}: {lines[0]}")
+        with self.working():
+            found: SurveyFound | None = await self.tab.run_task(
+                "adjust_survey", int(self.frames.value or 0), activity="adjusting the survey …"
+            )
+            if found is None:
+                return
+            lines = survey_lines(found)
+            self.show_survey([*lines, prediction_text(found.plan)], found.plan)
+            self.tab.log(f"survey of {Path(self.tab.scene).name}: {lines[0]}")
+            if not found.refusal:
+                self.save_map.set_enabled(True)
+                self.colored = found.ids, found.known
+                self.tab.scene_3d.color_lights(*self.colored)
 
     def show_survey(self, lines: Sequence[str], plan: SurveyPlan) -> None:
         """Show what a survey has found and its next attitudes, which can then be flown."""
-        self.plan, self.lines = plan, lines
-        self.fly.set_enabled(True)
-        self.adjust_button.set_enabled(False)
-        self.save_map.set_enabled(False)
+        self.plan = plan
         self.stops.clear()
         with self.stops:
             for line in lines:
@@ -160,15 +198,13 @@ class PlanPanel:
     async def fly_plan(self) -> None:
         """Change the scene's maneuver to the plan's attitudes, in order, and compute this flight."""
         assert self.plan is not None
-        plan, lines, tab = self.plan, self.lines, self.tab
-        flight = survey_flight, tab.scene, dict(tab.overrides), plan.angles_deg
-        overrides = await tab.await_result(run.io_bound(*flight))
-        if overrides is None or not await tab.open(tab.scene, overrides):
-            return
-        self.show_survey(lines, plan)  # the survey goes on, although the scene has changed
-        tab.tabs.set_value("Run")
-        await tab.run_panel.simulate()
-        self.adjust_button.set_enabled(self.plan is plan and bool(tab.run_panel.rows))
+        tab = self.tab
+        with self.working():
+            flight = survey_flight, tab.scene, dict(tab.overrides), self.plan.angles_deg
+            overrides = await tab.await_result(run.io_bound(*flight))
+            if overrides is not None and await tab.open(tab.scene, overrides):
+                tab.tabs.set_value("Run")
+                await tab.run_panel.simulate()
 
     async def download_map(self) -> None:
         data: bytes | None = await self.tab.run_task("survey_map")
@@ -196,15 +232,22 @@ def prediction_text(plan: SurveyPlan) -> str:
 
 def survey_lines(found: SurveyFound) -> list[str]:
     """What the frames of a survey have measured, and the faults of the dome."""
-    unmeasured = f"{found.seen_once} seen once, {found.unseen} not seen."
+    missed = [f"{found.missed} attitudes have no frame: the vehicle did not rest there."] if found.missed else []
+    unmeasured = f"{found.seen_once} seen once, {found.unseen} not seen"
     if found.refusal:
-        return [f"{found.frames} frames: no LED measured; {unmeasured}", f"Not determined yet: {found.refusal}."]
+        return [
+            f"{found.frames} frames: no LED measured; {unmeasured}.",
+            *missed,
+            f"Not determined yet: {found.refusal}.",
+        ]
+    renamed = f"; {found.renamed} have the number of another one" if found.renamed else ""
     return [
         f"{found.frames} frames, {found.connected} of them connected: {found.measured} of {len(found.ids)} LEDs"
-        f" measured to {found.sigma_mm:.2g} mm rms about each axis (1σ); their true error is"
-        f" {found.error_mm:.2g} mm, {found.before_mm:.2g} mm before. {unmeasured}",
+        f" measured to {found.sigma_mm:.2g} mm rms about each axis (1σ), {unmeasured} in the connected ones. Their true"
+        f" error is {found.error_mm:.2g} mm, {found.before_mm:.2g} mm before{renamed}.",
+        *missed,
         *found.faults,
-        "The 3-D view shows by how much the uncertainty of each LED is reduced: measured ones are bright.",
+        "In the 3-D view the LEDs are the brighter the better they are measured.",
     ]
 
 
@@ -213,18 +256,36 @@ def survey_flight(
 ) -> dict[str, str]:
     """Overrides with which the vehicle slews to each attitude and holds it, with frames over the whole time.
 
-    An exposure is no longer than the frame period, so one lies wholly in a hold of two periods. Raises InputError.
+    An exposure is no longer than the frame period, so one lies wholly in a hold of two periods. Between two tilted
+    attitudes the vehicle may tilt more than at either: where that is too much, it is leveled in between. Raises
+    InputError.
     """
     before = forms.validated_scene(scene, overrides)
     rate_hz = min(SURVEY_RATE_HZ, before.exposure.rate_hz)
-    legs = list[dict[str, object]]()
+    legs, at = list[dict[str, object]](), guidance.start_attitude(before.motion)
     for angles in angles_deg:
-        named = zip(("roll_deg", "pitch_deg", "yaw_deg"), angles, strict=True)
-        legs.append({"kind": "slew", **{name: round(angle, 3) for name, angle in named}})
-        legs.append({"kind": "hold", "duration": f"{HOLD_PERIODS / rate_hz:g} s"})
+        attitude = stops.from_angles(np.array([angles]))[0]
+        if greatest_tilt_deg(at, attitude) > before.vehicle.tilt_stop_deg - TILT_MARGIN_DEG:
+            legs += [slew((0.0, 0.0, yaw_deg)) for yaw_deg in (float(at.as_euler("ZYX", degrees=True)[0]), angles[2])]
+        legs += [slew(angles), {"kind": "hold", "duration": f"{HOLD_PERIODS / rate_hz:g} s"}]
+        at = attitude
     flown = {**overrides, "motion.maneuver": forms.yaml_line(legs), "exposure.rate_hz": f"{rate_hz:g}"}
+    flown["exposure.first"] = "0 s"
     if before.motion.control is None:
         flown["motion.control"] = PRESCRIBED
-    loaded = forms.validated_scene(scene, flown)
-    duration_s = guidance.plan(loaded.motion).duration_s - loaded.exposure.first_s
+    duration_s = guidance.plan(forms.validated_scene(scene, flown).motion).duration_s
     return {**flown, "exposure.frames": str(max(math.floor(duration_s * rate_hz), 1))}
+
+
+def slew(angles_deg: Sequence[float]) -> dict[str, object]:
+    """A slew to roll, pitch and yaw, as a maneuver of a scene."""
+    names = "roll_deg", "pitch_deg", "yaw_deg"
+    return {"kind": "slew", **{name: round(angle, 3) for name, angle in zip(names, angles_deg, strict=True)}}
+
+
+def greatest_tilt_deg(first: Rotation, last: Rotation) -> float:
+    """Greatest tilt of the vehicle between two attitudes lab_from_body, along the rotation about one axis."""
+    share = np.linspace(0, 1, TILT_STEPS)[:, None]
+    lab_from_body = first * Rotation.from_rotvec(share * (first.inv() * last).as_rotvec())
+    up = lab_from_body.apply([0.0, 0.0, 1.0])
+    return float(np.degrees(np.arccos(np.clip(up[:, 2], -1, 1))).max())

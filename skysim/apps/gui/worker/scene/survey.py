@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from skysim.apps.gui.messages import SurveyFound, SurveyPlan
 from skysim.apps.gui.worker.playback import Flight
 from skysim.core import quaternion
 from skysim.core.errors import InputError
+from skysim.core.types import Floats
 from skysim.dynamics import guidance
 from skysim.experiments.dome_survey import adjust, prior, procedure, stops
 from skysim.experiments.dome_survey.frames import SurveyFrame, detect_lights, imu_attitudes
@@ -30,6 +32,7 @@ from skysim.tracking import settings as tracker_settings
 
 SURVEY_TILT_DEG = 25.0  # greatest tilt of a survey, if the vehicle's stop allows it
 MAX_STOPS = 200
+REST_PX = 1.0  # motion of the image at rest, during an exposure
 UNCERTAINTY = prior.survey_uncertainty()  # that `skysim survey` assumes
 
 
@@ -38,101 +41,96 @@ class Survey:
     """A survey of a scene's dome, with the uncertainties that `skysim survey` assumes.
 
     testbed, before : with the errors of the onboard model before the survey, and this model
-    noise_px : standard deviation of a centroid's coordinates, by which frames are chosen
-    held, lights, index : true lab_from_body, detections and number of each frame that was flown
-    flight : from which the last of them are;  run : the newest adjustment
+    noise_px : standard deviation of a centroid's coordinates, by which attitudes are chosen
+    taken : the frames that were flown;  run : the newest adjustment that succeeded
     """
 
     scene: Scene
     testbed: Testbed
     before: CalibrationPrior
     noise_px: float
-    held: list[Rotation] = field(default_factory=list)
-    lights: list[Centroids] = field(default_factory=list)
-    index: list[int] = field(default_factory=list)
-    flight: Flight | None = None
+    taken: list[TakenFrame] = field(default_factory=list)
     run: SurveyRun | None = None
 
     def is_of(self, scene: Scene) -> bool:
-        """Whether this is a survey of a scene, which may differ by its motion and the frames taken of it."""
+        """Whether a scene is the surveyed one, but for its sections `motion` and `exposure`."""
         return self.scene.model_copy(update={"motion": scene.motion, "exposure": scene.exposure}) == scene
 
     def adjust(self, flight: Flight, count: int) -> SurveyFound:
-        """Adjust the dome to all frames so far with those of a flight, and plan `count` further attitudes.
+        """Adjust the dome to all frames so far and those of a flight, and plan `count` further attitudes.
 
-        Raises InputError if the flight has no further frames.
+        Raises InputError if the flight has no further frames; the survey is then as before.
         """
         allow(count)
-        self.take(flight)
+        new, missed = self.new_frames(flight)
+        taken = [*self.taken, *new]
+        frames = self.survey_frames(taken)
         try:
-            self.run = adjust.run_survey(self.frames(), self.before, UNCERTAINTY)
-            refusal, so_far = "", findings.coverage(self.run)
+            run, refusal = adjust.run_survey(frames, self.before, UNCERTAINTY), ""
+            so_far = findings.coverage(run)
         except InputError as error:
-            self.run, refusal = None, str(error)
-            so_far = findings.coverage_before(self.frames(), self.before, UNCERTAINTY, self.noise_px)
+            run, refusal = None, str(error)
+            so_far = findings.coverage_before(frames, self.before, UNCERTAINTY, self.noise_px)
         counts = findings.coverage_statistics(so_far)
-        before_mm, after_mm, faults = self.errors()
-        return SurveyFound(
-            frames=len(self.held),
-            connected=int(self.run.survey.tied.sum()) if self.run else 0,
-            measured=counts["measured"] if self.run else 0,
+        truth = report.truth_statistics(run, self.before, self.testbed) if run else {}
+        found = SurveyFound(
+            frames=len(taken),
+            connected=int(run.survey.tied.sum()) if run else 0,
+            missed=missed,
+            measured=counts["measured"] if run else 0,
             seen_once=counts["seen_once"],
             unseen=counts["unseen"],
-            sigma_mm=1e3 * self.run.accuracy.led_rms_m if self.run else None,
-            before_mm=before_mm,
-            error_mm=after_mm,
-            faults=faults,
+            renamed=truth.get("renamed", 0),
+            sigma_mm=1e3 * run.accuracy.led_rms_m if run else None,
+            before_mm=truth.get("led_mm_before"),
+            error_mm=truth.get("led_mm_after"),
+            faults=tuple(findings.fault_lines(asdict(findings.find_faults(run)))) if run else (),
             refusal=refusal,
             ids=so_far.model.leds.id,
-            known=self.known_share(so_far),
-            plan=self.next_plan(so_far, count),
+            known=known_share(run),
+            plan=self.next_plan(so_far, len(taken), count),
         )
+        self.taken, self.run = taken, run or self.run
+        return found
 
-    def take(self, flight: Flight) -> None:
-        """Take the frames of a flight at which the vehicle rests. Raises InputError if none are new."""
-        if flight is self.flight:
-            raise InputError("the survey has the frames of this flight already: fly the next attitudes")
-        rows = frames_at_rest(flight)
+    def new_frames(self, flight: Flight) -> tuple[list[TakenFrame], int]:
+        """The frames of a flight at which the vehicle rests, one of each hold, and the number of holds without one.
+
+        Raises InputError if there are none, or the survey has them already.
+        """
+        rows, holds = frames_at_rest(flight)
         if not rows:
-            raise InputError("the flight has no frame in which the vehicle rests: fly the attitudes")
-        assert flight.moved is not None
+            raise InputError(
+                f"survey: the vehicle rests at none of the flight's {holds} holds; allowed: a flight of the survey's"
+                " attitudes with a vehicle that holds them, such as motion.control: prescribed"
+            )
+        known = {frame.row for frame in self.taken if frame.flown == flight.bench.scene}
+        if known >= set(rows):
+            raise InputError("survey: it has the frames of this flight; allowed: a flight of the next attitudes")
         settings = tracker_settings.assumed_settings(self.testbed.scene)
         camera = onboard_model.assumed_camera(self.testbed.scene)
-        for row in rows:
+        assert flight.moved is not None
+        new = []
+        for row in (row for row in rows if row not in known):
             view = flight.frames[row].view
             frame, _ = exposure.render_frame(flight.moved, row, exposure_s=view.exposure_s)
-            self.lights.append(detect_lights(settings, camera, frame.image_dn))
-            self.held.append(quaternion.to_rotation(np.array(view.body_wxyz)))
-            self.index.append(row)
-        self.flight = flight
+            lab_from_body = quaternion.to_rotation(np.array(view.body_wxyz))
+            lights = detect_lights(settings, camera, frame.image_dn)
+            new.append(TakenFrame(flight.bench.scene, row, lab_from_body, lights))
+        return new, holds - len(rows)
 
-    def frames(self) -> list[SurveyFrame]:
-        """The frames so far, with the IMU's attitudes."""
-        measured = imu_attitudes(self.scene, Rotation.concatenate(self.held), UNCERTAINTY.imu_sigma_rad)
-        return [SurveyFrame(*one) for one in zip(self.lights, measured, self.index, strict=True)]
+    def survey_frames(self, taken: Sequence[TakenFrame]) -> list[SurveyFrame]:
+        """Frames with the IMU's attitudes."""
+        lab_from_body = Rotation.concatenate([frame.lab_from_body for frame in taken])
+        measured = imu_attitudes(self.scene, lab_from_body, UNCERTAINTY.imu_sigma_rad)
+        return [SurveyFrame(frame.lights, at, frame.row) for frame, at in zip(taken, measured, strict=True)]
 
-    def errors(self) -> tuple[float | None, float | None, tuple[str, ...]]:
-        """True rms errors of the measured LEDs about each axis before and after the survey, mm, and the faults."""
-        if self.run is None:
-            return None, None, ()
-        truth = report.truth_statistics(self.run, self.before, self.testbed)
-        faults = findings.fault_lines(asdict(findings.find_faults(self.run)))
-        return truth["led_mm_before"], truth["led_mm_after"], tuple(faults)
-
-    def known_share(self, so_far: Coverage) -> np.ndarray:
-        """(N,) by how much the survey has reduced the uncertainty of each LED: 0, not measured, to 1."""
-        if self.run is None or so_far.accuracy is None:
-            return np.zeros(len(so_far.model.leds.id))
-        share = 1 - so_far.accuracy.led_sigma_m / UNCERTAINTY.led_sigma_m
-        return np.where(so_far.measured, np.clip(share, 0.0, 1.0), 0.0)
-
-    def next_plan(self, so_far: Coverage, count: int) -> SurveyPlan:
-        """Attitudes to hold after those so far."""
+    def next_plan(self, so_far: Coverage, taken: int, count: int) -> SurveyPlan:
+        """Attitudes to hold after the frames taken so far."""
         margin_px = prior.image_sizes(self.before).margin_px
         further = findings.next_stops(self.scene, so_far, margin_px, count, tilt_deg(self.scene))
         shown = so_far.model.visible(further.lab_from_body.inv(), margin_px)
-        step = plan_step(len(self.held) + len(shown), further.accuracy)
-        return survey_plan(further.lab_from_body, shown, (step,))
+        return survey_plan(further.lab_from_body, shown, (plan_step(taken + len(shown), further.accuracy),))
 
     def map_file(self) -> bytes:
         """The measured LEDs, lever arm and lens as the file for `tracker.map`. Raises InputError if there are none."""
@@ -142,6 +140,16 @@ class Survey:
             path = Path(folder) / "leds.ecsv"
             dome_map_file.write_dome_map(path, adjust.dome_map(self.run.survey, UNCERTAINTY))
             return path.read_bytes()
+
+
+@dataclass(frozen=True, slots=True)
+class TakenFrame:
+    """A frame of a survey: the scene that was flown, its number there, the true attitude, and its detections."""
+
+    flown: Scene
+    row: int
+    lab_from_body: Rotation
+    lights: Centroids
 
 
 def begin(scene: Scene, frames: int) -> tuple[Survey, SurveyPlan]:
@@ -178,16 +186,30 @@ def plan_step(count: int, accuracy: findings.SurveyAccuracy | None) -> tuple[int
     return count, int(statistics["measured"] or 0), statistics["led_mm"]
 
 
-def frames_at_rest(flight: Flight) -> list[int]:
-    """Rows of a flight's frames: of each hold of its maneuver the last whose whole exposure is in it."""
+def known_share(run: SurveyRun | None) -> Floats:
+    """(N,) by how much a survey has reduced the uncertainty of each LED: 0, not measured, to 1."""
+    if run is None:
+        return np.zeros(0)
+    share = 1 - run.accuracy.led_sigma_m / UNCERTAINTY.led_sigma_m
+    return np.where(run.accuracy.measured, np.clip(share, 0.0, 1.0), 0.0)
+
+
+def frames_at_rest(flight: Flight) -> tuple[list[int], int]:
+    """Rows of a flight's frames at which the vehicle rests, of each hold the last one, and the number of holds.
+
+    It rests if its image moves by less than REST_PX during the exposure, as its true rate says: a controller may not
+    reach the attitude, or not hold it.
+    """
     motion = flight.bench.scene.motion
-    if not all(isinstance(maneuver, SlewConfig | HoldConfig) for maneuver in motion.maneuver):
-        return []
-    reference = guidance.plan(motion)
-    by_hold: dict[int, int] = {}
+    if flight.moved is None or not all(isinstance(one, SlewConfig | HoldConfig) for one in motion.maneuver):
+        return [], 0
+    reference, by_hold = guidance.plan(motion), dict[int, int]()
+    holds = {leg for leg, one in enumerate(motion.maneuver) if isinstance(one, HoldConfig)}
     for row, kept in enumerate(flight.frames):
-        begin_s, end_s = kept.view.t_s, kept.view.t_s + kept.view.exposure_s
+        begin_s, exposure_s = kept.view.t_s, kept.view.exposure_s
         leg = int(np.searchsorted(reference.start_s, begin_s, side="right")) - 1
-        if leg < len(motion.maneuver) and end_s <= reference.start_s[leg + 1]:
-            by_hold |= {leg: row} if isinstance(motion.maneuver[leg], HoldConfig) else {}
-    return list(by_hold.values())
+        if leg in holds and begin_s + exposure_s <= reference.start_s[leg + 1]:
+            rate_rad_s = np.linalg.norm(flight.moved.trajectory.rate_at(begin_s + exposure_s / 2))
+            if rate_rad_s * exposure_s * flight.bench.scene.camera.focal_px < REST_PX:
+                by_hold[leg] = row
+    return list(by_hold.values()), len(holds)
