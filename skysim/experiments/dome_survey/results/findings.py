@@ -148,8 +148,8 @@ def fault_lines(faults: Mapping[str, Any]) -> Iterator[str]:
     observable = "exchanged LEDs cannot be found: all shine alike; codes or brightness levels would tell them apart"
     if share is None:
         observable = (
-            f"exchanged LEDs are not searched for: that takes LEDs in {survey_faults.MIN_FRAMES} frames each, and a code"
-            " in step with the frames"
+            f"exchanged LEDs are not searched for: too few are in {survey_faults.MIN_FRAMES} frames, or their code runs"
+            " freely"
         )
     elif share > 0:
         observable = f"{100 * share:.0f} % of exchanges would be found"
