@@ -341,8 +341,9 @@ FILE_KEYS += tuple(("heads", "*", *keys) for keys in FILE_KEYS if keys[0] in HEA
 
 def resolve_files(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
     """The scene with file names made absolute if such a file exists in the scene's folder."""
+    folder = path.resolve().parent
     for keys in FILE_KEYS:
-        tree = resolve_file(path.resolve().parent, tree, *keys)
+        tree = resolve_file(folder, tree, *keys)
     return tree
 
 

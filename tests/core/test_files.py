@@ -21,7 +21,7 @@ from astropy.wcs import WCS
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.io import files, images
+from skysim.core.io import files, images, yaml_reader
 from skysim.core.io.files import HOST, TEMPORARY_NAME
 from skysim.core.types import BodyTruth, Frame, Truth
 from skysim.results.files import ccsds_aem, frames
@@ -432,3 +432,14 @@ def test_a_camera_s_frame_is_taken_as_opencv_opens_it_and_none_is_told(tmp_path:
     for nowhere in (str(tmp_path / "none.avi"), "99"):
         with pytest.raises(InputError, match="no camera found; allowed: an index such as 0"):
             images.grab_frame(nowhere)
+
+
+def test_a_yaml_file_is_read_anew_after_a_change_of_the_file_or_of_its_values(tmp_path: Path) -> None:
+    """Values are kept by the file's text, and every reader has its own."""
+    file = tmp_path / "a.yaml"
+    file.write_text("a: {b: [1, 2]}")
+    tree, _ = yaml_reader.read_yaml(file)
+    tree["a"]["b"].append(3)
+    assert yaml_reader.read_yaml(file)[0] == {"a": {"b": [1, 2]}}
+    file.write_text("a: {b: [1, 4]}")
+    assert yaml_reader.read_yaml(file)[0] == {"a": {"b": [1, 4]}}

@@ -8,7 +8,9 @@ defines it.
 
 from __future__ import annotations
 
+import copy
 import difflib
+import functools
 import json
 import re
 from collections.abc import Mapping
@@ -26,6 +28,7 @@ VERSION = 1  # of scene and study files; raised by an incompatible change, with 
 
 
 MAX_BYTES = 1 << 20  # of a file: a minute of reading
+MAX_KEPT = 1 << 15  # characters of a text whose values are kept
 MAX_NODES = 100_000  # of a document, counting the content of an alias each time
 MAX_EXCERPT = 200  # characters of a value in a message
 MAX_DEPTH = 40  # levels of nesting
@@ -74,6 +77,13 @@ def parse_yaml(text: str, kind: type[StrictLoader] = StrictLoader) -> tuple[yaml
         return node, None if node is None else loader.construct_document(node)
     finally:
         loader.dispose()
+
+
+@functools.lru_cache(maxsize=16)
+def parse_kept(text: str) -> tuple[yaml.Node | None, Any]:
+    """`parse_yaml`, kept for the next time: each point of a study has the same scene and camera file, whose parsing
+    takes ten times as long as all else of it. The result must not be changed."""
+    return parse_yaml(text)
 
 
 def is_file(path: Path) -> bool:
@@ -133,7 +143,7 @@ def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: {path.stat().st_size} bytes; allowed: up to {MAX_BYTES}")
         text = path.read_text(encoding="utf-8")
-        node, tree = parse_yaml(text)
+        node, tree = (parse_kept if len(text) <= MAX_KEPT else parse_yaml)(text)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     except yaml.YAMLError as error:
@@ -144,7 +154,7 @@ def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
     if not isinstance(tree, dict):
         raise InputError(f"{path}: allowed: a mapping of keys to values")
     reject_duplicate_keys(node, path)
-    return tree, text
+    return copy.deepcopy(tree), text
 
 
 def reject_duplicate_keys(node: yaml.Node | None, path: Path) -> None:
