@@ -212,8 +212,9 @@ class Exchange:
     or_any_of: tuple[int, ...] = ()
 
 
-def exchanged(table: LightTable) -> tuple[list[Exchange], float]:
-    """LEDs whose light is another LED's, and the share of pairs of LEDs of which an exchange would be found.
+def exchanged(table: LightTable) -> tuple[list[Exchange], float | None]:
+    """LEDs whose light is another LED's, and the share of pairs of LEDs of which an exchange would be found; None if
+    fewer than two LEDs are in enough frames to be compared.
 
     The log likelihood of LED j at the place of i is that of the logarithms of the light in the frames less the expected
     ones: of their mean, with the robust scatter of all LEDs between them, and of their deviations from it, with that
@@ -302,10 +303,10 @@ def _log_likelihood(table: LightTable) -> Floats:
     return np.asarray(out)
 
 
-def _observable(table: LightTable, likelihood: Floats, tested: Mask, least: float) -> float:
+def _observable(table: LightTable, likelihood: Floats, tested: Mask, least: float) -> float | None:
     """Share of the pairs of tested LEDs whose exchange would be found, by the likelihoods as they are."""
     rows = np.flatnonzero(tested)
     if len(rows) < 2:
-        return 0.0
+        return None
     worse = np.diag(likelihood)[rows, None] - likelihood[np.ix_(rows, rows)] > least
     return float(np.sum(worse & worse.T) / (len(rows) * (len(rows) - 1)))

@@ -137,10 +137,8 @@ def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
     Equal values have an interval of zero width; a single value has none.
     """
     value = float(statistic(values))
-    if len(values) < 2:
-        return Summary(value, math.nan, math.nan, len(values), 2 - len(values))
-    if np.ptp(values) == 0:
-        return Summary(value, value, value, len(values))
+    if len(values) < 2 or np.ptp(values) == 0:
+        return without_resampling(values, value)
     batch = max(1, 2_000_000 // len(values))  # limits the memory of a batch to two million values
     result = scipy.stats.bootstrap(
         (values,),
@@ -153,6 +151,12 @@ def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
     )
     low, high = map(float, result.confidence_interval)
     return Summary(value, low, high, len(values))
+
+
+def without_resampling(values: Floats, value: float) -> Summary:
+    """The summary of fewer than two values, or of equal ones."""
+    count = len(values)
+    return Summary(value, math.nan, math.nan, count, 2 - count) if count < 2 else Summary(value, value, value, count)
 
 
 def mean_of(values: Floats) -> Summary:
@@ -175,10 +179,8 @@ def bootstrap_of_few(values: Floats, function: Callable[[Any], Any] = np.positiv
     the same for all samples of a size.
     """
     count, value = len(values), float(function(np.mean(values)))
-    if count < 2:
-        return Summary(value, math.nan, math.nan, count, 2 - count)
-    if np.ptp(values) == 0:
-        return Summary(value, value, value, count)
+    if count < 2 or np.ptp(values) == 0:
+        return without_resampling(values, value)
     low, high = np.quantile(function(values @ resampling_counts(count) / count), TAILS)
     return Summary(value, float(low), float(high), count)
 

@@ -335,7 +335,8 @@ class SurveyFound(NamedTuple):
     sigma_mm : estimated rms error of the measured LEDs about each axis;  before_mm, error_mm : the true one before the
         survey and now. None, with the reason in `refusal`, if the frames do not determine them
     faults : of the dome, a line each
-    ids, known : (N,) the LEDs, and by how much the survey has reduced the uncertainty of each, 0 to 1
+    ids, known : (N,) the LEDs, and by how much the survey has reduced the uncertainty of each, 0 to 1;
+        `known` is empty after a refusal
     """
 
     frames: int

@@ -120,8 +120,7 @@ def find_faults(run: SurveyRun) -> DomeFaults:
     # The time of a code that runs freely is unknown, and with it what each LED shows.
     code = run.prior.code
     is_free = code is not None and code.bit_time_s is not None
-    compared = int(np.sum(np.isfinite(table.light).sum(axis=0) >= survey_faults.MIN_FRAMES))
-    exchanges, share = ([], None) if is_free or compared < 2 else survey_faults.exchanged(table)
+    exchanges, share = ([], None) if is_free else survey_faults.exchanged(table)
     return DomeFaults(
         leds.id[survey_faults.dark(table.shown & (table.expected > 0), run.seen)].tolist(),
         {int(leds.id[row]): float(off_m[row]) for row in rows},

@@ -18,7 +18,7 @@ from skysim.apps.gui.messages import AmbiguityMap, PlanCheck, SurveyFound, Surve
 from skysim.apps.gui.page import forms
 from skysim.apps.gui.page.style import color_scale
 from skysim.core.types import Floats
-from skysim.dynamics import guidance
+from skysim.dynamics import guidance, multibody
 from skysim.experiments.dome_survey import stops
 from skysim.scene.sections.motion import PRESCRIBED
 
@@ -286,6 +286,4 @@ def slew(angles_deg: Sequence[float]) -> dict[str, object]:
 def greatest_tilt_deg(first: Rotation, last: Rotation) -> float:
     """Greatest tilt of the vehicle between two attitudes lab_from_body, along the rotation about one axis."""
     share = np.linspace(0, 1, TILT_STEPS)[:, None]
-    lab_from_body = first * Rotation.from_rotvec(share * (first.inv() * last).as_rotvec())
-    up = lab_from_body.apply([0.0, 0.0, 1.0])
-    return float(np.degrees(np.arccos(np.clip(up[:, 2], -1, 1))).max())
+    return float(multibody.tilt_deg(first * Rotation.from_rotvec(share * (first.inv() * last).as_rotvec())).max())

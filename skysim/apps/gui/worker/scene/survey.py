@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from estimator.calibration.survey_plan import Mask, SurveyAccuracy
 from estimator.core.types import Centroids
 from skysim.apps.gui.messages import SurveyFound, SurveyPlan
 from skysim.apps.gui.worker.playback import Flight
@@ -172,22 +173,20 @@ def tilt_deg(scene: Scene) -> float:
     return min(SURVEY_TILT_DEG, scene.vehicle.tilt_stop_deg)
 
 
-def survey_plan(
-    lab_from_body: Rotation, shown: np.ndarray, steps: tuple[tuple[int, int, float | None], ...]
-) -> SurveyPlan:
+def survey_plan(lab_from_body: Rotation, shown: Mask, steps: tuple[tuple[int, int, float | None], ...]) -> SurveyPlan:
     """A plan as the page has it. shown : (F, N) LEDs that each attitude shows"""
     angles = tuple(tuple(row) for row in stops.angles_deg(lab_from_body).tolist())
     return SurveyPlan(angles, tuple(shown.sum(axis=1).tolist()), shown.shape[1], steps)
 
 
-def plan_step(count: int, accuracy: findings.SurveyAccuracy | None) -> tuple[int, int, float | None]:
+def plan_step(count: int, accuracy: SurveyAccuracy | None) -> tuple[int, int, float | None]:
     """Number of frames, and what is predicted after them: LEDs measured, and their rms error in mm."""
     statistics = findings.accuracy_statistics(accuracy)
     return count, int(statistics["measured"] or 0), statistics["led_mm"]
 
 
 def known_share(run: SurveyRun | None) -> Floats:
-    """(N,) by how much a survey has reduced the uncertainty of each LED: 0, not measured, to 1."""
+    """(N,) by how much a survey has reduced the uncertainty of each LED: 0, not measured, to 1; (0,) without one."""
     if run is None:
         return np.zeros(0)
     share = 1 - run.accuracy.led_sigma_m / UNCERTAINTY.led_sigma_m
