@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import nicegui
 from nicegui import app, core, ui
 from starlette.datastructures import MutableHeaders
 from starlette.middleware.gzip import GZipMiddleware
@@ -43,10 +44,12 @@ REPORT_POLICY = (
 SECURITY_HEADERS = {"x-frame-options": "DENY", "x-content-type-options": "nosniff", "referrer-policy": "no-referrer"}
 # Noise is not compressible: gzip at its default level takes half a second for a frame.
 FRAME_HEADERS = {"cache-control": "no-store", "content-encoding": "identity"}
+FILES = f"/_nicegui/{nicegui.__version__}"
 USER, USER_BYTES, YEAR_S = "skysim_user", 8, 365 * 86400  # cookie with the number of a browser
 QUEUED = "This page opens when another one has been closed."
 CONNECT_TIMEOUT_S = 50.0  # for a browser to load the page
 RECONNECT_S = 6.0  # for a lost browser to reconnect, before its work ends
+GC_THRESHOLDS = 2_000, 10, 1_000  # new objects until a collection, and collections until one of older objects
 PING_INTERVAL_S, PING_TIMEOUT_S = 5.0, 30.0  # of the connection; a busy machine answers late
 
 
@@ -75,6 +78,45 @@ async def stream(request: Request) -> Response:
 FRAME_ROUTES = Router([Route("/frame/{tab}/{number:int}", frame), Route("/frame/{tab}/next", stream)])
 
 
+class KeptFiles:
+    """ASGI layer that keeps the page's code and styles after their first response.
+
+    A page loads some 40 of these files at once. NiceGUI's layers take 3 ms for each, in which the keys of other pages
+    wait.
+    """
+
+    def __init__(self, app: Any) -> None:
+        self.app = app
+        self.kept = dict[tuple[str, bool], list[dict[str, Any]]]()
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        if not is_plain_file(scope):
+            await self.app(scope, receive, send)
+            return
+        encodings = dict(scope["headers"]).get(b"accept-encoding", b"")
+        key, messages = (scope["path"], b"gzip" in encodings), list[dict[str, Any]]()
+
+        async def keep(message: dict[str, Any]) -> None:
+            messages.append(dict(message))  # a copy, since layers further out add headers
+            await send(message)
+
+        if key not in self.kept:
+            await self.app(scope, receive, keep)
+            if messages[0].get("status") == 200 and not messages[-1].get("more_body"):
+                self.kept[key] = messages
+            return
+        for message in self.kept[key]:
+            await send(dict(message))
+
+
+def is_plain_file(scope: Any) -> bool:
+    """Whether a request is for a whole file of NiceGUI or of this page's elements, which never changes."""
+    if scope["type"] != "http" or scope["method"] != "GET" or scope["query_string"]:
+        return False
+    is_file = scope["path"].startswith(f"{FILES}/") and not scope["path"].startswith(f"{FILES}/dynamic_resources/")
+    return is_file and b"range" not in dict(scope["headers"])
+
+
 class Guard:
     """ASGI middleware that refuses unknown host names, requests of other sites or without token, and large requests.
 
@@ -85,7 +127,7 @@ class Guard:
     """
 
     def __init__(self, app: Any, hosts: tuple[str, ...], token: str, port: int) -> None:
-        self.app, self.hosts, self.token, self.cookie = app, hosts, token, f"skysim_gui_{port}"
+        self.app, self.hosts, self.token, self.cookie = KeptFiles(app), hosts, token, f"skysim_gui_{port}"
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -182,9 +224,13 @@ def be_patient() -> None:
 
 
 def freeze() -> None:
-    """Take what was imported out of the garbage collector's sight, so that collecting a closed page is quick."""
+    """Take what was imported out of the garbage collector's sight, and let it work in small steps.
+
+    A collection of all pages takes half a second with 20 of them, in which no key is answered; `close` makes one.
+    """
     gc.collect()
     gc.freeze()
+    gc.set_threshold(*GC_THRESHOLDS)
 
 
 def release_memory() -> None:
@@ -226,7 +272,7 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
     @ui.page("/", title="skysim gui", dark=True)
     async def index(request: Request) -> None:
         tab = Tab(scene, folder, out, cameras, user_of(request.cookies))
-        tab.build()
+        await tab.build()
         client = ui.context.client
         try:
             await client.connected(timeout=CONNECT_TIMEOUT_S)
@@ -260,7 +306,9 @@ def serve(
     """
     hosts = LOOPBACK if host in LOOPBACK else ("*",)
     token = token or secrets.token_urlsafe(16)
-    app.add_middleware(Guard, hosts=hosts, token=token, port=port)
+    layers = app.build_middleware_stack
+    # NiceGUI adds further layers when it runs; the guard is outside of them.
+    app.build_middleware_stack = lambda: Guard(layers(), hosts, token, port)
     routes(scene, folder, out, cameras, workers)
     login = f"/?token={quote(token)}"
     address = f"http://{host}:{port}{login}"

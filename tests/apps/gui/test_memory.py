@@ -33,7 +33,7 @@ def test_a_closed_page_is_freed(tmp_path: Path) -> None:
         client = Client(page("/"))
         with client:
             tab = Tab("shefex2", tmp_path, tmp_path)
-            tab.build()
+            await tab.build()
         tab.session = Hand()  # type: ignore[assignment]
         client.on_delete(tab.close)
         freed = weakref.ref(tab)

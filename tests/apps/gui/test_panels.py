@@ -24,7 +24,7 @@ from skysim.apps.gui.page import forms, keys
 from skysim.apps.gui.page.frame import overlay
 from skysim.apps.gui.page.frame.sensor import Sensor
 from skysim.apps.gui.page.frame.star_names import NAMES
-from skysim.apps.gui.server import Guard, host_of, report_path, user_of
+from skysim.apps.gui.server import FILES, Guard, KeptFiles, host_of, report_path, user_of
 from skysim.apps.gui.worker import export, photo, pixels, playback, study_process, tasks, workbench
 from skysim.apps.gui.worker.photo import SUFFIXES
 from skysim.apps.gui.worker.scene import lens as lenses
@@ -368,6 +368,64 @@ def test_the_guard_of_a_page_of_this_machine(headers: dict[str, str], query: str
 def test_the_guard_of_a_page_for_others_wants_the_token(headers: dict[str, str], query: str, status: int) -> None:
     guard = Guard(page, ("*",), "right", 8080)
     assert asyncio.run(knock(guard, headers, query)) == status
+
+
+@pytest.mark.parametrize(
+    ("path", "method", "query", "headers", "status", "asked"),
+    [
+        (f"{FILES}/static/vue.js", "GET", "", {}, 200, 1),
+        (f"{FILES}/static/vue.js", "GET", "", {"accept-encoding": "gzip, br"}, 200, 1),
+        (f"{FILES}/static/none.js", "GET", "", {}, 404, 3),
+        (f"{FILES}/static/vue.js", "HEAD", "", {}, 200, 3),
+        (f"{FILES}/static/vue.js", "GET", "v=1", {}, 200, 3),
+        (f"{FILES}/static/vue.js", "GET", "", {"range": "bytes=0-1"}, 200, 3),
+        (f"{FILES}/dynamic_resources/a.css", "GET", "", {}, 200, 3),
+        ("/", "GET", "", {}, 200, 3),
+    ],
+)
+def test_files_of_the_page_are_asked_for_once(
+    path: str, method: str, query: str, headers: dict[str, str], status: int, asked: int
+) -> None:
+    """All other responses are made anew; each answer is whole, and a layer further out may change its headers."""
+    calls, answers = [], list[list[dict]]()
+
+    async def inner(scope: dict, _receive: object, send) -> None:
+        calls.append(scope)
+        await send({"type": "http.response.start", "status": status, "headers": [(b"a", b"b")]})
+        await send({"type": "http.response.body", "body": b"one", "more_body": True})
+        await send({"type": "http.response.body", "body": b"two", "more_body": False})
+
+    kept = KeptFiles(inner)
+    raw = [(name.encode(), value.encode()) for name, value in headers.items()]
+    scope = {"type": "http", "method": method, "path": path, "headers": raw, "query_string": query.encode()}
+    for _ in range(3):
+        answers.append([])
+
+        async def send(message: dict) -> None:
+            answers[-1].append(dict(message))
+            message["headers"] = "changed"
+
+        asyncio.run(kept(scope, None, send))
+    assert len(calls) == asked
+    for start, *body in answers:
+        assert (start["status"], start["headers"]) == (status, [(b"a", b"b")])
+        assert b"".join(part["body"] for part in body) == b"onetwo"
+
+
+def test_a_compressed_file_is_not_sent_to_a_browser_that_asks_for_a_plain_one() -> None:
+    async def inner(scope: dict, _receive: object, send) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": list(scope["headers"])})
+        await send({"type": "http.response.body", "body": b""})
+
+    kept, starts = KeptFiles(inner), list[dict]()
+
+    async def send(message: dict) -> None:
+        starts.append(message)
+
+    for encoding in (b"gzip", b"identity", b"gzip"):
+        scope = {"type": "http", "method": "GET", "path": f"{FILES}/a.js", "query_string": b""}
+        asyncio.run(kept(scope | {"headers": [(b"accept-encoding", encoding)]}, None, send))
+    assert [dict(one["headers"])[b"accept-encoding"] for one in starts[::2]] == [b"gzip", b"identity", b"gzip"]
 
 
 def test_every_response_has_a_policy_that_no_other_site_frames() -> None:

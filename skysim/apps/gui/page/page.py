@@ -17,6 +17,7 @@ from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.page import forms, keys, style
 from skysim.apps.gui.page.frame.live import Contents, LiveText
 from skysim.apps.gui.page.frame.sensor import FRAMES, Sensor
+from skysim.apps.gui.page.panels import lights, monte_carlo
 from skysim.apps.gui.page.panels.attitude import AttitudeCard
 from skysim.apps.gui.page.panels.lights import LightsPanel
 from skysim.apps.gui.page.panels.monte_carlo import MonteCarloPanel
@@ -41,6 +42,7 @@ from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.scene.loader import find, load
 
+PAUSE_S = 0.005  # between the parts of a page that is built, in which the keys of other pages are answered
 PANELS = ("Run", "Lights", "Scene", "Tracker", "Plan", "Monte Carlo", "Image", "Log")
 
 
@@ -54,6 +56,7 @@ class Tab:
     state : what the page shows;  view : the newest frame of the scene
     feedback : of the scene's controller; None without a controller
     solving : whether every frame is solved;  contents : of the fields that change with every frame
+    editing, filling : held while the scene is changed, or a form of its keys is filled
     """
 
     session: Session
@@ -68,7 +71,7 @@ class Tab:
         self.feedback: str | None = None
         self.solving, self.is_open, self.restarting = True, True, False
         self.message_text, self.contents = "", Contents()
-        self.editing = asyncio.Lock()
+        self.editing, self.filling = asyncio.Lock(), asyncio.Lock()
 
     async def close(self) -> None:
         """Release the tab's resources after its browser has gone: frames, study and worker."""
@@ -100,7 +103,8 @@ class Tab:
 
     # Page elements.
 
-    def build(self) -> None:
+    async def build(self) -> None:
+        """Build all elements, in parts between which other pages get their turn."""
         ui.add_css(style.CSS)
         ui.add_body_html(f"<script>{keys.SUPPRESS_DEFAULTS_JS}</script>")
         ui.colors(
@@ -112,20 +116,25 @@ class Tab:
         with ui.element("div").classes("lab"):
             self.build_header()
             self.sensor = Sensor(self)
+            await asyncio.sleep(PAUSE_S)
             with ui.element("div").classes("lab-side"):
                 Arrangement.splitter("side", "vertical", "Width of the panels")
                 self.attitude = AttitudeCard(self)
-                self.build_panels()
+                await self.build_panels()
             with ui.element("div").classes("lab-keys").mark("keys"):
                 for key in keys.KEYS:
                     if key.description:
                         ui.html(f"<span><kbd>{key.label}</kbd>{key.description}</span>", sanitize=False)
+        await asyncio.sleep(PAUSE_S)
         self.help = help_dialog()
         self.actions = Actions(self, PANELS)
         ui.keyboard(on_key=self.actions.key, ignore=["input", "textarea"])
         self.history = History(self, self.scene)
         self.palette = Palette(self.actions.commands)
         self.arrangement = Arrangement([self.run_panel.strips.chart, self.study_panel.chart])
+        # A timer waits for the browser, whereupon NiceGUI sends the page as it is: so timers come after all pauses.
+        ui.timer(lights.UPDATE_S, self.lights.update)
+        ui.timer(monte_carlo.POLL_S, self.study_panel.poll)
 
     def build_header(self) -> None:
         with ui.element("div").classes("lab-head"):
@@ -157,7 +166,7 @@ class Tab:
             | {self.scene: Path(self.scene).name}
         )
 
-    def build_panels(self) -> None:
+    async def build_panels(self) -> None:
         with ui.element("div").classes("lab-panes"):
             with ui.element("div").classes("lab-space-pane"):
                 self.scene_3d = Scene3D(self)
@@ -174,16 +183,20 @@ class Tab:
                     self.scene_panel = ScenePanel(self)
                 with ui.tab_panel("Plan"):
                     self.plan_panel = PlanPanel(self)
+                await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Run").classes("lab-run"):
                     self.run_panel = RunPanel(self)
+                await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Monte Carlo"):
                     self.study_panel = MonteCarloPanel(self)
+                await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Tracker"):
                     self.tracker_panel = TrackerPanel(self)
                 with ui.tab_panel("Image"):
                     self.photo = PhotoPanel(self)
                 with ui.tab_panel("Log"):
                     self.log_panel = LogPanel(self)
+        self.tabs.on_value_change(self.fill_form)
 
     # Actions.
 
@@ -268,11 +281,20 @@ class Tab:
         self.plan_panel.set_scene()
         self.study_panel.set_scene()
         self.display_live(view)
-        fields = await run.io_bound(forms.fields, scene, overrides)
-        self.scene_panel.set_scene(fields)
-        self.tracker_panel.set_scene(fields)
+        await self.fill_form()
         self.log(f"opened {Path(scene).name}" + (f" with {', '.join(overrides)}" if overrides else ""))
         return True
+
+    async def fill_form(self) -> None:
+        """Show the keys of the current scene in the panel of them that is open; it takes a while, so not in others."""
+        panels: dict[str, ScenePanel | TrackerPanel] = {"Scene": self.scene_panel, "Tracker": self.tracker_panel}
+        panel = panels.get(str(self.tabs.value))
+        async with self.filling:
+            while panel and self.view and self.is_open and panel.shown != (current := (self.scene, self.overrides)):
+                fields = await run.io_bound(forms.fields, *current)
+                if (self.scene, self.overrides) == current:
+                    panel.set_scene(fields)
+                    panel.shown = current
 
     async def apply_overrides(self, overrides: Mapping[str, str], dropped: Collection[str] = ()) -> None:
         """Reopen the scene with further overrides and without some; edits made meanwhile follow one after the other."""

@@ -32,10 +32,9 @@ class LightsPanel:
     def __init__(self, tab: Tab) -> None:
         self.tab, self.sent = tab, 0
         self.table = Table().mark("lights")
-        ui.timer(UPDATE_S, self.update)
 
     def update(self) -> None:
-        """Timer: send the table of a new frame."""
+        """Timer, every UPDATE_S: send the table of a new frame."""
         sensor = self.tab.sensor
         if self.tab.tabs.value != "Lights" or self.sent == sensor.sent_number:
             return

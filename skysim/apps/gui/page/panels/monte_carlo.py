@@ -74,7 +74,6 @@ class MonteCarloPanel:
         ui.separator().style("margin: 8px 0")
         ui.label("Finished studies").classes("quiet")
         self.reports = ui.column().classes("w-full gap-0")
-        ui.timer(POLL_S, self.poll)
         self.list_reports()
 
     def set_scene(self) -> None:
@@ -246,7 +245,7 @@ class MonteCarloPanel:
         self.note.set_text(f"{done} of {self.process.total} trials{rest}")
 
     async def poll(self) -> None:
-        """Read the store of a running study and display its results so far."""
+        """Timer, every POLL_S: read the store of a running study and display its results so far."""
         if self.process.running:
             results = await run.io_bound(self.process.results)
             if results and self.process.running:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
 CONTROL_KEYS = ("motion.control", "motion.maneuver")
 BUDGET_S = 0.04  # of a piece of the flight; a key waits for one at most
-POLL_S = 0.05  # between two looks whether the flight plays
+LOOK_S = 0.05  # between two looks whether the flight still plays
 DRAW_S = 0.7  # between two drawings of the strips while frames come
 
 
@@ -33,6 +33,7 @@ class RunPanel:
 
     rows, log : of the computed frames and of the motion;  residuals : of the identified lights, see `FlightStep`
     computing, stopping : whether the flight is being computed, and whether it shall end
+    playing, showing : whether it plays, and whether `play_on` shows its frames
     wanted_s : time to be shown once the flight is computed; None: play it from its start
     sought : place of the slider while its frame is not shown yet
     index : of the frame on the page;  started_s, from_s : time of the last start of playback, and in the flight there
@@ -44,7 +45,7 @@ class RunPanel:
         self.tab = tab
         self.rows, self.log, self.times_s = list[FrameRow](), MotionLog(()), list[float]()
         self.residuals = list[tuple[float, int, float]]()
-        self.computing = self.stopping = self.playing = False
+        self.computing = self.stopping = self.playing = self.showing = False
         self.wanted_s: float | None = None
         self.sought: int | None = None
         self.plays_when_done = False
@@ -52,7 +53,6 @@ class RunPanel:
         self.closed_scene, self.closed_overrides = "", dict[str, str]()
         self.build()
         ui.on("moment", self.clicked)
-        ui.timer(POLL_S, self.play_on)
 
     def build(self) -> None:
         with ui.row().classes("w-full no-wrap items-center gap-1"):
@@ -214,6 +214,7 @@ class RunPanel:
         self.tab.photo.stop()
         self.playing, self.started_s = True, time.monotonic()
         self.play.props("icon=pause")
+        ui.timer(0, self.play_on, once=True)
 
     def toggle(self) -> None:
         """Play or pause; at the end, play again from the start."""
@@ -272,15 +273,22 @@ class RunPanel:
                 self.sought = None
 
     async def play_on(self) -> None:
-        """Timer: while the flight plays, show the frame whose turn it is; pause at the last."""
-        while self.playing and self.rows and self.tab.is_open:
-            index = max(bisect.bisect_right(self.times_s, self.now_s) - 1, 0)
-            if index != self.index or self.tab.state.kind != "flight":
-                await self.show_index(index)
-            if self.index >= len(self.rows) - 1:
-                self.pause()
-            elif self.playing:
-                await asyncio.sleep(min(max((self.times_s[index + 1] - self.now_s) / self.factor, 0.001), POLL_S))
+        """While the flight plays, show the frame whose turn it is; pause at the last."""
+        if self.showing:  # it was paused and started again meanwhile
+            return
+        self.showing = True
+        try:
+            while self.playing and self.rows and self.tab.is_open:
+                index = max(bisect.bisect_right(self.times_s, self.now_s) - 1, 0)
+                if index != self.index or self.tab.state.kind != "flight":
+                    await self.show_index(index)
+                if self.index >= len(self.rows) - 1:
+                    self.pause()
+                elif self.playing:
+                    wait_s = (self.times_s[index + 1] - self.now_s) / self.factor
+                    await asyncio.sleep(min(max(wait_s, 0.001), LOOK_S))
+        finally:
+            self.showing = False
 
     async def show_index(self, index: int) -> None:
         """Show a frame of the flight."""

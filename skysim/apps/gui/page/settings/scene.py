@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from nicegui import run, ui
@@ -16,10 +16,11 @@ if TYPE_CHECKING:
 
 
 class ScenePanel:
-    """The form, one part per section of the scene, and a field that finds keys."""
+    """The form, one part per section of the scene, and a field that finds keys. shown : scene and overrides in it"""
 
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
+        self.shown: tuple[str, Mapping[str, str]] | None = None
         with ui.row().classes("w-full no-wrap items-center gap-2").style("margin-bottom: 8px"):
             self.find = ui.input(placeholder="find a key", on_change=lambda: self.search())
             self.find.props("dense outlined clearable").classes("flex-grow").mark("find-key")
@@ -74,5 +75,5 @@ class ScenePanel:
 
     async def revert(self) -> None:
         """Reopen the scene without overrides."""
-        self.form.scene = ""  # forces a rebuild, which removes refused values too
+        self.form.scene, self.shown = "", None  # forces a rebuild, which removes refused values too
         await self.tab.open(self.tab.scene)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -42,10 +42,14 @@ MODEL = "Sensor model: the Monte Carlo simulation of centroids takes stars of th
 
 
 class TrackerPanel:
-    """The form of two parts, without keys that have no effect, and the noise of the Monte Carlo simulation's lights."""
+    """The form of two parts, without keys that have no effect, and the noise of the Monte Carlo simulation's lights.
+
+    shown : scene and overrides in the form
+    """
 
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
+        self.shown: tuple[str, Mapping[str, str]] | None = None
         names = {key: name for group in NAMES.values() for key, name in group.items()}
         self.form = KeyForm(tab, lambda field: names[field.key], opens=SENSOR)
         ui.label(MODEL).classes("quiet").style("margin: 10px 0 4px")
@@ -81,8 +85,9 @@ class TrackerPanel:
         if info and self.arcsec.value != shown:
             noise.set_value(float(f"{float(self.arcsec.value or 0) / info.pixel_arcsec:.4g}"))
 
-    def open(self, action: str) -> None:
+    async def open(self, action: str) -> None:
         """Show the part of an action, sensor or identifier, with the keyboard on its first field."""
+        await self.tab.fill_form()
         group = SENSOR if action == "sensor" else IDENTIFIER
         if group in self.form.expansions:
             self.form.expansions[group].open()

@@ -101,7 +101,7 @@ class Actions:
             self.tab.attitude.inputs[0].run_method("focus")
         elif action in ("sensor", "identifier"):
             self.tab.tabs.set_value("Tracker")
-            self.tab.tracker_panel.open(action)
+            await self.tab.tracker_panel.open(action)
         elif action == "runs":
             self.tab.tabs.set_value("Monte Carlo")
             keys.focus(self.tab.study_panel.count)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING, Any
 
 import nicegui.elements.scene  # registers three.js with the page  # noqa: F401
@@ -34,11 +35,15 @@ class Space(ui.element, component="js/space.js", esm={"skysim-space": "js"}):  #
 
 
 class Scene3D:
-    """The view and its buttons; `set_scene` builds it, `show` sets the attitude, which a timer sends."""
+    """The view and its buttons; `set_scene` builds it, `show` sets the attitude, which is sent a little later.
+
+    newest_view : that is not sent yet;  waits : whether `update` will be called
+    """
 
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
         self.newest_view: FrameView | None = None
+        self.waits = False
         self.canvas = Space().classes("w-full h-full").mark("space")
         with ui.element("div").classes("lab-looks"):
             for name, text in VIEWS.items():
@@ -48,7 +53,6 @@ class Scene3D:
         hint = ui.label("drag: rotate · drag the vehicle: push it · right drag: pan · wheel: zoom")
         hint.classes("lab-turn")
         self.push = PushControl(tab, self.canvas)
-        ui.timer(UPDATE_S, self.update)
 
     def look(self, name: str) -> None:
         """Look from a preset, also to undo how the user has turned the view."""
@@ -78,13 +82,16 @@ class Scene3D:
         self.canvas.run_method("color", list(zip(ids.tolist(), colors, strict=True)))
 
     def show(self, view: FrameView) -> None:
-        """Queue the newest attitude for the timer."""
+        """Send the newest attitude soon, so that of many frames in a short time only the last is sent."""
         self.newest_view = view
+        if not self.waits:
+            self.waits = True
+            asyncio.get_running_loop().call_later(UPDATE_S, self.update)
 
     def update(self) -> None:
-        """Timer: send the vehicle's attitude, and the lights that are on the frame and that are identified."""
-        view, self.newest_view = self.newest_view, None
-        if view is None:
+        """Send the vehicle's attitude, and the lights that are on the frame and that are identified."""
+        view, self.newest_view, self.waits = self.newest_view, None, False
+        if view is None or not self.tab.is_open:
             return
         found = view.result.detections if view.result else ()
         identified = {spot.id: self.tab.sensor.name(spot.id) for spot in found if spot.id >= 0}
