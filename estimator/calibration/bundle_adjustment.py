@@ -31,6 +31,7 @@ from estimator.core.arrays import Floats, Ints
 # accuracy of 1e-9 in lengths.
 DECREMENT = 1e-12
 STEPS = 100
+EXACT = 1e-6  # least relative standard deviation of what is assumed, and in m
 MEDIAN_RADIUS = np.sqrt(2 * np.log(2))  # median distance of a two-dimensional unit Gaussian from its mean
 
 
@@ -48,9 +49,33 @@ class Sightings:
         return Sightings(self.frame[which], self.led[which], self.xy_px[which], self.sigma_px[which])
 
 
+class Assumed(NamedTuple):
+    """Lever and focal length as they are known without the frames; they enter the adjustment as measurements.
+
+    camera_body_m, lever_sigma_m : (3,) m, and the standard deviation of each axis;  focal_px, focal_sigma_px
+    """
+
+    camera_body_m: Floats
+    lever_sigma_m: float
+    focal_px: float
+    focal_sigma_px: float
+
+    @property
+    def value(self) -> Floats:
+        """(4,) the lever and the focal length."""
+        return np.array([*self.camera_body_m, self.focal_px])
+
+    @property
+    def weight(self) -> Floats:
+        """(4,) 1 / sigma^2 of each. A sigma of 0 is taken as EXACT of the value, so that the weights are finite."""
+        least_m, least_px = EXACT * float(np.linalg.norm(self.camera_body_m)), EXACT * self.focal_px
+        lever_m, focal_px = max(self.lever_sigma_m, least_m, EXACT), max(self.focal_sigma_px, least_px)
+        return np.array([lever_m, lever_m, lever_m, focal_px]) ** -2.0
+
+
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """Parameters of the model: everything that the pixels depend on, and the prior map.
+    """Parameters of the model: everything that the pixels depend on, and what is known of them without the pixels.
 
     position_m       : (N, 3) lights in the lab frame
     R_body_from_lab  : (F, 3, 3)
@@ -59,6 +84,7 @@ class Bundle:
     lens             : (8,) focal_px, center x and y in px, k1, k2, p1, p2, k3
     free_lens        : the first free_lens elements of `lens` are unknowns
     map_m, map_sigma_m : (N, 3) prior positions of the lights, and their standard deviation per axis; inf for no prior
+    assumed          : prior lever and focal length; None for no prior
     """
 
     position_m: Floats
@@ -69,11 +95,20 @@ class Bundle:
     free_lens: int
     map_m: Floats
     map_sigma_m: float = np.inf
+    assumed: Assumed | None = None
 
     def cost(self, sightings: Sightings, width: float) -> tuple[float, Floats]:
-        """Total loss of the pixels and the prior map, and the (M,) robust weights of the sightings."""
+        """Total loss of the pixels and of what is known without them, and the (M,) robust weights of the sightings."""
         loss, weight = cauchy(np.sum(residuals(self, sightings) ** 2, axis=1), width)
-        return loss + float(np.sum(((self.map_m - self.position_m) / self.map_sigma_m) ** 2)), weight
+        loss += float(np.sum(((self.map_m - self.position_m) / self.map_sigma_m) ** 2))
+        if self.assumed:
+            loss += float(np.sum(self.assumed.weight * self.from_assumed**2))
+        return loss, weight
+
+    @property
+    def from_assumed(self) -> Floats:
+        """(4,) differences of the prior lever and focal length from those of the bundle; 0 without a prior."""
+        return self.assumed.value - [*self.camera_body_m, self.lens[0]] if self.assumed else np.zeros(4)
 
     def apply_step(self, led: Floats, rest: Floats) -> Bundle:
         """The bundle after a step.
@@ -203,7 +238,7 @@ class NormalEquations(NamedTuple):
 
 
 def normal_equations(bundle: Bundle, sightings: Sightings, weight: Floats) -> NormalEquations:
-    """The normal equations J'WJ and J'W residual, with one weight per sighting and the prior map added."""
+    """The normal equations J'WJ and J'W residual, with one weight per sighting and the priors added."""
     terms = linearize(bundle, sightings)
     root = np.sqrt(weight)[:, None, None]
     count, frames, lights = len(weight), len(bundle.R_body_from_lab), len(bundle.position_m)
@@ -217,13 +252,12 @@ def normal_equations(bundle: Bundle, sightings: Sightings, weight: Floats) -> No
     by_rest = _append_dense(by_rotation, shared)
     blocks += np.eye(3) / bundle.map_sigma_m**2
     from_map = (bundle.map_m - bundle.position_m).ravel() / bundle.map_sigma_m**2
-    return NormalEquations(
-        blocks,
-        csr_array(by_rest.T @ by_led),
-        (by_rest.T @ by_rest).toarray(),
-        by_led.T @ residual + from_map,
-        by_rest.T @ residual,
-    )
+    rest, rhs_rest = (by_rest.T @ by_rest).toarray(), by_rest.T @ residual
+    if bundle.assumed:
+        known = 3 * frames + np.arange(4)  # lever and focal length
+        rest[known, known] += bundle.assumed.weight
+        rhs_rest[known] += bundle.assumed.weight * bundle.from_assumed
+    return NormalEquations(blocks, csr_array(by_rest.T @ by_led), rest, by_led.T @ residual + from_map, rhs_rest)
 
 
 def _block_matrix(blocks: Floats, column: Ints, width: int) -> csr_array:

@@ -37,7 +37,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map
 from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration.bundle_adjustment import Bundle, Covariances, Sightings
+from estimator.calibration.bundle_adjustment import Assumed, Bundle, Covariances, Sightings
 from estimator.calibration.gauge import Gauge, Subset
 from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
@@ -135,6 +135,7 @@ def survey(
     reference_frame: int | None = None,
     leds_sigma_m: float = np.inf,
     fit_noise: bool = False,
+    assumed: Assumed | None = None,
 ) -> DomeSurvey:
     """Survey the dome: least squares over all lights and attitudes, the lever and the lens.
 
@@ -150,6 +151,8 @@ def survey(
     fit_noise       : multiply sigma_px by the misfit and fit again until the misfit is 1 (estimation of a variance
         component: Koch 1999, Parameter Estimation and Hypothesis Testing in Linear Models, section 3.6). The weights of
         pixels and map are then right even if the noise is known only up to a factor
+    assumed         : lever and focal length with standard deviations, used as measurements beside the map. Many frames
+        determine both better; few frames hardly do, and misidentified ones could be fitted by a wrong lens
 
     Raises ValueError in one line if the frames are malformed or do not determine the unknowns, Unconnected if they form
     several groups.
@@ -158,13 +161,15 @@ def survey(
         raise ValueError(f"survey: unknown loss {loss!r}; allowed: {', '.join(LOSSES)}")
     if not leds_sigma_m > 0:
         raise ValueError(f"survey: leds_sigma_m is {leds_sigma_m}; allowed: above 0, inf for a start only")
+    if assumed and np.isinf(leds_sigma_m):
+        raise ValueError("survey: an assumed lever needs a map that is a measurement; allowed: a finite leds_sigma_m")
     checks.each_of_type("survey: frames", frames, DomeFrame)
     checks.of_type("survey: camera_start", camera_start, Camera)
     check_map(leds_start)
     check_lever(leds_start, lever_start)
     sightings = _collect(frames, len(leds_start.position_m))
     start = _start_bundle(frames, leds_start, lever_start, camera_start, 7 if fit_distortion else 3)
-    start = replace(start, map_sigma_m=leds_sigma_m)
+    start = replace(start, map_sigma_m=leds_sigma_m, assumed=assumed)
     gauge = Gauge(known_length, reference_frame, start.map_m, start.R_body_from_lab)
     fit = _fit(start, sightings, gauge, LOSSES[loss], fit_noise)
     status = "converged" if fit.converged else f"stopped after {ba.STEPS} steps without convergence"
@@ -224,13 +229,16 @@ def _misfit(subset: Subset, covariances: Covariances) -> float:
     """Square root of chi-square of the pixels over their redundancy.
 
     With the map as a measurement the pixels determine U - tr(C) / sigma_map^2 of the U unknowns, C the covariance of
-    the lights, and the map the rest; without it U less the four gauge freedoms.
+    the lights, and the map the rest; without it U less the four gauge freedoms. An assumed lever and focal length
+    count as the map does.
     """
     bundle, sightings = subset.bundle, subset.sightings
     unknowns = 3.0 * (len(subset.led) + len(subset.frame) + 1) + bundle.free_lens - 4
     if np.isfinite(bundle.map_sigma_m):
-        by_map = float(np.einsum("nii->", covariances.by_led)) / bundle.map_sigma_m**2
-        unknowns -= max(by_map - 4, 0.0)
+        by_prior = float(np.einsum("nii->", covariances.by_led)) / bundle.map_sigma_m**2
+        if bundle.assumed:
+            by_prior += float(bundle.assumed.weight @ np.diag(covariances.shared)[:4])
+        unknowns -= max(by_prior - 4, 0.0)
     chi2 = np.sum(ba.residuals(bundle, sightings) ** 2)
     return float(np.sqrt(chi2 / max(2 * len(sightings.led) - unknowns, 1)))
 

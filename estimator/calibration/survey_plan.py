@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, project
 from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration.bundle_adjustment import Bundle, Sightings
+from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
 from estimator.calibration.dome_survey import connected_subset
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
@@ -34,6 +34,7 @@ class SurveyModel:
 
     sigma_px     : standard deviation of a centroid's coordinates
     leds_sigma_m : standard deviation of the LEDs' assumed places about each axis
+    lever_sigma_m, focal_sigma_px : of the lever about each axis and of the focal length; inf if nothing is known
     """
 
     camera: Camera
@@ -41,6 +42,8 @@ class SurveyModel:
     lever: Lever
     sigma_px: float
     leds_sigma_m: float
+    lever_sigma_m: float = np.inf
+    focal_sigma_px: float = np.inf
 
     def __post_init__(self) -> None:
         check_map(self.leds)
@@ -102,7 +105,10 @@ def _bundle(model: SurveyModel, body_from_lab: Rotation, seen: Mask, free_lens: 
     lens = np.array([camera.focal_px, *camera.center_px, *camera.distortion])
     matrices = body_from_lab.as_matrix().reshape(-1, 3, 3), lever.cam_from_body.as_matrix()
     arm_m = np.array(lever.camera_body_m)
-    bundle = Bundle(position_m, matrices[0], arm_m, matrices[1], lens, free_lens, position_m, model.leds_sigma_m)
+    assumed = Assumed(arm_m, model.lever_sigma_m, camera.focal_px, model.focal_sigma_px)
+    bundle = Bundle(
+        position_m, matrices[0], arm_m, matrices[1], lens, free_lens, position_m, model.leds_sigma_m, assumed
+    )
     frame, led = np.nonzero(seen)
     sightings = Sightings(frame, led, np.zeros((len(led), 2)), np.full(len(led), model.sigma_px))
     xy_px = -ba.residuals(bundle, sightings) * model.sigma_px

@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 
 from estimator.attitude.dome_map import LedMap
 from estimator.calibration import dome_survey, survey_faults
+from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, Unconnected
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey.frames import SurveyFrame
 from skysim.experiments.dome_survey.matching import Correspondences, match_by_imu, match_by_survey
-from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty
+from skysim.experiments.dome_survey.prior import CalibrationPrior, SurveyUncertainty, assumed
 from skysim.experiments.dome_survey.survey_run import SurveyRun, identified, led_sigma_m, light_table, stray_lights
 from skysim.tracking.dome_map_file import DomeMap
 
@@ -62,12 +63,12 @@ def run_survey(
         pairs = [
             (replace(frames[row], body_from_lab=start[row]), match) for row, match in zip(rows, matches, strict=True)
         ]
-        selected, survey = adjust_connected(pairs, prior, uncertainty, fit_distortion)
+        selected, survey = adjust_connected(pairs, prior, uncertainty, before, fit_distortion)
         rows, matches = [rows[k] for k in selected], [matches[k] for k in selected]
         start.update(zip(rows, survey.body_from_lab, strict=True))
         return with_names(SurveyRun(survey, frames, rows, matches, listed, prior, uncertainty))
 
-    listed, total = prior.leds, ROUNDS + MOVED_ROUNDS
+    listed, before, total = prior.leds, assumed(prior, uncertainty), ROUNDS + MOVED_ROUNDS
     start = {row: frame.body_from_lab for row, frame in enumerate(frames)}
     run = adjusted(list(start), [match_by_imu(frame, prior, uncertainty) for frame in frames], prior)
     for completed in range(1, total):
@@ -100,10 +101,10 @@ def check_plausible(run: SurveyRun, prior: CalibrationPrior, uncertainty: Survey
         (1e3 * before, 1e3 * now, 1e3 * sigma, 1e3 * uncertainty.lever_sigma_m, f"lever {axis} mm")
         for before, now, sigma, axis in lever
     ]
-    for before, now, sigma, assumed, name in rows:
-        if abs(now - before) > PLAUSIBLE * math.hypot(sigma, assumed):
+    for before, now, sigma, known, name in rows:
+        if abs(now - before) > PLAUSIBLE * math.hypot(sigma, known):
             raise InputError(
-                f"survey: {name} {now:.5g} ± {sigma:.2g} contradicts the assumed {before:.5g} ± {abs(assumed):.2g}:"
+                f"survey: {name} {now:.5g} ± {sigma:.2g} contradicts the assumed {before:.5g} ± {abs(known):.2g}:"
                 " lights are misidentified; allowed: further frames, or a larger uncertainty of what is assumed"
             )
 
@@ -129,7 +130,7 @@ def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], Calibra
                 continue
         rows.append(row)
         matches.append(match)
-    # Keep the map from before the survey: it enters each adjustment as a measurement.
+    # Keep the map from before the survey: it enters each adjustment as a measurement, as the assumed lever does.
     return rows, matches, replace(model, leds=prior.leds)
 
 
@@ -199,6 +200,7 @@ def adjust_connected(
     pairs: Sequence[tuple[SurveyFrame, Correspondences]],
     prior: CalibrationPrior,
     uncertainty: SurveyUncertainty,
+    before: Assumed,
     fit_distortion: bool,
 ) -> tuple[list[int], DomeSurvey]:
     """Adjust the largest group of connected frames. Returns its rows and the survey.
@@ -210,7 +212,7 @@ def adjust_connected(
     selected = largest_connected_group(led_visibility(pairs, prior), MIN_SHARED_LEDS)
     while True:
         try:
-            # A robust loss, and the prior map as a measurement.
+            # A robust loss, and what was assumed before the survey as measurements.
             survey = dome_survey.survey(
                 [dome_frame(*pairs[k]) for k in selected],
                 prior.leds,
@@ -220,6 +222,7 @@ def adjust_connected(
                 loss="cauchy",
                 leds_sigma_m=uncertainty.led_sigma_m,
                 fit_noise=True,
+                assumed=before,
             )
         except Unconnected as error:
             if len(error.frames) > MAX_UNCONNECTED * len(selected):

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
+from estimator.calibration.bundle_adjustment import Assumed
+from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_plan import SurveyModel
 from estimator.core.camera import Camera
 from estimator.identification.leds.codes import LedCode
@@ -136,9 +138,19 @@ def require_dome(scene: Scene) -> DomeConfig:
     return scene.light
 
 
-def survey_model(prior: CalibrationPrior, led_sigma_m: float, noise_px: float) -> SurveyModel:
-    """The model by which the estimator plans and predicts."""
-    return SurveyModel(prior.camera, prior.leds, prior.lever, noise_px, led_sigma_m)
+def survey_model(known: CalibrationPrior | DomeSurvey, uncertainty: SurveyUncertainty, noise_px: float) -> SurveyModel:
+    """The model by which the estimator plans and predicts. known : before a survey, or from it"""
+    focal_sigma_px = abs(uncertainty.focal_error) * known.camera.focal_px
+    sigmas = uncertainty.led_sigma_m, uncertainty.lever_sigma_m, focal_sigma_px
+    return SurveyModel(known.camera, known.leds, known.lever, noise_px, *sigmas)
+
+
+def assumed(prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> Assumed:
+    """Lever and focal length before a survey, which enter its adjustment as measurements."""
+    focal_px = prior.camera.focal_px
+    return Assumed(
+        prior.lever.camera_body_m, uncertainty.lever_sigma_m, focal_px, abs(uncertainty.focal_error) * focal_px
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,7 +81,7 @@ def make_plan(
 ) -> Plan:
     """The attitudes of a survey: by the plan, or random. Raises InputError for a tilt beyond the vehicle's stop."""
     random = stops.stop_attitudes(testbed.scene, "attitudes", count, tilt_deg)
-    model = survey_model(prior, uncertainty.led_sigma_m, centroid_noise_px(testbed, tilt_deg))
+    model = survey_model(prior, uncertainty, centroid_noise_px(testbed, tilt_deg))
     margin_px = image_sizes(prior).margin_px
     held = random if kind == RANDOM else stops.planned_stops(testbed.scene, model, margin_px, count, tilt_deg)
     return Plan(held, model.visible(held.inv(), margin_px), model, margin_px)

@@ -12,6 +12,7 @@ from estimator.attitude import dome_map, nearfield
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration import dome_survey
+from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
 from estimator.calibration.gauge import align_attitudes
 from estimator.core.camera import Camera
@@ -360,6 +361,7 @@ def test_frames_in_two_groups_are_refused() -> None:
         ({"known_length": (59, 3, 0.1)}, r"known_length ends at LED row 59, which is not surveyed"),
         ({"reference_frame": 40}, r"reference_frame is 40; allowed: 0 to 39"),
         ({"leds_sigma_m": 0.0}, r"leds_sigma_m is 0.0; allowed: above 0"),
+        ({"assumed": Assumed(np.zeros(3), 0.005, 900.0, 9.0)}, r"an assumed lever .*; allowed: a finite leds_sigma_m"),
     ],
 )
 def test_a_wrong_question_is_answered_in_one_line(change: dict, message: str) -> None:

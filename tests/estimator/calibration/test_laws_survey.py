@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration import star_field
-from estimator.calibration.bundle_adjustment import Bundle, Sightings
+from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
 from estimator.calibration.gauge import Gauge, Subset, align_attitudes
 from estimator.calibration.star_field import LensPrior, StarFrame
@@ -116,6 +116,28 @@ def test_lights_eliminated_are_the_whole_system_solved(rng: np.random.Generator,
     assert ((lighter > 0) & (lighter <= 1)).all()
     np.testing.assert_allclose(bundle.cost(seen, width)[0], cost, rtol=1e-12, atol=0)
     assert ba.robust_scale(bundle, seen) == max(1.0, np.median(np.sqrt(squared)) / ba.MEDIAN_RADIUS)
+
+
+@law(Assumed.value, Assumed.weight, Bundle.from_assumed, Bundle.cost, ba.normal_equations)
+@given(rng=SEEDS, lever_m=some.floats(0, 0.1), focal_px=some.floats(0, 20), list_m=some.floats(1e-4, 0.1))
+def test_what_is_assumed_is_a_measurement_of_its_weight(
+    rng: np.random.Generator, lever_m: float, focal_px: float, list_m: float
+) -> None:
+    """The right-hand sides are half the cost's falling slope, and the matrix has 1 / sigma^2 more for each value."""
+    true, seen = dome(rng, 0.1)
+    assumed = Assumed(true.camera_body_m + rng.normal(0, 0.01, 3), lever_m, LENS[0] + rng.normal(0, 5), focal_px)
+    bundle = replace(nudged(rng, true, 1e-3), map_sigma_m=list_m)
+    known, every = replace(bundle, assumed=assumed), np.ones(len(seen.led))
+    terms = ba.normal_equations(known, seen, every)
+    more = np.diag(terms.rest - ba.normal_equations(bundle, seen, every).rest)
+    sigma = np.maximum([lever_m] * 3 + [focal_px], ba.EXACT * np.array([1, 1, 1, assumed.focal_px]))
+    np.testing.assert_allclose(more[3 * FRAMES : 3 * FRAMES + 4], sigma**-2.0, rtol=1e-3, atol=1e-3)
+    assert np.abs(np.delete(more, np.s_[3 * FRAMES : 3 * FRAMES + 4])).max() == 0
+    led, rest, step = rng.normal(size=3 * LIGHTS), rng.normal(size=3 * FRAMES + 6), 1e-7
+    costs = [known.apply_step(sign * step * led, sign * step * rest).cost(seen, np.inf)[0] for sign in (-1, 1)]
+    slope = (costs[0] - costs[1]) / (2 * step)
+    pull = 2 * (terms.rhs_led @ led + terms.rhs_rest @ rest)
+    np.testing.assert_allclose(slope, pull, rtol=1e-3, atol=1e-5 * max(costs) + 1e-9 * max(costs) / step)
 
 
 @law(ba.adjust, ba.fit_attitudes, ba.covariance_in_gauge)

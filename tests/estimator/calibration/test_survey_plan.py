@@ -12,11 +12,13 @@ from surveyed_dome import LIST_SIGMA_M, NOISE_PX, attitudes, model, pixels
 
 from estimator.attitude.dome_map import Lever
 from estimator.calibration import survey_faults, survey_plan
+from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
 from estimator.calibration.survey_faults import LightTable
 from estimator.calibration.survey_plan import SurveyModel
 
 LEDS, FRAMES, SURVEYS = 120, 30, 60
+LEVER_SIGMA_M, FOCAL_ERROR = 0.005, 0.01  # of what is assumed
 
 
 def planned(count: int, frames: int) -> tuple[SurveyModel, Rotation]:
@@ -26,10 +28,13 @@ def planned(count: int, frames: int) -> tuple[SurveyModel, Rotation]:
     return true, candidates[rows]
 
 
-def simulated(rng: np.random.Generator, true: SurveyModel, held: Rotation, sigma_factor: float = 1.0) -> DomeSurvey:
+def simulated(
+    rng: np.random.Generator, true: SurveyModel, held: Rotation, sigma_factor: float = 1.0, uses_assumed: bool = False
+) -> DomeSurvey:
     """A survey of noisy pixels with a list, a lever, a lens and start attitudes that are off.
 
     sigma_factor : by which the noise is smaller than it is believed
+    uses_assumed : whether lever and focal length are measurements; the focal length then errs at random, else by 1 %
     """
     frames = []
     for attitude, seen in zip(held, true.visible(held), strict=True):
@@ -38,9 +43,11 @@ def simulated(rng: np.random.Generator, true: SurveyModel, held: Rotation, sigma
         start = Rotation.from_rotvec(0.005 * rng.normal(size=3)) * attitude
         frames.append(DomeFrame(led, xy_px, np.full(len(led), sigma_factor * NOISE_PX), start))
     listed = replace(true.leds, position_m=true.leds.position_m + rng.normal(0, LIST_SIGMA_M, (LEDS, 3)))
-    lever = Lever(true.lever.camera_body_m + rng.normal(0, 0.005, 3), true.lever.cam_from_body)
-    camera = replace(true.camera, focal_px=1.01 * true.camera.focal_px)
-    return survey(frames, listed, lever, camera, leds_sigma_m=LIST_SIGMA_M, fit_noise=True)
+    lever = Lever(true.lever.camera_body_m + rng.normal(0, LEVER_SIGMA_M, 3), true.lever.cam_from_body)
+    sigma_px = FOCAL_ERROR * true.camera.focal_px
+    camera = replace(true.camera, focal_px=true.camera.focal_px + sigma_px * (rng.normal() if uses_assumed else 1))
+    assumed = Assumed(lever.camera_body_m, LEVER_SIGMA_M, camera.focal_px, sigma_px) if uses_assumed else None
+    return survey(frames, listed, lever, camera, leds_sigma_m=LIST_SIGMA_M, fit_noise=True, assumed=assumed)
 
 
 @pytest.mark.slow
@@ -64,6 +71,27 @@ def test_surveys_err_by_what_is_predicted(sigma_factor: float) -> None:
     led_m2, misfit = np.mean(claimed, axis=0)
     assert np.sqrt(led_m2) == pytest.approx(predicted.led_rms_m, rel=0.05)
     assert misfit == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.slow
+def test_few_frames_err_less_by_what_is_assumed() -> None:
+    """Eight frames determine the focal length to 0.3 %, and to a seventh less with the lever and the focal length that
+    are known to 5 mm and 1 % before. The survey errs by what is predicted."""
+    true, held = planned(LEDS, 8)
+    informed = replace(true, lever_sigma_m=LEVER_SIGMA_M, focal_sigma_px=FOCAL_ERROR * true.camera.focal_px)
+    without, predicted = (survey_plan.predict(one, held, true.visible(held)) for one in (true, informed))
+    assert (predicted.lever_sigma_m < without.lever_sigma_m).all()
+    assert predicted.lens_sigma[0] < 0.9 * without.lens_sigma[0]
+    rng, errors, misfits = np.random.default_rng(5), [], []
+    for _ in range(SURVEYS):
+        found = simulated(rng, true, held, uses_assumed=True)
+        lever_m = found.lever.camera_body_m - true.lever.camera_body_m
+        sigma_m = np.sqrt(np.diag(found.lever_covariance_m2))
+        errors.append([*(lever_m / sigma_m), (found.camera.focal_px - true.camera.focal_px) / found.focal_sigma_px])
+        np.testing.assert_allclose(found.focal_sigma_px, predicted.lens_sigma[0], rtol=0.3)
+        misfits.append(found.misfit)
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(errors), axis=0)), 1, atol=4 / np.sqrt(2 * SURVEYS))
+    assert np.mean(misfits) == pytest.approx(1, abs=0.02)
 
 
 @pytest.mark.slow

@@ -41,7 +41,7 @@ class Coverage:
 def coverage(run: SurveyRun) -> Coverage:
     """The coverage of a survey."""
     survey = run.survey
-    model = SurveyModel(survey.camera, survey.leds, survey.lever, run.noise_px, run.uncertainty.led_sigma_m)
+    model = survey_model(survey, run.uncertainty, run.noise_px)
     return Coverage(model, survey.body_from_lab, run.seen, run.accuracy)
 
 
@@ -51,7 +51,7 @@ def coverage_before(
     """The coverage of frames before their survey: LEDs named by the IMU's attitudes, and the accuracy predicted."""
     matches = [match_by_imu(frame, prior, uncertainty) for frame in frames]
     held = Rotation.concatenate([frame.body_from_lab for frame in frames])
-    model = survey_model(prior, uncertainty.led_sigma_m, noise_px)
+    model = survey_model(prior, uncertainty, noise_px)
     seen = identified(matches, len(prior.leds.id))
     return Coverage(model, held, seen, predicted(model, held, seen))
 
