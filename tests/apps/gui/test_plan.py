@@ -260,6 +260,17 @@ def test_check_map_and_survey_in_the_page(page: Any) -> None:
     with page.expect_download() as download:
         save.click()
     assert download.value.suggested_filename == "afit_simsat_leds.ecsv"
+    of_survey, of_map = page.get_by_text("the brighter the better"), page.get_by_text("drawn in the 3-D view")
+    of_survey.wait_for()
+    assert of_map.is_hidden()
+    page.get_by_role("button", name="Map", exact=True).click()  # it colors the LEDs anew
+    of_survey.wait_for(state="hidden")
+    of_map.wait_for()
+    page.get_by_role("button", name="Plan", exact=True).click()
+    page.get_by_text("A new survey forgets the 5 frames").wait_for()
+    page.get_by_role("button", name="Cancel", exact=True).click()
+    page.get_by_text("A new survey forgets").wait_for(state="hidden")
+    page.get_by_text("after 10 frames").wait_for()
     panel(page, "Scene")
     page.get_by_placeholder("find a key").fill("exposure.frames")
     set_to(page, "exposure.frames", "3")  # with another exposure the survey goes on

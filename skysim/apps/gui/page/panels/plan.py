@@ -32,6 +32,7 @@ FRAMES = 20  # of a survey, at first
 ALIKE = 0.9  # of the LEDs that coincide: a tracker without a prior refuses the field as ambiguous
 UNCHECKED = "Check computes what this scene will show and how accurate its tracker will be. Nothing is rendered."
 UNMAPPED = "Map compares the fields of the dome with one another: a field that looks like another one is ambiguous."
+COLORED = "In the 3-D view the LEDs are the brighter the better they are measured."
 UNPLANNED = (
     "Plan begins a survey: it chooses the attitudes from which the dome's LEDs are measured best. Fly takes frames at"
     " them. Adjust adds these to the survey's frames, measures the LEDs by all of them, and plans the next attitudes."
@@ -39,12 +40,18 @@ UNPLANNED = (
 
 
 class PlanPanel:
-    """Panel with three parts, each computed at a button's press and cleared when the scene changes."""
+    """Panel with three parts, each computed at a button's press and cleared when the scene changes.
+
+    taken : frames of the survey, once they are adjusted;  colored : its LEDs and how well it knows each
+    legends : what the colors of the LEDs in the 3-D view mean, by what has colored them; the last one is shown
+    """
 
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
         self.plan: SurveyPlan | None = None
-        self.colored: tuple[NDArray[np.int64], Floats] | None = None  # LEDs and how well the survey knows them
+        self.taken = 0
+        self.colored: tuple[NDArray[np.int64], Floats] | None = None
+        self.legends = dict[str, ui.element]()
         with self.part():
             ui.button("Check", on_click=self.check).props("dense outline size=sm").mark("check")
         self.facts = ui.column().classes("w-full gap-1").mark("check-result")
@@ -71,6 +78,7 @@ class PlanPanel:
 
     def set_scene(self) -> None:
         """Say what each part does, because nothing is known of a new scene; its survey goes on if there is one."""
+        self.legends.pop("map", None)
         for column, text in ((self.facts, UNCHECKED), (self.fields, UNMAPPED)):
             column.clear()
             with column:
@@ -79,11 +87,19 @@ class PlanPanel:
         if not (info and info.surveyed):
             self.clear_survey()
         elif self.colored:
-            self.tab.scene_3d.color_lights(*self.colored)
+            self.color("survey", *self.colored)
+
+    def color(self, by: str, ids: NDArray[np.int64], values: Floats) -> None:
+        """Color LEDs of the 3-D view, and show what that means."""
+        self.tab.scene_3d.color_lights(ids, values)
+        for name, legend in self.legends.items():
+            legend.set_visibility(name == by)
 
     def clear_survey(self) -> None:
         """Forget the survey, and say what it does."""
         self.plan = self.colored = None
+        self.taken = 0
+        self.legends.pop("survey", None)
         self.enable()
         self.save_map.set_enabled(False)
         self.stops.clear()
@@ -130,23 +146,26 @@ class PlanPanel:
         found: AmbiguityMap | None = await self.tab.run_task("ambiguity", activity="comparing the fields …")
         if found is None:
             return
-        span = (found.fraction - found.least) / (1 - found.least)
-        self.tab.scene_3d.color_lights(found.ids, span)
         self.fields.clear()
         with self.fields:
             ui.label(ambiguity_text(found))
-            with ui.row().classes("no-wrap items-center gap-2"):
+            with ui.row().classes("no-wrap items-center gap-2") as self.legends["map"]:
                 ui.label(f"{100 * found.least:.0f} % or less").classes("quiet")
                 colors = ", ".join(
                     f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in 255 * color_scale(np.linspace(0, 1, 8))
                 )
                 ui.element("div").style(f"width: 120px; height: 10px; background: linear-gradient(90deg, {colors})")
                 ui.label("100 % of the LEDs coincide; drawn in the 3-D view").classes("quiet")
+        self.color("map", found.ids, (found.fraction - found.least) / (1 - found.least))
 
     # The survey.
 
     async def plan_survey(self) -> None:
         """Begin a new survey: plan its first attitudes."""
+        if self.taken and not await confirmed(
+            f"A new survey forgets the {self.taken} frames of this one.", "Begin anew"
+        ):
+            return
         with self.working():
             found: SurveyPlan | None = await self.tab.run_task(
                 "plan_survey", int(self.frames.value or 0), activity="planning the survey …"
@@ -163,13 +182,14 @@ class PlanPanel:
             )
             if found is None:
                 return
-            lines = survey_lines(found)
+            self.taken, lines = found.frames, survey_lines(found)
             self.show_survey([*lines, prediction_text(found.plan)], found.plan)
             self.tab.log(f"survey of {Path(self.tab.scene).name}: {lines[0]}")
             if not found.refusal:
                 self.save_map.set_enabled(True)
                 self.colored = found.ids, found.known
-                self.tab.scene_3d.color_lights(*self.colored)
+            if self.colored:
+                self.color("survey", *self.colored)
 
     def show_survey(self, lines: Sequence[str], plan: SurveyPlan) -> None:
         """Show what a survey has found and its next attitudes, which can then be flown."""
@@ -178,6 +198,8 @@ class PlanPanel:
         with self.stops:
             for line in lines:
                 ui.label(line).style("overflow-wrap: anywhere")
+            self.legends["survey"] = ui.label(COLORED)
+            self.legends["survey"].set_visibility(False)
             with ui.element("div").classes("lab-stops mono"):
                 for head in ("", "roll °", "pitch °", "yaw °", "LEDs"):
                     ui.label(head).classes("quiet num")
@@ -210,6 +232,18 @@ class PlanPanel:
         data: bytes | None = await self.tab.run_task("survey_map")
         if data is not None:
             ui.download(data, f"{Path(self.tab.scene).stem}_leds.ecsv")
+
+
+async def confirmed(question: str, action: str) -> bool:
+    """Ask before something is lost. action : the label of the button that does it"""
+    with ui.dialog() as dialog, ui.card():
+        ui.label(question)
+        with ui.row():
+            ui.button(action, on_click=lambda: dialog.submit(True)).props("dense outline size=sm")
+            ui.button("Cancel", on_click=lambda: dialog.submit(False)).props("dense flat size=sm")
+    answer = await dialog
+    dialog.delete()
+    return bool(answer)
 
 
 def ambiguity_text(found: AmbiguityMap) -> str:
@@ -247,7 +281,6 @@ def survey_lines(found: SurveyFound) -> list[str]:
         f" error is {found.error_mm:.2g} mm, {found.before_mm:.2g} mm before{renamed}.",
         *missed,
         *found.faults,
-        "In the 3-D view the LEDs are the brighter the better they are measured.",
     ]
 
 
