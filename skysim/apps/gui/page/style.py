@@ -114,9 +114,9 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-space > canvas {{ position: absolute; inset: 0; width: 100%; height: 100%; touch-action: none }}
 .lab-space > .lab-names {{ pointer-events: none }}
 .lab-tag {{ position: absolute; left: 0; top: 0; pointer-events: none; color: #fff; background: #0d1015b0 }}
-.lab-looks {{ position: absolute; right: 10px; top: 8px; display: flex; gap: 4px; z-index: 1 }}
+.lab-looks {{ position: absolute; right: 8px; top: 8px; display: flex; flex-direction: column; gap: 3px; z-index: 1 }}
 .lab-looks > .q-btn {{ color: #9cc4ff; background: #0d1015 }}
-.lab-push {{ position: absolute; right: 10px; top: 38px; display: flex; gap: 10px; align-items: center;
+.lab-push {{ position: absolute; left: 10px; top: 8px; display: flex; gap: 10px; align-items: center;
   color: #d7dce4; background: #0d1015b0 }} .lab-push > .q-btn {{ color: #9cc4ff }}
 .lab-lights {{ width: 100%; border-collapse: collapse; cursor: default; text-align: right }}
 .lab-lights th {{ position: sticky; top: -10px; font-weight: normal; color: {COLORS["quiet"]};
