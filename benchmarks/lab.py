@@ -381,4 +381,5 @@ def lower_priority() -> None:
     newest = max(roots, key=psutil.Process.create_time)
     for one in (newest, *newest.children(recursive=True)):
         for thread in one.threads():
-            os.sched_setscheduler(thread.id, os.SCHED_IDLE, os.sched_param(0))
+            with suppress(ProcessLookupError):  # it has ended meanwhile
+                os.sched_setscheduler(thread.id, os.SCHED_IDLE, os.sched_param(0))

@@ -152,7 +152,7 @@ def survey(
         component: Koch 1999, Parameter Estimation and Hypothesis Testing in Linear Models, section 3.6). The weights of
         pixels and map are then right even if the noise is known only up to a factor
     assumed         : lever and focal length with standard deviations, used as measurements beside the map. Many frames
-        determine both better; few frames hardly do, and misidentified ones could be fitted by a wrong lens
+        determine both better. Few frames hardly determine them: a wrong lens could then fit misidentified lights
 
     Raises ValueError in one line if the frames are malformed or do not determine the unknowns, Unconnected if they form
     several groups.
@@ -161,8 +161,8 @@ def survey(
         raise ValueError(f"survey: unknown loss {loss!r}; allowed: {', '.join(LOSSES)}")
     if not leds_sigma_m > 0:
         raise ValueError(f"survey: leds_sigma_m is {leds_sigma_m}; allowed: above 0, inf for a start only")
-    if assumed and np.isinf(leds_sigma_m):
-        raise ValueError("survey: an assumed lever needs a map that is a measurement; allowed: a finite leds_sigma_m")
+    if assumed and (np.isinf(leds_sigma_m) or known_length or reference_frame is not None):
+        raise ValueError("survey: an assumed lever needs the map for all else; allowed: a finite leds_sigma_m alone")
     checks.each_of_type("survey: frames", frames, DomeFrame)
     checks.of_type("survey: camera_start", camera_start, Camera)
     check_map(leds_start)
@@ -203,7 +203,9 @@ def _fit(start: Bundle, sightings: Sightings, gauge: Gauge, width: float, fit_no
         for _ in range(NOISE_ROUNDS if fit_noise else 1):
             scaled = replace(subset.sightings, sigma_px=scale * sightings.sigma_px[subset.index])
             fitted, converged = ba.adjust(subset.bundle, scaled, np.inf)
-            subset = replace(subset, bundle=gauge.transform(fitted, subset), sightings=scaled)
+            # If priors fix the gauge, the fit's own is the one of least squares.
+            in_gauge = fitted if _has_prior_gauge(fitted, gauge) else gauge.transform(fitted, subset)
+            subset = replace(subset, bundle=in_gauge, sightings=scaled)
             covariances = _covariances(subset, gauge)
             misfit = _misfit(subset, covariances)
             if not fit_noise or abs(misfit - 1) < NOISE_TOLERANCE or not misfit > 0:
@@ -216,11 +218,16 @@ def _fit(start: Bundle, sightings: Sightings, gauge: Gauge, width: float, fit_no
     return _Fit(subset, keep, converged, covariances, misfit, scale)
 
 
+def _has_prior_gauge(bundle: Bundle, gauge: Gauge) -> bool:
+    """Whether the map, as a measurement, fixes rotation and scale."""
+    return gauge.is_map and bool(np.isfinite(bundle.map_sigma_m))
+
+
 def _covariances(subset: Subset, gauge: Gauge) -> Covariances:
     """The covariances of a fitted subset: of total errors if its map fixes the gauge, else relative to the gauge."""
     bundle = subset.bundle
     terms = ba.normal_equations(bundle, subset.sightings, np.ones(len(subset.index)))
-    if gauge.is_map and np.isfinite(bundle.map_sigma_m):
+    if _has_prior_gauge(bundle, gauge):
         return ba.covariance(terms, bundle)
     return ba.covariance_in_gauge(terms, bundle, *gauge.constraints(bundle, subset))
 

@@ -51,6 +51,9 @@ class SurveyModel:
         for name in ("sigma_px", "leds_sigma_m"):
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"survey: {name} is {getattr(self, name)}; allowed: finite, above 0")
+        for name in ("lever_sigma_m", "focal_sigma_px"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"survey: {name} is {getattr(self, name)}; allowed: 0 or more")
 
     def visible(self, body_from_lab: Rotation, margin_px: float = 0.0) -> Mask:
         """(F, N) LEDs on the chip at each of F attitudes, at least `margin_px` from its edge."""

@@ -12,6 +12,7 @@ import signal
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from posixpath import normpath
 from typing import Any
 from urllib.parse import quote
 
@@ -113,8 +114,9 @@ def is_plain_file(scope: Any) -> bool:
     """Whether a request is for a whole file of NiceGUI or of this page's elements, which never changes."""
     if scope["type"] != "http" or scope["method"] != "GET" or scope["query_string"]:
         return False
-    is_file = scope["path"].startswith(f"{FILES}/") and not scope["path"].startswith(f"{FILES}/dynamic_resources/")
-    return is_file and b"range" not in dict(scope["headers"])
+    path = scope["path"]
+    is_file = path.startswith(f"{FILES}/") and not path.startswith(f"{FILES}/dynamic_resources/")
+    return is_file and normpath(path) == path and b"range" not in dict(scope["headers"])
 
 
 class Guard:
@@ -224,9 +226,9 @@ def be_patient() -> None:
 
 
 def freeze() -> None:
-    """Take what was imported out of the garbage collector's sight, and let it work in small steps.
+    """Take what was imported out of the garbage collector's sight, and let it look at new objects alone.
 
-    A collection of all pages takes half a second with 20 of them, in which no key is answered; `close` makes one.
+    A collection of all pages takes half a second with 20 of them, in which no key is answered. Only `close` makes one.
     """
     gc.collect()
     gc.freeze()
@@ -269,7 +271,8 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
             return Response(status_code=404)
         return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_POLICY})
 
-    @ui.page("/", title="skysim gui", dark=True)
+    # NiceGUI allows three seconds for building a page, which many that are built at once exceed.
+    @ui.page("/", title="skysim gui", dark=True, response_timeout=CONNECT_TIMEOUT_S)
     async def index(request: Request) -> None:
         tab = Tab(scene, folder, out, cameras, user_of(request.cookies))
         await tab.build()

@@ -40,7 +40,9 @@ MOVED_ROUNDS = 2  # further rounds if LEDs are far from their places in the list
 
 # Share of a frame's lights that are matched, and of these that fit the adjustment: far less by chance.
 MIN_MATCHED = 0.5
-PLAUSIBLE = 6.0  # standard deviations between a parameter found and the assumed one
+# Standard deviations by which a parameter may move from the assumed one, and the least of these, as a share of that
+# of the assumed one.
+PLAUSIBLE, LEAST_SHARE = 6.0, 0.1
 MAX_DISPLACEMENT_M = 0.1  # of an LED from its place in the list
 
 
@@ -90,21 +92,24 @@ def check_plausible(run: SurveyRun, prior: CalibrationPrior, uncertainty: Survey
     """Raise InputError if the survey found a focal length or a lever arm that contradicts what was assumed before.
 
     If frames are misidentified, the adjustment can fit them with a model that is far from the real one, such as half
-    the focal length with the camera close to the dome, and with small residuals and standard deviations. A parameter
-    found differs from the assumed one by more than PLAUSIBLE sqrt(assumed sigma^2 + sigma^2) only by such an error.
+    the focal length with the camera close to the dome, and with small residuals and standard deviations. The assumed
+    value is one of the adjustment's measurements, so what the frames add to it has the variance P0 - P, P0 before and P
+    after (the innovation of a linear estimate). A value moves by more than PLAUSIBLE standard deviations only by such
+    an error. For frames that add next to nothing the variance is at least LEAST_SHARE^2 P0.
     """
     found, accuracy = run.survey, run.accuracy
     lever = zip(prior.lever.camera_body_m, found.lever.camera_body_m, accuracy.lever_sigma_m, "xyz", strict=True)
     focal_px = prior.camera.focal_px
-    rows = [(focal_px, found.camera.focal_px, accuracy.lens_sigma[0], uncertainty.focal_error * focal_px, "focal px")]
+    lever_sigma_m, focal_sigma_px = assumed(prior, uncertainty).weight[2:] ** -0.5
+    rows = [(focal_px, found.camera.focal_px, accuracy.lens_sigma[0], focal_sigma_px, "focal px")]
     rows += [
-        (1e3 * before, 1e3 * now, 1e3 * sigma, 1e3 * uncertainty.lever_sigma_m, f"lever {axis} mm")
+        (1e3 * before, 1e3 * now, 1e3 * sigma, 1e3 * lever_sigma_m, f"lever {axis} mm")
         for before, now, sigma, axis in lever
     ]
     for before, now, sigma, known, name in rows:
-        if abs(now - before) > PLAUSIBLE * math.hypot(sigma, known):
+        if abs(now - before) > PLAUSIBLE * math.sqrt(max(known**2 - sigma**2, (LEAST_SHARE * known) ** 2)):
             raise InputError(
-                f"survey: {name} {now:.5g} ± {sigma:.2g} contradicts the assumed {before:.5g} ± {abs(known):.2g}:"
+                f"survey: {name} {now:.5g} ± {sigma:.2g} contradicts the assumed {before:.5g} ± {known:.2g}:"
                 " lights are misidentified; allowed: further frames, or a larger uncertainty of what is assumed"
             )
 

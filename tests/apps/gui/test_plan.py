@@ -270,7 +270,8 @@ def test_check_map_and_survey_in_the_page(page: Any) -> None:
     page.get_by_text("A new survey forgets the 5 frames").wait_for()
     page.get_by_role("button", name="Cancel", exact=True).click()
     page.get_by_text("A new survey forgets").wait_for(state="hidden")
-    page.get_by_text("after 10 frames").wait_for()
+    assert come(adjust.is_enabled)
+    assert page.get_by_text("5 frames, ").is_visible()
     panel(page, "Scene")
     page.get_by_placeholder("find a key").fill("exposure.frames")
     set_to(page, "exposure.frames", "3")  # with another exposure the survey goes on
@@ -278,6 +279,9 @@ def test_check_map_and_survey_in_the_page(page: Any) -> None:
     page.get_by_text("after 10 frames").wait_for()
     adjust.click()
     page.get_by_text("no flight: fly the survey's attitudes").first.wait_for()
+    page.get_by_role("button", name="Plan", exact=True).click()
+    page.get_by_role("button", name="Begin anew", exact=True).click()
+    page.get_by_text("after 2 frames").wait_for()  # the steps of a new plan
     chosen(page, "Scene", "shefex2")
     page.get_by_text("Plan begins a survey").wait_for()
     assert adjust.is_disabled()

@@ -243,6 +243,43 @@ def test_a_survey_of_a_dome_is_at_rest_and_knows_its_errors(rng: np.random.Gener
         assert_covariance(matrix)
 
 
+@law(survey, slow=True)
+@given(rng=SEEDS, lever_m=some.floats(0, 0.02), focal_px=some.floats(0.5, 20))
+def test_the_misfit_is_over_what_the_pixels_determine(
+    rng: np.random.Generator, lever_m: float, focal_px: float
+) -> None:
+    """Beside a map and an assumed lever the pixels determine tr(N C) of the unknowns: N their own normal matrix, C the
+    covariance by all measurements. The survey is where these agree best; a lever that is known exactly is not moved."""
+    true, seen = dome(rng, 0.1)
+    turned = Rotation.from_matrix(true.R_body_from_lab)
+    arm = Lever(true.camera_body_m, Rotation.from_matrix(true.R_cam_from_body))
+    leds = LedMap(np.arange(LIGHTS), true.position_m + rng.normal(0, 0.002, (LIGHTS, 3)), np.zeros(3), np.full(3, 1.2))
+    rows = [seen.frame == k for k in range(FRAMES)]
+    frames = [DomeFrame(seen.led[k], seen.xy_px[k], seen.sigma_px[k], turned[n]) for n, k in enumerate(rows)]
+    assumed = Assumed(true.camera_body_m, lever_m, CAMERA.focal_px, focal_px)
+    found = survey(frames, leds, arm, CAMERA, leds_sigma_m=0.002, assumed=assumed)
+    assert found.surveyed.all()
+    lens = np.array([found.camera.focal_px, *found.camera.center_px, *CAMERA.distortion])
+    attitudes, place_m, at_m = found.body_from_lab.as_matrix(), found.leds.position_m, found.lever.camera_body_m
+    bundle = Bundle(place_m, attitudes, at_m, true.R_cam_from_body, lens, 3, leds.position_m, 0.002, assumed)
+    every = ba.linearize(bundle, seen)
+    jacobian = np.zeros((len(seen.led), 2, 3 * LIGHTS + 3 * FRAMES + 6))
+    for n, (led, frame) in enumerate(zip(seen.led, seen.frame, strict=True)):
+        jacobian[n, :, 3 * led : 3 * led + 3] = every.by_led[n]
+        jacobian[n, :, 3 * (LIGHTS + frame) : 3 * (LIGHTS + frame) + 3] = every.by_rotation[n]
+    jacobian[:, :, -6:] = every.by_shared
+    jacobian = jacobian.reshape(2 * len(seen.led), -1)
+    by_pixels, before = jacobian.T @ jacobian, np.zeros(jacobian.shape[1])
+    before[: 3 * LIGHTS], before[-6:-2] = 0.002**-2, assumed.weight
+    determined = np.trace(np.linalg.solve(by_pixels + np.diag(before), by_pixels))
+    wanted = np.sqrt(np.sum(every.residual**2) / (2 * len(seen.led) - determined))
+    assert found.misfit == pytest.approx(wanted, rel=1e-3)
+    terms = ba.normal_equations(bundle, seen, np.ones(len(seen.led)))
+    led_step, rest_step = ba.step(terms, ba.eliminate_lights(terms, np.zeros((len(terms.rest), 0)), 0.0))
+    assert terms.rhs_led @ led_step + terms.rhs_rest @ rest_step < 1e-6  # at rest where all measurements agree best
+    assert np.linalg.norm(at_m - true.camera_body_m) < 6 * np.sqrt(3) * max(lever_m, ba.EXACT)
+
+
 @law(survey)
 @given(
     rng=SEEDS,

@@ -95,7 +95,7 @@ def frames(folder: Path, built: Testbed) -> Path:
     uncertainty = prior.survey_uncertainty("0.3 deg", "1 mm", "3 mm", "1%")
     testbed = build_testbed(prior.as_listed(loader.load(folder / "design.yaml")))
     assumed = prior.prior_of(testbed, prior.calibration_prior(testbed).camera, prior.calibration_prior(testbed).leds)
-    model = prior.survey_model(assumed, 0.001, 0.02)
+    model = prior.survey_model(assumed, uncertainty, 0.02)
     held = stops.planned_stops(built.scene, model, 8.0, STOPS, TILT_DEG)
     for _ in procedure.simulated_frames(built, uncertainty, held, folder / "frames"):
         pass

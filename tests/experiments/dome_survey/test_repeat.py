@@ -39,11 +39,19 @@ def test_a_survey_that_fails_does_not_lose_the_others(monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize(("parameter", "refused"), [("focal px", True), ("lever z mm", True), ("focal px", False)])
 def test_a_survey_that_contradicts_what_was_assumed_is_refused(parameter: str, refused: bool) -> None:
-    """Misidentified frames fitted half the focal length, 4242 px with a sigma of 180, where 9222 to 1 % was assumed."""
-    assumed, sigma_px, sigma_m, focal_px = prior.survey_uncertainty(), 180.0, 0.001, 9222.6
+    """The frames alone give a value of sigma s, before that one of sigma p was assumed: they differ by hypot(s, p), and
+    the weighted mean of both moves from the assumed one by p^2 / (s^2 + p^2) of this."""
+    assumed, focal_px = prior.survey_uncertainty(), 9222.6
     share = adjust.PLAUSIBLE * (1.01 if refused else 0.99)
-    off_px = share * math.hypot(sigma_px, assumed.focal_error * focal_px) * (parameter == "focal px")
-    off_m = share * math.hypot(sigma_m, assumed.lever_sigma_m) * (parameter == "lever z mm")
+
+    def moved(frames_sigma: float, before_sigma: float) -> tuple[float, float]:
+        """By how much the mean moves for frames that are off by `share`, and its standard deviation."""
+        both = math.hypot(frames_sigma, before_sigma)
+        return share * both * (before_sigma / both) ** 2, frames_sigma * before_sigma / both
+
+    off_px, sigma_px = moved(180.0, assumed.focal_error * focal_px)
+    off_m, sigma_m = moved(0.001, assumed.lever_sigma_m)
+    off_px, off_m = off_px * (parameter == "focal px"), off_m * (parameter == "lever z mm")
     before, found = (
         SimpleNamespace(
             camera=SimpleNamespace(focal_px=focal_px - focal),

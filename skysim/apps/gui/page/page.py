@@ -281,6 +281,7 @@ class Tab:
         self.plan_panel.set_scene()
         self.study_panel.set_scene()
         self.display_live(view)
+        self.scene_panel.shown = self.tracker_panel.shown = None  # the file may be another one under the same name
         await self.fill_form()
         self.log(f"opened {Path(scene).name}" + (f" with {', '.join(overrides)}" if overrides else ""))
         return True
@@ -292,7 +293,7 @@ class Tab:
         async with self.filling:
             while panel and self.view and self.is_open and panel.shown != (current := (self.scene, self.overrides)):
                 fields = await run.io_bound(forms.fields, *current)
-                if (self.scene, self.overrides) == current:
+                if self.is_open and (self.scene, self.overrides) == current:
                     panel.set_scene(fields)
                     panel.shown = current
 

@@ -162,11 +162,10 @@ class PlanPanel:
 
     async def plan_survey(self) -> None:
         """Begin a new survey: plan its first attitudes."""
-        if self.taken and not await confirmed(
-            f"A new survey forgets the {self.taken} frames of this one.", "Begin anew"
-        ):
-            return
         with self.working():
+            question = f"A new survey forgets the {self.taken} frames of this one."
+            if self.taken and not await confirmed(question, "Begin anew"):
+                return
             found: SurveyPlan | None = await self.tab.run_task(
                 "plan_survey", int(self.frames.value or 0), activity="planning the survey …"
             )
@@ -242,7 +241,8 @@ async def confirmed(question: str, action: str) -> bool:
             ui.button(action, on_click=lambda: dialog.submit(True)).props("dense outline size=sm")
             ui.button("Cancel", on_click=lambda: dialog.submit(False)).props("dense flat size=sm")
     answer = await dialog
-    dialog.delete()
+    if not dialog.is_deleted:
+        dialog.delete()
     return bool(answer)
 
 

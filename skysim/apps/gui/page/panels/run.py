@@ -33,7 +33,7 @@ class RunPanel:
 
     rows, log : of the computed frames and of the motion;  residuals : of the identified lights, see `FlightStep`
     computing, stopping : whether the flight is being computed, and whether it shall end
-    playing, showing : whether it plays, and whether `play_on` shows its frames
+    playing, showing : whether it plays, and whether `play_on` shows its frames;  slot : of the panel in the page
     wanted_s : time to be shown once the flight is computed; None: play it from its start
     sought : place of the slider while its frame is not shown yet
     index : of the frame on the page;  started_s, from_s : time of the last start of playback, and in the flight there
@@ -51,6 +51,7 @@ class RunPanel:
         self.plays_when_done = False
         self.index, self.started_s, self.from_s, self.drawn_s = 0, 0.0, 0.0, 0.0
         self.closed_scene, self.closed_overrides = "", dict[str, str]()
+        self.slot = ui.context.slot
         self.build()
         ui.on("moment", self.clicked)
 
@@ -214,7 +215,8 @@ class RunPanel:
         self.tab.photo.stop()
         self.playing, self.started_s = True, time.monotonic()
         self.play.props("icon=pause")
-        ui.timer(0, self.play_on, once=True)
+        with self.slot:  # not in that of a palette's row, which ends with the palette
+            ui.timer(0, self.play_on, once=True)
 
     def toggle(self) -> None:
         """Play or pause; at the end, play again from the start."""
@@ -285,8 +287,11 @@ class RunPanel:
                 if self.index >= len(self.rows) - 1:
                     self.pause()
                 elif self.playing:
-                    wait_s = (self.times_s[index + 1] - self.now_s) / self.factor
+                    wait_s = (self.times_s[self.index + 1] - self.now_s) / self.factor
                     await asyncio.sleep(min(max(wait_s, 0.001), LOOK_S))
+        except Exception:
+            self.pause()
+            raise
         finally:
             self.showing = False
 

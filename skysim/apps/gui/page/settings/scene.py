@@ -75,5 +75,5 @@ class ScenePanel:
 
     async def revert(self) -> None:
         """Reopen the scene without overrides."""
-        self.form.scene, self.shown = "", None  # forces a rebuild, which removes refused values too
+        self.form.scene = ""  # forces a rebuild, which removes refused values too
         await self.tab.open(self.tab.scene)

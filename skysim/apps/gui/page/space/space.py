@@ -37,7 +37,7 @@ class Space(ui.element, component="js/space.js", esm={"skysim-space": "js"}):  #
 class Scene3D:
     """The view and its buttons; `set_scene` builds it, `show` sets the attitude, which is sent a little later.
 
-    newest_view : that is not sent yet;  waits : whether `update` will be called
+    newest_view : that is not sent yet;  waits : whether `send_newest` will be called
     """
 
     def __init__(self, tab: Tab) -> None:
@@ -86,11 +86,15 @@ class Scene3D:
         self.newest_view = view
         if not self.waits:
             self.waits = True
-            asyncio.get_running_loop().call_later(UPDATE_S, self.update)
+            asyncio.get_running_loop().call_later(UPDATE_S, self.send_newest)
+
+    def send_newest(self) -> None:
+        self.waits = False
+        self.update()
 
     def update(self) -> None:
         """Send the vehicle's attitude, and the lights that are on the frame and that are identified."""
-        view, self.newest_view, self.waits = self.newest_view, None, False
+        view, self.newest_view = self.newest_view, None
         if view is None or not self.tab.is_open:
             return
         found = view.result.detections if view.result else ()
