@@ -51,6 +51,10 @@ class SurveyUncertainty:
     lever_sigma_m: float
     focal_error: float
 
+    def focal_sigma_px(self, camera: Camera) -> float:
+        """Standard deviation of the assumed focal length of a camera."""
+        return abs(self.focal_error) * camera.focal_px
+
 
 @dataclass(frozen=True, slots=True)
 class CalibrationPrior:
@@ -140,17 +144,14 @@ def require_dome(scene: Scene) -> DomeConfig:
 
 def survey_model(known: CalibrationPrior | DomeSurvey, uncertainty: SurveyUncertainty, noise_px: float) -> SurveyModel:
     """The model by which the estimator plans and predicts. known : before a survey, or from it"""
-    focal_sigma_px = abs(uncertainty.focal_error) * known.camera.focal_px
-    sigmas = uncertainty.led_sigma_m, uncertainty.lever_sigma_m, focal_sigma_px
+    sigmas = uncertainty.led_sigma_m, uncertainty.lever_sigma_m, uncertainty.focal_sigma_px(known.camera)
     return SurveyModel(known.camera, known.leds, known.lever, noise_px, *sigmas)
 
 
 def assumed(prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> Assumed:
     """Lever and focal length before a survey, which enter its adjustment as measurements."""
-    focal_px = prior.camera.focal_px
-    return Assumed(
-        prior.lever.camera_body_m, uncertainty.lever_sigma_m, focal_px, abs(uncertainty.focal_error) * focal_px
-    )
+    camera, arm_m = prior.camera, prior.lever.camera_body_m
+    return Assumed(arm_m, uncertainty.lever_sigma_m, camera.focal_px, uncertainty.focal_sigma_px(camera))
 
 
 @dataclass(frozen=True, slots=True)
