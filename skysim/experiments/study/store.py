@@ -85,7 +85,7 @@ class Store:
     def meta(self, key: str) -> str:
         """The value of a metadata key; empty if it is not set."""
         row = self.db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
-        return row[0] if row else ""
+        return self.checked(row, str)[0] if row else ""
 
     def overrides(self) -> dict[str, str]:
         """Overrides of study keys from the run's command line: YAML text by key. Raises InputError."""
@@ -126,6 +126,7 @@ class Store:
             for part in self.parts():
                 columns = [row_parts.read_column(part.path, name)[[0, -1]] for name in ("point", "replicate", "scene")]
                 found += zip(*(column.tolist() for column in columns), strict=True)
+        found = [self.checked(row, int, int, str) for row in found]
         return [min(found), max(found)] if found else []
 
     def delete_failed(self) -> None:
@@ -149,7 +150,7 @@ class Store:
         """All points, in order. Raises InputError."""
         rows = self.db.execute("SELECT levels, settings FROM points ORDER BY point")
         with self.corruption_as_input_error():
-            return [Point(json.loads(levels), json.loads(settings)) for levels, settings in rows]
+            return [Point(*self.checked(map(json.loads, row), dict, dict)) for row in rows]
 
     def add(self, rows: list[Row]) -> None:
         """Store rows in one transaction."""
@@ -214,7 +215,8 @@ class Store:
         if self.meta("format") != str(FORMAT_OF_PARTS):  # a store of an earlier skysim has no such table
             return []
         rows = self.db.execute("SELECT part, rows, first, last FROM parts ORDER BY part")
-        return [self._parts.setdefault(number, Part(self.part_path(number), *others)) for number, *others in rows]
+        known = (self.checked(row, int, int, int, int) for row in rows)
+        return [self._parts.setdefault(number, Part(self.part_path(number), *others)) for number, *others in known]
 
     @contextmanager
     def snapshot(self) -> Iterator[None]:
@@ -237,7 +239,8 @@ class Store:
     def runs(self) -> list[dict[str, Any]]:
         """Every run that was not killed: engine, workers, trials, seconds."""
         rows = self.db.execute("SELECT engine, workers, trials, seconds FROM runs ORDER BY run")
-        return [dict(zip(("engine", "workers", "trials", "seconds"), row, strict=True)) for row in rows]
+        known = (self.checked(row, str, int, int, float) for row in rows)
+        return [dict(zip(("engine", "workers", "trials", "seconds"), row, strict=True)) for row in known]
 
     def done(self, count: int) -> NDArray[np.bool_]:
         """(count,) mask of the trials in the store, failed ones included."""
@@ -264,7 +267,7 @@ class Store:
         """Number of each failed trial and the last line of its traceback. Raises InputError."""
         rows = self.db.execute("SELECT trial, error FROM trials WHERE error IS NOT NULL ORDER BY trial")
         with self.corruption_as_input_error():
-            return [(trial, error.strip().splitlines()[-1]) for trial, error in rows]
+            return [(trial, self.checked([error], str)[0].strip().splitlines()[-1]) for trial, error in rows]
 
     def trial(self, number: int) -> dict[str, Any]:
         """One row by column name. Raises InputError if the trial is not in the store."""
@@ -347,7 +350,16 @@ class Store:
             while rows := cursor.fetchmany(10_000):
                 for name, arrays, column in zip(COLUMNS, batches, zip(*rows, strict=True), strict=True):
                     arrays.append(to_array(name, column, texts))
+            self.checked([text for text in texts if not isinstance(text, str | None)][:1], str)
             return {name: np.concatenate(arrays) for name, arrays in zip(COLUMNS, batches, strict=True)}
+
+    def checked(self, row: Iterable[Any], *types: type) -> tuple[Any, ...]:
+        """The values of a row. Raises InputError for a value of another type: SQLite stores any type in any column."""
+        values = tuple(row)
+        if not all(map(isinstance, values, types)):
+            allowed = ", ".join(dict.fromkeys(one.__name__ for one in types))
+            raise InputError(f"{self.path}: not a valid study store: {repr(values)[:80]}; allowed: {allowed}")
+        return values
 
     @contextmanager
     def corruption_as_input_error(self) -> Iterator[None]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import signal
 import sqlite3
 import time
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -177,6 +179,42 @@ def test_what_is_no_store_is_refused(tmp_path: Path) -> None:
         pass
     with pytest.raises(InputError, match="unable to open"), store.writing(taken(tmp_path)):
         pass
+
+
+COLUMNS_READ = {  # all but the keys, for which SQLite itself refuses anything but integers
+    "meta": ["value"],
+    "points": ["levels", "settings"],
+    "trials": [name for name in store.COLUMNS if name not in ("trial", "time_ms")],
+    "timings": ["time_ms"],
+    "runs": ["engine", "workers", "trials", "seconds"],
+}
+
+
+@pytest.mark.parametrize(("table", "column"), [(table, one) for table in COLUMNS_READ for one in COLUMNS_READ[table]])
+def test_a_value_of_another_type_is_one_clear_line(table: str, column: str, tmp_path: Path) -> None:
+    """SQLite stores any type in any column, so a damaged file can hold bytes where skysim wrote text or numbers."""
+    path = tmp_path / "odd.sqlite"
+    with store.writing(path) as kept:
+        kept.begin([Point({"led": "a"}, {"led": "a"})], code="1", replicates="1")
+        kept.add([Row(0, 0, 0, 7, "scene", "code", Outcome("solved", 1, 1), None, 1e-3)])
+        kept.record_run("serial", 1, 1, 0.1)
+    with closing(sqlite3.connect(path)) as db, db:
+        assert db.execute(f"UPDATE {table} SET {column} = x'ff00'").rowcount
+    one_line = re.compile(r"[^\n]*odd\.sqlite: [^\n]+")
+    with pytest.raises(InputError) as refused, store.open_store(path) as kept:
+        kept.meta("code"), kept.points(), kept.runs(), kept.failures(), kept.columns()
+    assert one_line.fullmatch(str(refused.value))
+
+
+def test_a_resumed_store_with_text_for_a_number_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "odd.sqlite"
+    row = Row(0, 0, 0, 7, "scene", "code", Outcome("solved", 1, 1), None, 1e-3)
+    with store.writing(path) as kept:
+        kept.add([row, row._replace(trial=1), row._replace(trial=2)])
+    with closing(sqlite3.connect(path)) as db, db:
+        db.execute("UPDATE trials SET point = 'two' WHERE trial = 2")
+    with store.writing(path) as kept, pytest.raises(InputError, match=r"odd\.sqlite: .*'two'.*allowed: int, str"):
+        kept.scenes()
 
 
 def taken(folder: Path) -> Path:

@@ -162,7 +162,8 @@ def check_scene(plan: Plan, store: Store) -> None:
     """Raise InputError if the scene of the first or the last stored point, or a file it names, has changed."""
     points = store.points()
     for point, replicate, stored in store.scenes():
-        settings = plan.spec.trial_settings(points[point].settings, replicate)
+        with store.corruption_as_input_error():
+            settings = plan.spec.trial_settings(points[point].settings, replicate)
         now = scene_hash(resolve_point(plan.spec, settings)[0])
         if now != stored:
             raise InputError(
