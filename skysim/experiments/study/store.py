@@ -339,7 +339,10 @@ class Store:
     def _replicates(self) -> int:
         """Trials of a point."""
         with self.corruption_as_input_error():
-            return int(self.meta("replicates"))
+            replicates = int(self.meta("replicates"))
+            if not 1 <= replicates < 2**31:
+                raise ValueError(f"replicates {replicates}")
+            return replicates
 
     def _kept_columns(self, where: str, values: Sequence[int]) -> dict[str, NDArray[Any]]:
         """The columns of rows in SQLite, in trial order."""

@@ -144,6 +144,8 @@ class Part:
         """(N,) numbers of its trials, where a point has so many."""
         if self._trials[0] != replicates:
             point, replicate = (read_column(self.path, name) for name in ("point", "replicate"))
+            if not len(point) == len(replicate) == self.rows > 0:
+                raise InputError(f"{self.path}: has {len(point)} rows; allowed: {self.rows}, as the study store lists")
             self._trials = replicates, point * replicates + replicate
         return self._trials[1]
 

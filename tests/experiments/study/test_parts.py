@@ -8,6 +8,7 @@ import signal
 import sqlite3
 import time
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from multiprocessing import forkserver
 from pathlib import Path
@@ -415,6 +416,24 @@ def test_a_part_that_is_missing_or_damaged_is_named(tmp_path: Path) -> None:
         ):
             kept.columns()
         assert "\n" not in str(found.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("UPDATE parts SET rows = 7 WHERE part = 2", r"000002\.parquet: has \d+ rows; allowed: 7"),
+        ("UPDATE parts SET last = 'x' WHERE part = 2", r"s\.sqlite: not a valid study store: .*'x'"),
+        ("UPDATE meta SET value = '0' WHERE key = 'replicates'", r"s\.sqlite: not a valid study store: replicates 0"),
+    ],
+)
+def test_a_list_of_parts_that_skysim_cannot_have_written_is_one_clear_line(
+    change: str, message: str, tmp_path: Path
+) -> None:
+    path = filled(tmp_path / "s.sqlite", ALL)
+    with closing(sqlite3.connect(path)) as db, db:
+        assert db.execute(change).rowcount
+    with store.open_store(path) as kept, pytest.raises(InputError, match=message):
+        kept.trial_range()
 
 
 def test_an_earlier_skysim_refuses_a_store_with_parts(tmp_path: Path) -> None:
