@@ -49,6 +49,7 @@ LOSSES: dict[str, float] = {"linear": np.inf, "cauchy": CAUCHY}
 GATE = 5.0  # residuals above this many robust sigmas are outliers in the final fit
 GROSS_GATE = 6.0  # the same for the first rejection, after only the attitudes are fitted
 CROSSING_RAD = 0.005  # least rms angle between the rays to one light; below, its distance is undetermined
+CONNECTING_RAD = 2 * CROSSING_RAD  # of lights that connect frames before they are adjusted: the angle is not yet exact
 NOISE_ROUNDS, NOISE_TOLERANCE = 8, 0.01  # of the noise estimated from the residuals; the tolerance is relative
 
 
@@ -290,8 +291,12 @@ def _reject_misidentified(full: Bundle, sightings: Sightings, width: float) -> t
     """Improve the start values and reject wrong identifications.
 
     First only the attitudes are fitted. For a finite width, gross outliers are rejected, the whole bundle is fitted
-    with Cauchy's loss, whose width shrinks with the noise until it settles, and residuals beyond GATE are rejected.
-    Returns the bundle and the (M,) mask of sightings kept.
+    with Cauchy's loss for a noise that shrinks with the residuals until it settles, and residuals beyond GATE are
+    rejected. Returns the bundle and the (M,) mask of sightings kept.
+
+    With the true noise at once, a few wrong identifications would move the lever or the lens by ten times what is known
+    of them, and the fit would end in a minimum where the right ones are rejected. So at first what is known counts as
+    much as the pixels (graduated non-convexity: Blake and Zisserman 1987, Visual Reconstruction, chapter 7).
     """
     keep = np.ones(len(sightings.led), dtype=bool)
     subset = connected_subset(full, sightings, keep)
@@ -301,10 +306,10 @@ def _reject_misidentified(full: Bundle, sightings: Sightings, width: float) -> t
         return full, keep
     keep[subset.index] = _inliers(fitted, subset.sightings, GROSS_GATE)
     subset = connected_subset(full, sightings, keep)
-    # Graduated robust fit: each round shrinks the width with the residuals, until it shrinks by less than 10 %.
     fitted, previous = subset.bundle, np.inf
-    while (current := width * ba.robust_scale(fitted, subset.sightings)) < 0.9 * previous:
-        fitted, previous = ba.adjust(fitted, subset.sightings, current, decrement=0.1)[0], current
+    while (scale := ba.robust_scale(fitted, subset.sightings)) < 0.9 * previous:
+        noisy = replace(subset.sightings, sigma_px=scale * subset.sightings.sigma_px)
+        fitted, previous = ba.adjust(fitted, noisy, width, decrement=0.1)[0], scale
     keep[subset.index] = _inliers(fitted, subset.sightings, GATE)
     return subset.insert_into(full, fitted), keep
 
@@ -324,11 +329,13 @@ def connected_subset(full: Bundle, sightings: Sightings, keep: np.ndarray) -> Su
     in_front = np.isfinite(ba.residuals(full, sightings)).all(axis=1)
     index = np.flatnonzero(keep & in_front)
     lights, frames = len(full.position_m), len(full.R_body_from_lab)
+    camera_m = np.einsum("kji,j->ki", full.R_body_from_lab, full.camera_body_m)
     # Removing a light can leave its frames with too few lights, and the reverse: repeat until nothing changes.
     while True:
         led, frame = sightings.led[index], sightings.frame[index]
         incidence = csr_array((np.ones(len(index)), (frame, led)), shape=(frames, lights)) > 0
-        good_led = (incidence.sum(axis=0) >= 2) & _crossing(full, sightings.take(index))
+        angle_rad = ray_angles(full.position_m, camera_m, frame, led)
+        good_led = (incidence.sum(axis=0) >= 2) & (angle_rad > CROSSING_RAD)
         good_frame = incidence @ good_led.astype(float) >= 2
         valid = good_led[led] & good_frame[frame]
         if valid.all():
@@ -350,19 +357,20 @@ def connected_subset(full: Bundle, sightings: Sightings, keep: np.ndarray) -> Su
     return Subset(bundle, numbered, led_rows, frame_rows, index)
 
 
-def _crossing(full: Bundle, sightings: Sightings) -> np.ndarray:
-    """(N,) whether each light's rays differ enough in direction to determine its distance.
+def ray_angles(position_m: np.ndarray, camera_m: np.ndarray, frame: Ints, led: Ints) -> np.ndarray:
+    """(N,) rms angle of the rays to each light from their main direction, by which they determine its distance.
 
-    1 minus the largest eigenvalue of the mean of u u' is the mean sin^2 of the rays' angles from their main direction.
+    position_m : (N, 3) lights;  camera_m : (F, 3) camera positions;  frame, led : (K,) rows of the sightings
+
+    1 minus the largest eigenvalue of the mean of u u' is the mean sin^2 of these angles. Without a sighting it is 0.
     """
-    camera_lab = np.einsum("kji,j->ki", full.R_body_from_lab, full.camera_body_m)
-    ray = full.position_m[sightings.led] - camera_lab[sightings.frame]
+    ray = position_m[led] - camera_m[frame]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    lights = len(full.position_m)
-    scatter, count = np.zeros((lights, 3, 3)), np.maximum(np.bincount(sightings.led, minlength=lights), 1)
-    np.add.at(scatter, sightings.led, ray[:, :, None] * ray[:, None, :])
-    largest = np.linalg.eigvalsh(scatter / count[:, None, None])[:, 2]
-    return 1 - largest > CROSSING_RAD**2
+    lights = len(position_m)
+    scatter, count = np.zeros((lights, 3, 3)), np.bincount(led, minlength=lights)
+    np.add.at(scatter, led, ray[:, :, None] * ray[:, None, :])
+    largest = np.linalg.eigvalsh(scatter / np.maximum(count, 1)[:, None, None])[:, 2]
+    return np.sqrt(np.where(count > 0, np.maximum(1 - largest, 0.0), 0.0))
 
 
 def _check_one_group(incidence: csr_array, frame_rows: Ints) -> None:

@@ -19,12 +19,13 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, project
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
-from estimator.calibration.dome_survey import connected_subset
+from estimator.calibration.dome_survey import CONNECTING_RAD, connected_subset
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
 
 Mask = NDArray[np.bool_]
-MIN_SHARED = 8  # LEDs that an attitude shares with those before it
+MIN_SHARED = 8  # LEDs that an attitude shares with those before it, seen in another direction
+PLANNED_RAD = 1.2 * CONNECTING_RAD  # rms angle by which their rays cross: attitudes are not held exactly
 ATTITUDE_SIGMA_RAD = 0.05  # of an attitude before its frame is adjusted: next to nothing is known
 
 
@@ -136,28 +137,29 @@ def choose(
     2 x 3 rows of the Jacobian and A those of the attitude, the reduction is the sum over i of tr(P_i B_i' W_ii B_i
     P_i), W = (B P B' + s^2 A A' + I)^-1. Correlations between LEDs are left out, which is thirty times faster and no
     worse: 40 attitudes under a dome of 390 LEDs leave 0.66 mm rms, against 0.69 mm with all correlations. An attitude
-    must share MIN_SHARED LEDs with those before it, if any does, so that the frames are connected at any time. The
+    must share MIN_SHARED LEDs with those before it, if any does, whose rays then cross by the rms angle PLANNED_RAD or
+    more, so that the frames are connected at any time. The
     reductions hardly grow from choice to choice, so that a candidate is evaluated again only while its last value is
     above the best (lazy greedy: Minoux 1978).
     """
     if np.shape(shown) != (len(candidates), len(model.leds.id)):
         raise ValueError(f"survey: shown has shape {np.shape(shown)}; allowed: {len(candidates), len(model.leds.id)}")
     blocks = np.tile(np.eye(3) * model.leds_sigma_m**2, (len(model.leds.id), 1, 1))
-    covered: Mask = np.zeros(len(blocks), dtype=bool)
+    reach = _Reach(model, candidates, shown)
     if held is not None and seen is not None:
         for row in _rows(model, held, seen):
             blocks[row.led] -= _reduction(row, blocks)
-        covered = np.asarray(seen.any(axis=0))
+        reach.add(held, seen)
     rows = _rows(model, candidates, shown)
     bound = np.array([np.inf if len(row.led) >= MIN_SHARED else 0.0 for row in rows])
     chosen: list[int] = []
     while len(chosen) < count:
-        shared = (shown & covered).sum(axis=1) if covered.any() else shown.sum(axis=1)
+        shared = reach.shared() if reach.count.any() else shown.sum(axis=1)
         best = _best(rows, blocks, bound, shared >= min(MIN_SHARED, shared[bound > 0].max(initial=0)))
         if best is None:
             break
         blocks[rows[best].led] -= _reduction(rows[best], blocks)
-        covered |= shown[best]
+        reach.add(candidates[[best]], shown[[best]])
         chosen.append(best)
     return chosen
 
@@ -174,6 +176,50 @@ def _best(rows: Sequence[_Row], blocks: Floats, bound: Floats, allowed: Mask) ->
         if bound[k] > greatest:
             best, greatest = k, float(bound[k])
     return best
+
+
+class _Reach:
+    """Where each LED has been seen from, and what candidate attitudes share with that.
+
+    The rms angle of an LED's rays is the rms distance of the camera positions from their mean, perpendicular to the
+    direction u of the LED, over its distance. With the camera at the radius r about the center of rotation, m the mean
+    of its positions c and a that of (u.c)^2, the mean square distance is r^2 - |m|^2 - (a - (u.m)^2).
+    """
+
+    def __init__(self, model: SurveyModel, candidates: Rotation, shown: Mask) -> None:
+        place_m, self.arm_m = model.leds.position_m, np.array(model.lever.camera_body_m)
+        distance_m = np.linalg.norm(place_m, axis=1)
+        self.toward, self.least_m2 = place_m / distance_m[:, None], (PLANNED_RAD * distance_m) ** 2
+        self.count, self.along_m2, self.sum_m = (
+            np.zeros(len(place_m)),
+            np.zeros(len(place_m)),
+            np.zeros((len(place_m), 3)),
+        )
+        self.candidates, (self.row, self.led) = candidates, np.nonzero(shown)
+        self.camera_m, self.along_m = self.positions(candidates, self.row, self.led)
+
+    def positions(self, body_from_lab: Rotation, row: Ints, led: Ints) -> tuple[Floats, Floats]:
+        """(K, 3) camera positions of sightings, and (K,) their components toward the LEDs."""
+        camera_m = np.atleast_2d(body_from_lab.inv().apply(self.arm_m))[row]
+        return camera_m, np.sum(camera_m * self.toward[led], axis=1)
+
+    def add(self, body_from_lab: Rotation, seen: Mask) -> None:
+        """Count the (F, N) LEDs seen at F attitudes."""
+        row, led = np.nonzero(seen)
+        camera_m, along_m = self.positions(body_from_lab, row, led)
+        np.add.at(self.count, led, 1)
+        np.add.at(self.sum_m, led, camera_m)
+        np.add.at(self.along_m2, led, along_m**2)
+
+    def shared(self) -> Ints:
+        """(C,) LEDs of each candidate that have been seen before, and from elsewhere."""
+        led, count = self.led, self.count[self.led] + 1
+        mean_m = (self.sum_m[led] + self.camera_m) / count[:, None]
+        mean_along_m = np.sum(mean_m * self.toward[led], axis=1)
+        across_m2 = self.arm_m @ self.arm_m - np.sum(mean_m**2, axis=1)
+        across_m2 -= (self.along_m2[led] + self.along_m**2) / count - mean_along_m**2
+        is_shared = (count > 1) & (across_m2 > self.least_m2[led])
+        return np.bincount(self.row[is_shared], minlength=len(self.candidates))
 
 
 class _Row(NamedTuple):

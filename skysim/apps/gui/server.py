@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import ctypes
-import gc
 import hmac
 import re
 import secrets
@@ -24,6 +21,7 @@ from starlette.requests import HTTPConnection, Request
 from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response, StreamingResponse
 from starlette.routing import Route, Router
 
+from skysim.apps.gui import memory
 from skysim.apps.gui.page.frame.sensor import FRAMES
 from skysim.apps.gui.page.frame.served import display_of
 from skysim.apps.gui.page.page import Tab
@@ -50,7 +48,6 @@ USER, USER_BYTES, YEAR_S = "skysim_user", 8, 365 * 86400  # cookie with the numb
 QUEUED = "This page opens when another one has been closed."
 CONNECT_TIMEOUT_S = 50.0  # for a browser to load the page
 RECONNECT_S = 6.0  # for a lost browser to reconnect, before its work ends
-GC_THRESHOLDS = 2_000, 10, 1_000  # new objects until a collection, and collections until one of older objects
 PING_INTERVAL_S, PING_TIMEOUT_S = 5.0, 30.0  # of the connection; a busy machine answers late
 
 
@@ -103,7 +100,7 @@ class KeptFiles:
 
         if key not in self.kept:
             await self.app(scope, receive, keep)
-            if messages[0].get("status") == 200 and not messages[-1].get("more_body"):
+            if messages and messages[0].get("status") == 200 and not messages[-1].get("more_body"):
                 self.kept[key] = messages
             return
         for message in self.kept[key]:
@@ -225,41 +222,23 @@ def be_patient() -> None:
     core.sio.eio.ping_interval, core.sio.eio.ping_timeout = PING_INTERVAL_S, PING_TIMEOUT_S
 
 
-def freeze() -> None:
-    """Take what was imported out of the garbage collector's sight, and let it look at new objects alone.
-
-    A collection of all pages takes half a second with 20 of them, in which no key is answered. Only `close` makes one.
-    """
-    gc.collect()
-    gc.freeze()
-    gc.set_threshold(*GC_THRESHOLDS)
-
-
-def release_memory() -> None:
-    """Collect a closed page, and return its memory to the system; glibc's allocator would keep it."""
-    gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim:
-        trim(0)
-
-
 def stop_studies() -> None:
     """End the studies of all pages with the server; their trials so far are kept."""
     for process in StudyProcess.begun:
         process.stop(signal.SIGTERM)
 
 
-async def close(tab: Tab) -> None:
+async def close(tab: Tab, closed_pages: memory.ClosedPages) -> None:
     """Release all that a tab held."""
     await tab.close()
-    await asyncio.to_thread(release_memory)
+    closed_pages.collect_soon()
 
 
 def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers: int) -> None:
     """Register all routes, and prepare the workers of tabs."""
-    pool = Workers(workers)
+    pool, closed_pages = Workers(workers), memory.ClosedPages()
     app.on_startup(be_patient)
-    app.on_startup(freeze)
+    app.on_startup(memory.freeze)
     app.on_startup(partial(pool.prepare, str(find(scene).resolve())))
     app.on_shutdown(stop_studies)
 
@@ -277,11 +256,11 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
         tab = Tab(scene, folder, out, cameras, user_of(request.cookies))
         await tab.build()
         client = ui.context.client
+        client.on_delete(partial(close, tab, closed_pages))
         try:
             await client.connected(timeout=CONNECT_TIMEOUT_S)
         except TimeoutError:  # no browser has connected: start no worker
             return
-        client.on_delete(partial(close, tab))
         session = await pool.wait(lambda: tab.is_open, lambda text: tab.sensor.show_waiting(text, QUEUED))
         if session is None:  # the tab was closed while it waited
             return

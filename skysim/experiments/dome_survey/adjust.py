@@ -32,14 +32,13 @@ from skysim.tracking.dome_map_file import DomeMap
 MIN_SHARED_LEDS = 3  # that a frame must share with others: two determine its attitude
 MAX_UNCONNECTED = 0.5  # share of the frames that may be left out at a time
 
-# Minimum rms angle between an LED's rays for its distance: twice the minimum that the adjustment requires.
-MIN_RAY_ANGLE_RAD = 2 * dome_survey.CROSSING_RAD
-
 ROUNDS = 3  # rounds of identification and adjustment; from the second on with the adjusted values
 MOVED_ROUNDS = 2  # further rounds if LEDs are far from their places in the list
 
 # Share of a frame's lights that are matched, and of these that fit the adjustment: far less by chance.
 MIN_MATCHED = 0.5
+# The same as a share of the frames' median: a field shifted by one LED matches some 0.6 of its lights, a right one all.
+MIN_OF_MEDIAN = 0.8
 # Standard deviations by which a parameter may move from the assumed one, and the least of these, as a share of that
 # of the assumed one.
 PLAUSIBLE, LEAST_SHARE = 6.0, 0.1
@@ -72,7 +71,7 @@ def run_survey(
 
     listed, before, total = prior.leds, assumed(prior, uncertainty), ROUNDS + MOVED_ROUNDS
     start = {row: frame.body_from_lab for row, frame in enumerate(frames)}
-    run = adjusted(list(start), [match_by_imu(frame, prior, uncertainty) for frame in frames], prior)
+    run = adjusted(*identified_by_imu(frames, prior, uncertainty), prior)
     for completed in range(1, total):
         if watch:
             watch(completed, total)
@@ -114,6 +113,32 @@ def check_plausible(run: SurveyRun, prior: CalibrationPrior, uncertainty: Survey
             )
 
 
+def identified_by_imu(
+    frames: Sequence[SurveyFrame], prior: CalibrationPrior, uncertainty: SurveyUncertainty
+) -> tuple[list[int], list[Correspondences]]:
+    """Rows of the frames that the IMU's attitudes identify, and their correspondences. Raises InputError for none."""
+    matches = [match_by_imu(frame, prior, uncertainty) for frame in frames]
+    rows = well_matched([matched_share(frame, match, prior) for frame, match in zip(frames, matches, strict=True)])
+    if not rows:
+        raise InputError(
+            f"survey: in none of the {len(frames)} frames do the lights fit the LEDs of the list; allowed: attitudes,"
+            " LEDs and a camera that are true within the uncertainties"
+        )
+    return rows, [matches[row] for row in rows]
+
+
+def well_matched(share: Sequence[float]) -> list[int]:
+    """Rows of the frames of which at least MIN_MATCHED of the lights are matched, and MIN_OF_MEDIAN of the median."""
+    shares = np.array(share)
+    return np.flatnonzero(shares >= max(MIN_MATCHED, MIN_OF_MEDIAN * np.median(shares))).tolist()
+
+
+def matched_share(frame: SurveyFrame, match: Correspondences, model: CalibrationPrior) -> float:
+    """Share of the lights of a frame that are matched, or of the LEDs in it if they are fewer."""
+    visible = int(np.count_nonzero(model.camera.contains(model.pixels(frame.body_from_lab))))
+    return len(match.led) / max(1, min(len(frame.lights), visible))
+
+
 def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], CalibrationPrior]:
     """Rows of the frames that are identified, their lights matched anew with the adjusted model, and that model.
 
@@ -126,17 +151,18 @@ def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], Calibra
     map_px = led_sigma_m(survey, run.uncertainty) * model.px_per_m
     sigma_px = np.hypot(map_px, max(survey.rms_px, prior.floor_px))
     tied = {row: frame for row, frame, ok in zip(run.rows, run.frames, survey.tied, strict=True) if ok}
-    rows, matches = [], []
+    matches, shares = list[Correspondences](), list[float]()
     for row, frame in enumerate(run.taken):
         match = match_by_survey(tied[row], model, sigma_px) if row in tied else None
-        if match is None or not is_identified(tied[row], match, model):
-            match = match_by_imu(frame, model, run.uncertainty_after)
-            if not is_identified(frame, match, model):
-                continue
-        rows.append(row)
+        share = matched_share(tied[row], match, model) if match else 0.0
+        if match is None or share < MIN_MATCHED:
+            match = match_by_imu(frame, model, run.uncertainty_after, map_px)
+            share = matched_share(frame, match, model)
         matches.append(match)
+        shares.append(share)
+    rows = well_matched(shares)
     # Keep the map from before the survey: it enters each adjustment as a measurement, as the assumed lever does.
-    return rows, matches, replace(model, leds=prior.leds)
+    return rows, [matches[row] for row in rows], replace(model, leds=prior.leds)
 
 
 def with_names(run: SurveyRun) -> SurveyRun:
@@ -169,12 +195,6 @@ def with_names(run: SurveyRun) -> SurveyRun:
         survey=replace(survey, leds=leds, led_covariance_m2=covariance_m2, surveyed=surveyed),
         matches=[Correspondences(match.light, name[match.led]) for match in run.matches],
     )
-
-
-def is_identified(frame: SurveyFrame, match: Correspondences, model: CalibrationPrior) -> bool:
-    """Whether at least MIN_MATCHED of the lights of a frame, or of the LEDs in it if they are fewer, are matched."""
-    visible = int(np.count_nonzero(model.camera.contains(model.pixels(frame.body_from_lab))))
-    return len(match.led) > 0 and len(match.led) >= MIN_MATCHED * min(len(frame.lights), visible)
 
 
 def displaced_leds(run: SurveyRun) -> dict[int, Floats]:
@@ -250,13 +270,10 @@ def led_visibility(pairs: Sequence[tuple[SurveyFrame, Correspondences]], prior: 
     Such an LED, seen from camera positions close together, has no measurable distance and connects no frames.
     """
     visible = identified([match for _, match in pairs], len(prior.leds.id))
-    # RMS spread of the camera positions over the frames that show an LED, as an angle seen from the nearest LED.
     arm_m = prior.lever.camera_body_m
-    camera_m = np.array([frame.body_from_lab.inv().apply(arm_m) for frame, _ in pairs])
-    count = np.maximum(visible.sum(axis=0), 1)[:, None]
-    spread_m2 = np.sum((visible.T @ camera_m**2) / count - ((visible.T @ camera_m) / count) ** 2, axis=1)
-    angle_rad = np.sqrt(np.maximum(spread_m2, 0)) * prior.px_per_m / prior.camera.focal_px
-    return visible & (angle_rad > MIN_RAY_ANGLE_RAD)
+    camera_m = np.array([frame.body_from_lab.inv().apply(arm_m) for frame, _ in pairs]).reshape(-1, 3)
+    angle_rad = dome_survey.ray_angles(prior.leds.position_m, camera_m, *np.nonzero(visible))
+    return visible & (angle_rad > dome_survey.CONNECTING_RAD)
 
 
 def largest_connected_group(visible: NDArray[np.bool_], min_shared: int) -> list[int]:

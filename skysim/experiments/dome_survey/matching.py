@@ -31,8 +31,12 @@ class Correspondences(NamedTuple):
     led: Ints
 
 
-def prediction_sigmas_px(prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> tuple[float, float]:
-    """Standard deviations per coordinate in pixels: of the common shift of a frame, and of each light individually.
+def prediction_sigmas_px(
+    prior: CalibrationPrior, uncertainty: SurveyUncertainty, map_px: Floats | None = None
+) -> tuple[float, Floats]:
+    """Standard deviations per coordinate in pixels: of the common shift of a frame, and (N,) of each LED individually.
+
+    map_px : (N,) those of the LEDs' places, as `uncertainty` has them if None
 
     The attitude error across the boresight and the lever arm error shift all lights alike. The LED position error, and
     the roll and focal length errors (largest, and evaluated, at the image corner), act on each light differently.
@@ -41,45 +45,55 @@ def prediction_sigmas_px(prior: CalibrationPrior, uncertainty: SurveyUncertainty
     corner_px = np.hypot(camera.width_px, camera.height_px) / 2
     common = np.hypot(uncertainty.imu_sigma_rad * camera.focal_px, uncertainty.lever_sigma_m * prior.px_per_m)
     roll_and_scale = corner_px * np.hypot(uncertainty.imu_sigma_rad, uncertainty.focal_error)
-    return float(common), float(np.hypot(uncertainty.led_sigma_m * prior.px_per_m, roll_and_scale))
+    if map_px is None:
+        map_px = np.full(len(prior.leds.id), uncertainty.led_sigma_m * prior.px_per_m)
+    return float(common), np.hypot(map_px, roll_and_scale)
 
 
-def match_by_imu(frame: SurveyFrame, prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> Correspondences:
-    """Match detections to LEDs with the IMU attitude and the declared errors: common shift first, then assignment."""
-    common_px, individual_px = prediction_sigmas_px(prior, uncertainty)
+def match_by_imu(
+    frame: SurveyFrame, prior: CalibrationPrior, uncertainty: SurveyUncertainty, map_px: Floats | None = None
+) -> Correspondences:
+    """Match detections to LEDs with the IMU attitude and the declared errors: common shift first, then assignment.
+
+    map_px : see `prediction_sigmas_px`
+    """
+    common_px, individual_px = prediction_sigmas_px(prior, uncertainty, map_px)
     predicted = prior.pixels(frame.body_from_lab)
-    visible = np.flatnonzero(prior.camera.contains(predicted, -GATE_SIGMAS * (common_px + individual_px)))
+    margin_px = GATE_SIGMAS * (common_px + float(individual_px.max()))
+    visible = np.flatnonzero(prior.camera.contains(predicted, -margin_px))
     detected = frame.lights.xy_px
     if not len(visible) or not len(detected):
         return Correspondences(np.zeros(0, np.int64), np.zeros(0, np.int64))
-    predicted = predicted[visible]
+    predicted, individual_px = predicted[visible], individual_px[visible]
     shift = common_shift_px(detected, predicted, common_px, individual_px, prior.camera.center_px)
-    light, led = assign_lights(detected, predicted + shift, np.full(len(visible), GATE_SIGMAS * individual_px))
+    light, led = assign_lights(detected, predicted + shift, GATE_SIGMAS * individual_px)
     return Correspondences(light, visible[led])
 
 
 def common_shift_px(
-    detected_px: Floats, predicted_px: Floats, common_px: float, individual_px: float, center_px: tuple[float, float]
+    detected_px: Floats, predicted_px: Floats, common_px: float, individual_px: Floats, center_px: tuple[float, float]
 ) -> Floats:
     """(2,) most likely common shift of (P, 2) predictions onto (S, 2) detections, pixels.
 
     Candidates are the shifts that move a prediction onto one of the ANCHOR_LIGHTS detections nearest to the image
     center, where a roll error displaces least. The cost of a shift t is
     |t|^2 / common_px^2 + sum_i min(d_i / individual_px, GATE_SIGMAS)^2, where d_i is the distance of detection i from
-    the nearest shifted prediction. The best candidate is refined by the mean residual of the detections in the gate.
+    the nearest shifted prediction. The best candidate is refined by the mean residual of the detections in the gate,
+    weighted by 1 / individual_px^2.
     """
     inner = np.argsort(np.linalg.norm(detected_px - center_px, axis=1))[:ANCHOR_LIGHTS]
     candidates = (detected_px[inner, None] - predicted_px).reshape(-1, 2)
-    limit_px = GATE_SIGMAS * np.hypot(common_px, individual_px)
+    limit_px = GATE_SIGMAS * np.hypot(common_px, individual_px.max())
     candidates = candidates[np.linalg.norm(candidates, axis=1) < limit_px]
     candidates = np.vstack([np.zeros((1, 2)), candidates])  # no shift is a candidate too
     distance_px, nearest = cKDTree(predicted_px).query(detected_px - candidates[:, None])
-    cost = np.minimum(distance_px / individual_px, GATE_SIGMAS)
+    cost = np.minimum(distance_px / individual_px[nearest], GATE_SIGMAS)
     best = int(np.argmin(np.sum(candidates**2, axis=1) / common_px**2 + np.sum(cost**2, axis=1)))
     is_close = cost[best] < GATE_SIGMAS
     if not is_close.any():
         return candidates[best]
-    return np.mean(detected_px[is_close] - predicted_px[nearest[best, is_close]], axis=0)
+    led = nearest[best, is_close]
+    return np.average(detected_px[is_close] - predicted_px[led], axis=0, weights=individual_px[led] ** -2.0)
 
 
 def assign_lights(detected_px: Floats, predicted_px: Floats, gate_px: Floats) -> tuple[Ints, Ints]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import time
 from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,10 +20,12 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
+from skysim.apps.gui import memory
 from skysim.apps.gui.messages import Detection, Lights, TrackerResult
 from skysim.apps.gui.page import forms, keys
 from skysim.apps.gui.page.frame import overlay
-from skysim.apps.gui.page.frame.sensor import Sensor
+from skysim.apps.gui.page.frame.sensor import FRAMES, Sensor
+from skysim.apps.gui.page.frame.served import TabFrames
 from skysim.apps.gui.page.frame.star_names import NAMES
 from skysim.apps.gui.server import FILES, Guard, KeptFiles, host_of, report_path, user_of
 from skysim.apps.gui.worker import export, photo, pixels, playback, study_process, tasks, workbench
@@ -426,6 +429,47 @@ def test_a_compressed_file_is_not_sent_to_a_browser_that_asks_for_a_plain_one() 
         scope = {"type": "http", "method": "GET", "path": f"{FILES}/a.js", "query_string": b""}
         asyncio.run(kept(scope | {"headers": [(b"accept-encoding", encoding)]}, None, send))
     assert [dict(one["headers"])[b"accept-encoding"] for one in starts[::2]] == [b"gzip", b"identity", b"gzip"]
+
+
+def test_closed_pages_are_collected_once_and_while_no_page_gets_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A collection of all pages takes as long as many frames, and a page's frames need not wait for it."""
+    collected, frames = list[float](), TabFrames(lambda _: None)
+    monkeypatch.setattr(memory, "release_memory", lambda: collected.append(time.monotonic()))
+    monkeypatch.setattr(memory, "QUIET_S", 0.2)
+    monkeypatch.setitem(FRAMES, "busy", frames)
+
+    async def close_while_another_plays() -> None:
+        closed = memory.ClosedPages()
+        for number in range(8):
+            frames.add(number, SimpleNamespace(), alone=False)
+            closed.collect_soon()
+            await asyncio.sleep(0.05)
+        assert not collected
+        await asyncio.sleep(0.5)
+        assert len(collected) == 1
+        assert collected[0] - frames.added_s > 0.2
+        closed.collect_soon()
+        await asyncio.sleep(0.1)
+        assert len(collected) == 2
+
+    asyncio.run(close_while_another_plays())
+
+
+def test_closed_pages_are_collected_in_the_end_though_frames_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    collected, frames = list[bool](), TabFrames(lambda _: None)
+    monkeypatch.setattr(memory, "release_memory", lambda: collected.append(True))
+    monkeypatch.setattr(memory, "QUIET_S", 0.05)
+    monkeypatch.setattr(memory, "PATIENCE_S", 0.2)
+    monkeypatch.setitem(FRAMES, "busy", frames)
+
+    async def close_while_another_plays() -> None:
+        memory.ClosedPages().collect_soon()
+        for number in range(20):
+            frames.add(number, SimpleNamespace(), alone=False)
+            await asyncio.sleep(0.02)
+
+    asyncio.run(close_while_another_plays())
+    assert collected == [True]
 
 
 def test_every_response_has_a_policy_that_no_other_site_frames() -> None:

@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 from laws import SEEDS, answered, law
+from scipy.spatial.transform import Rotation
 from surveyed_dome import attitudes, model, pixels
 
 from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration import survey_faults, survey_plan
+from estimator.calibration import dome_survey, survey_faults, survey_plan
 from estimator.calibration.dome_survey import connected_subset
 from estimator.calibration.gauge import Gauge
 from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
@@ -49,13 +50,23 @@ def test_a_longer_plan_begins_as_a_shorter_one(rng: np.random.Generator, count: 
     shown = assumed.visible(candidates)
     plan = survey_plan.choose(assumed, candidates, shown, 12)
     assert survey_plan.choose(assumed, candidates, shown, count) == plan[:count]
-    least = survey_plan.MIN_SHARED
-    covered = shown[plan[0]]
-    for row in plan[1:]:
-        reachable = (shown & covered).sum(axis=1)
-        assert reachable[row] >= min(least, reachable.max())
-        covered = covered | shown[row]
     assert answered(lambda: survey_plan.choose(assumed, candidates, shown[:, :-1], count)) is None
+
+
+@law(dome_survey.ray_angles)
+@given(rng=SEEDS, half_rad=some.floats(1e-3, 0.5))
+def test_rays_from_a_circle_cross_at_its_half_angle(rng: np.random.Generator, half_rad: float) -> None:
+    """Seen from the light, the cameras lie on a cone of this half angle. A light of one ray or none has none."""
+    around = rng.uniform(0, 2 * np.pi) + np.arange(5) * 2 * np.pi / 5
+    cone = np.column_stack([np.sin(half_rad) * np.cos(around), np.sin(half_rad) * np.sin(around), 0 * around])
+    cone[:, 2] = -np.cos(half_rad)
+    turn, at_m = Rotation.random(rng=rng), rng.normal(size=3)
+    camera_m = at_m + rng.uniform(0.1, 3, (5, 1)) * turn.apply(cone)
+    lights_m = np.array([at_m, at_m + 1, at_m - 1])
+    frame, led = np.array([0, 1, 2, 3, 4, 2]), np.array([0, 0, 0, 0, 0, 1])
+    angle_rad = dome_survey.ray_angles(lights_m, camera_m, frame, led)
+    assert np.sin(half_rad) == pytest.approx(angle_rad[0], rel=1e-6)
+    np.testing.assert_allclose(angle_rad[1:], 0, atol=1e-7)
 
 
 @law(HeldFrames.shown, HeldFrames.rays)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from surveyed_dome import LIST_SIGMA_M, NOISE_PX, attitudes, model, pixels
+from surveyed_dome import LIST_SIGMA_M, NOISE_PX, attitudes, leds, model, pixels
 
 from estimator.attitude.dome_map import Lever
 from estimator.calibration import survey_faults, survey_plan
 from estimator.calibration.bundle_adjustment import Assumed
-from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
+from estimator.calibration.dome_survey import CONNECTING_RAD, DomeFrame, DomeSurvey, ray_angles, survey
 from estimator.calibration.survey_faults import LightTable
 from estimator.calibration.survey_plan import SurveyModel
+from estimator.core.camera import Camera
 
 LEDS, FRAMES, SURVEYS = 120, 30, 60
 LEVER_SIGMA_M, FOCAL_ERROR = 0.005, 0.01  # of what is assumed
@@ -29,25 +31,35 @@ def planned(count: int, frames: int) -> tuple[SurveyModel, Rotation]:
 
 
 def simulated(
-    rng: np.random.Generator, true: SurveyModel, held: Rotation, sigma_factor: float = 1.0, uses_assumed: bool = False
+    rng: np.random.Generator,
+    true: SurveyModel,
+    held: Rotation,
+    sigma_factor: float = 1.0,
+    uses_assumed: bool = False,
+    change: Callable[[DomeFrame], DomeFrame] | None = None,
 ) -> DomeSurvey:
     """A survey of noisy pixels with a list, a lever, a lens and start attitudes that are off.
 
     sigma_factor : by which the noise is smaller than it is believed
     uses_assumed : whether lever and focal length are measurements; the focal length then errs at random, else by 1 %
+    change       : of each frame, which the survey then tolerates by a robust loss
     """
     frames = []
     for attitude, seen in zip(held, true.visible(held), strict=True):
         led = np.flatnonzero(seen)
-        xy_px = pixels(true, true.leds.position_m[led], attitude) + rng.normal(0, NOISE_PX, (len(led), 2))
+        xy_px = pixels(true, true.leds.position_m[led], attitude) + rng.normal(0, true.sigma_px, (len(led), 2))
         start = Rotation.from_rotvec(0.005 * rng.normal(size=3)) * attitude
-        frames.append(DomeFrame(led, xy_px, np.full(len(led), sigma_factor * NOISE_PX), start))
-    listed = replace(true.leds, position_m=true.leds.position_m + rng.normal(0, LIST_SIGMA_M, (LEDS, 3)))
+        frames.append(DomeFrame(led, xy_px, np.full(len(led), sigma_factor * true.sigma_px), start))
+    if change:
+        frames = [change(frame) for frame in frames]
+    list_error_m = rng.normal(0, LIST_SIGMA_M, true.leds.position_m.shape)
+    listed = replace(true.leds, position_m=true.leds.position_m + list_error_m)
     lever = Lever(true.lever.camera_body_m + rng.normal(0, LEVER_SIGMA_M, 3), true.lever.cam_from_body)
     sigma_px = FOCAL_ERROR * true.camera.focal_px
     camera = replace(true.camera, focal_px=true.camera.focal_px + sigma_px * (rng.normal() if uses_assumed else 1))
     assumed = Assumed(lever.camera_body_m, LEVER_SIGMA_M, camera.focal_px, sigma_px) if uses_assumed else None
-    return survey(frames, listed, lever, camera, leds_sigma_m=LIST_SIGMA_M, fit_noise=True, assumed=assumed)
+    loss = "cauchy" if change else "linear"
+    return survey(frames, listed, lever, camera, loss=loss, leds_sigma_m=LIST_SIGMA_M, fit_noise=True, assumed=assumed)
 
 
 @pytest.mark.slow
@@ -115,6 +127,53 @@ def test_a_plan_goes_on_from_the_frames_that_are_held() -> None:
     further = survey_plan.choose(true, candidates, shown, 10, west, seen)
     known = np.sum(seen, axis=0) >= 2
     assert np.mean(shown[further][:, ~known].sum(axis=1)) > 1.3 * np.mean(shown[:, ~known].sum(axis=1))
+
+
+NARROW = Camera(1024, 1024, 9222.0, (511.5, 511.5))  # AFIT's 35 mm lens
+
+
+def narrow_dome(sigma_px: float = NOISE_PX) -> SurveyModel:
+    """A dense dome under a narrow field, as AFIT's: two attitudes that share LEDs see them in nearly one direction."""
+    return replace(model(1400), camera=NARROW, leds=leds(1400, 20.0), sigma_px=sigma_px)
+
+
+def test_planned_attitudes_are_connected_by_rays_that_cross() -> None:
+    """Otherwise the adjustment leaves frames out of which the plan has predicted LEDs."""
+    true = narrow_dome()
+    candidates = attitudes(np.random.default_rng(3), 1000, 20.0)
+    held = candidates[survey_plan.choose(true, candidates, true.visible(candidates), 12)]
+    seen, camera_m = true.visible(held), held.inv().apply(true.lever.camera_body_m)
+    for k in range(1, len(held)):
+        angle_rad = ray_angles(true.leds.position_m, camera_m, *np.nonzero(seen[: k + 1]))
+        connecting = seen[k] & seen[:k].any(axis=0) & (angle_rad > CONNECTING_RAD)
+        assert connecting.sum() >= survey_plan.MIN_SHARED
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 2])
+def test_one_wrong_light_of_a_hundred_does_not_lead_a_survey_astray(seed: int) -> None:
+    """A light 80 px off, as a neighbor of the LED that it is taken for, is as far off as four errors of the list.
+
+    Weighted by the noise of 0.02 px alone, it would be fitted by a lever 90 mm off, and the right ones be rejected.
+    """
+    true, rng = narrow_dome(0.02), np.random.default_rng(seed)
+    candidates = attitudes(np.random.default_rng(1), 1000, 20.0)
+    held = candidates[survey_plan.choose(true, candidates, true.visible(candidates), 12)]
+
+    def moved(frame: DomeFrame) -> DomeFrame:
+        wrong = rng.random((len(frame.led), 1)) < 0.01
+        direction = rng.normal(size=(len(frame.led), 2))
+        off_px = 80 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        return replace(frame, xy_px=frame.xy_px + wrong * off_px)
+
+    found = simulated(rng, true, held, uses_assumed=True, change=moved)
+    error_m = (found.leds.position_m - true.leds.position_m)[found.surveyed]
+    sigma_m = np.sqrt(np.einsum("nii->n", found.led_covariance_m2[found.surveyed]) / 3)
+    assert found.surveyed.sum() > 75
+    assert 0.5 < np.sqrt(np.mean(error_m**2) / np.mean(sigma_m**2)) < 1.5
+    lever_m = found.lever.camera_body_m - true.lever.camera_body_m
+    assert (np.abs(lever_m) < 3 * np.sqrt(np.diag(found.lever_covariance_m2))).all()
+    assert found.misfit == pytest.approx(1, abs=0.05)
 
 
 # --- false alarms -------------------------------------------------------------------------------------------

@@ -63,6 +63,6 @@ def test_a_survey_that_contradicts_what_was_assumed_is_refused(parameter: str, r
     run = SimpleNamespace(survey=found, accuracy=accuracy)
     if refused:
         with pytest.raises(InputError, match=f"survey: {parameter} .* contradicts the assumed"):
-            adjust.check_plausible(run, before, assumed)  # type: ignore[arg-type]
+            adjust.check_plausible(run, prior.assumed(before, assumed))  # type: ignore[arg-type]
     else:
-        adjust.check_plausible(run, before, assumed)  # type: ignore[arg-type]
+        adjust.check_plausible(run, prior.assumed(before, assumed))  # type: ignore[arg-type]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import struct
+import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -72,6 +73,7 @@ class TabFrames:
     newest : by number;  waiting : numbers of those to be sent over the stream; None: no stream is open
     drawn : number of the last frame that the browser has drawn
     alone : of the last one that did not go over the stream, which later ones must not overtake
+    added_s : when the newest one was added, by `time.monotonic`
     """
 
     announce: Callable[[int], Any]
@@ -79,10 +81,11 @@ class TabFrames:
     waiting: asyncio.Queue[int] | None = None
     drawn: int = 0
     alone: int = 0
+    added_s: float = -math.inf
 
     def add(self, number: int, frame: ServedFrame, alone: bool) -> None:
         """Keep a frame and send it, or its number. alone : not over the stream, because messages belong to it"""
-        self.newest[number] = frame
+        self.newest[number], self.added_s = frame, time.monotonic()
         self.newest.pop(min(self.newest) if len(self.newest) > KEPT_FRAMES else -1, None)
         self.alone = number if alone else self.alone
         if self.waiting is None or self.drawn < self.alone:
