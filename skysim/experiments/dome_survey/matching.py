@@ -38,12 +38,14 @@ def prediction_sigmas_px(
 
     map_px : (N,) those of the LEDs' places, as `uncertainty` has them if None
 
-    The attitude error across the boresight and the lever arm error shift all lights alike. The LED position error, and
-    the roll and focal length errors (largest, and evaluated, at the image corner), act on each light differently.
+    The attitude error across the boresight and the lever arm error shift all lights alike. An attitude error moves the
+    camera too: it turns the direction of an LED at the distance R from the center of rotation, d from the camera, by
+    R / d of itself. The LED position error, and the roll and focal length errors (largest, and evaluated, at the image
+    corner), act on each light differently.
     """
     camera = prior.camera
     corner_px = np.hypot(camera.width_px, camera.height_px) / 2
-    common = np.hypot(uncertainty.imu_sigma_rad * camera.focal_px, uncertainty.lever_sigma_m * prior.px_per_m)
+    common = np.hypot(uncertainty.imu_sigma_rad * prior.nearest_m, uncertainty.lever_sigma_m) * prior.px_per_m
     roll_and_scale = corner_px * np.hypot(uncertainty.imu_sigma_rad, uncertainty.focal_error)
     if map_px is None:
         map_px = np.full(len(prior.leds.id), uncertainty.led_sigma_m * prior.px_per_m)

@@ -80,10 +80,14 @@ class CalibrationPrior:
         return np.asarray(self.levels * self.code.levels[:, index % self.code.bits].T)
 
     @property
+    def nearest_m(self) -> float:
+        """Least distance of an LED from the center of rotation."""
+        return float(np.linalg.norm(self.leds.position_m, axis=1).min())
+
+    @property
     def px_per_m(self) -> float:
         """Image scale in pixels per meter perpendicular to the line of sight, at the least distance of an LED."""
-        nearest_m = np.linalg.norm(self.leds.position_m, axis=1).min()
-        return float(self.camera.focal_px / (nearest_m - np.linalg.norm(self.lever.camera_body_m)))
+        return float(self.camera.focal_px / (self.nearest_m - np.linalg.norm(self.lever.camera_body_m)))
 
     def pixels(self, body_from_lab: Rotation) -> Floats:
         """(N, 2) pixel positions of the LEDs; a value far outside the image for LEDs behind the camera."""

@@ -7,6 +7,7 @@ import io as std_io
 import itertools
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from estimator.trackers.dome_tracker import DomeTracker
@@ -202,6 +204,18 @@ def test_a_frame_of_a_stop_shows_a_vehicle_that_stands_there(testbed: Testbed) -
     assert (last.lab_from_body * stops[2].inv()).magnitude() < 1e-12
     assert np.abs(last.rate_cam_rad_s).max() == 0
     assert (first.lab_from_body * stops[0].inv()).magnitude() < 1e-12
+
+
+def test_an_imu_error_shifts_a_frame_by_what_is_predicted(testbed: Testbed) -> None:
+    """The camera is off the center of rotation, so that it moves too: the LEDs shift by half as much again."""
+    prior = survey_prior.calibration_prior(testbed)
+    sigmas = replace(UNCERTAINTY, lever_sigma_m=0.0)
+    predicted_px, _ = matching.prediction_sigmas_px(prior, sigmas)
+    errors_rad = sigmas.imu_sigma_rad * np.random.default_rng(7).standard_normal((2000, 3))
+    center = np.argsort(np.linalg.norm(prior.pixels(Rotation.identity()) - prior.camera.center_px, axis=1))[:5]
+    shifted_px = np.array([prior.pixels(error)[center].mean(axis=0) for error in Rotation.from_rotvec(errors_rad)])
+    assert shifted_px.std(axis=0) == pytest.approx(predicted_px, rel=0.05)
+    assert predicted_px > 1.4 * sigmas.imu_sigma_rad * prior.camera.focal_px
 
 
 def test_lights_get_their_true_names_by_the_imu(testbed: Testbed) -> None:
