@@ -31,7 +31,7 @@ from estimator.core.arrays import Floats, Ints
 # accuracy of 1e-9 in lengths.
 DECREMENT = 1e-12
 STEPS = 100
-EXACT = 1e-6  # least relative standard deviation of what is assumed, and in m
+EXACT = 1e-6  # least standard deviation of an assumed lever in m, and of an assumed focal length as a share of it
 MEDIAN_RADIUS = np.sqrt(2 * np.log(2))  # median distance of a two-dimensional unit Gaussian from its mean
 
 
@@ -60,16 +60,14 @@ class Assumed(NamedTuple):
     focal_px: float
     focal_sigma_px: float
 
-    @property
-    def value(self) -> Floats:
-        """(4,) the lever and the focal length."""
-        return np.array([*self.camera_body_m, self.focal_px])
+    def less(self, bundle: Bundle) -> Floats:
+        """(4,) lever and focal length less those of a bundle."""
+        return np.array([*(self.camera_body_m - bundle.camera_body_m), self.focal_px - bundle.lens[0]])
 
     @property
     def weight(self) -> Floats:
-        """(4,) 1 / sigma^2 of each. A sigma of 0 is taken as EXACT of the value, so that the weights are finite."""
-        least_m, least_px = EXACT * float(np.linalg.norm(self.camera_body_m)), EXACT * self.focal_px
-        lever_m, focal_px = max(self.lever_sigma_m, least_m, EXACT), max(self.focal_sigma_px, least_px)
+        """(4,) 1 / sigma^2 of each. A sigma of 0 is taken as EXACT, so that the weights are finite."""
+        lever_m, focal_px = max(self.lever_sigma_m, EXACT), max(self.focal_sigma_px, EXACT * self.focal_px)
         return np.array([lever_m, lever_m, lever_m, focal_px]) ** -2.0
 
 
@@ -102,13 +100,8 @@ class Bundle:
         loss, weight = cauchy(np.sum(residuals(self, sightings) ** 2, axis=1), width)
         loss += float(np.sum(((self.map_m - self.position_m) / self.map_sigma_m) ** 2))
         if self.assumed:
-            loss += float(np.sum(self.assumed.weight * self.from_assumed**2))
+            loss += float(np.sum(self.assumed.weight * self.assumed.less(self) ** 2))
         return loss, weight
-
-    @property
-    def from_assumed(self) -> Floats:
-        """(4,) differences of the prior lever and focal length from those of the bundle; 0 without a prior."""
-        return self.assumed.value - [*self.camera_body_m, self.lens[0]] if self.assumed else np.zeros(4)
 
     def apply_step(self, led: Floats, rest: Floats) -> Bundle:
         """The bundle after a step.
@@ -256,7 +249,7 @@ def normal_equations(bundle: Bundle, sightings: Sightings, weight: Floats) -> No
     if bundle.assumed:
         known = 3 * frames + np.arange(4)  # lever and focal length
         rest[known, known] += bundle.assumed.weight
-        rhs_rest[known] += bundle.assumed.weight * bundle.from_assumed
+        rhs_rest[known] += bundle.assumed.weight * bundle.assumed.less(bundle)
     return NormalEquations(blocks, csr_array(by_rest.T @ by_led), rest, by_led.T @ residual + from_map, rhs_rest)
 
 

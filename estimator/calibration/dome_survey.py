@@ -47,6 +47,7 @@ from estimator.core.camera import Camera
 CAUCHY = 2.385
 LOSSES: dict[str, float] = {"linear": np.inf, "cauchy": CAUCHY}
 GATE = 5.0  # residuals above this many robust sigmas are outliers in the final fit
+MIN_REDUNDANCY = 8  # coordinates more than unknowns, for a survey that estimates its noise from them
 GROSS_GATE = 6.0  # the same for the first rejection, after only the attitudes are fitted
 CROSSING_RAD = 0.005  # least rms angle between the rays to one light; below, its distance is undetermined
 CONNECTING_RAD = 2 * CROSSING_RAD  # of lights that connect frames before they are adjusted: the angle is not yet exact
@@ -208,6 +209,8 @@ def _fit(start: Bundle, sightings: Sightings, gauge: Gauge, width: float, fit_no
             in_gauge = fitted if _has_prior_gauge(fitted, gauge) else gauge.transform(fitted, subset)
             subset = replace(subset, bundle=in_gauge, sightings=scaled)
             covariances = _covariances(subset, gauge)
+            if fit_noise:
+                check_redundancy(subset, covariances)
             misfit = _misfit(subset, covariances)
             if not fit_noise or abs(misfit - 1) < NOISE_TOLERANCE or not misfit > 0:
                 break
@@ -234,21 +237,39 @@ def _covariances(subset: Subset, gauge: Gauge) -> Covariances:
 
 
 def _misfit(subset: Subset, covariances: Covariances) -> float:
-    """Square root of chi-square of the pixels over their redundancy.
+    """Square root of chi-square of the pixels over their redundancy."""
+    chi2 = np.sum(ba.residuals(subset.bundle, subset.sightings) ** 2)
+    return float(np.sqrt(chi2 / max(redundancy(subset, covariances), 1)))
+
+
+def redundancy(subset: Subset, covariances: Covariances) -> float:
+    """Number of coordinates of the pixels less that of the unknowns that they determine.
 
     With the map as a measurement the pixels determine U - tr(C) / sigma_map^2 of the U unknowns, C the covariance of
     the lights, and the map the rest; without it U less the four gauge freedoms. An assumed lever and focal length
     count as the map does.
     """
-    bundle, sightings = subset.bundle, subset.sightings
+    bundle = subset.bundle
     unknowns = 3.0 * (len(subset.led) + len(subset.frame) + 1) + bundle.free_lens - 4
     if np.isfinite(bundle.map_sigma_m):
         by_prior = float(np.einsum("nii->", covariances.by_led)) / bundle.map_sigma_m**2
         if bundle.assumed:
             by_prior += float(bundle.assumed.weight @ np.diag(covariances.shared)[:4])
         unknowns -= max(by_prior - 4, 0.0)
-    chi2 = np.sum(ba.residuals(bundle, sightings) ** 2)
-    return float(np.sqrt(chi2 / max(2 * len(sightings.led) - unknowns, 1)))
+    return 2 * len(subset.index) - unknowns
+
+
+def check_redundancy(subset: Subset, covariances: Covariances) -> None:
+    """Raise ValueError if so few coordinates are redundant that a misidentified light would not be seen.
+
+    Two frames under AFIT's dome have four, and one wrong light of 18 moved the lens center by four standard deviations.
+    """
+    spare = redundancy(subset, covariances)
+    if spare < MIN_REDUNDANCY:
+        raise ValueError(
+            f"survey: {spare:.1f} coordinates more than they determine unknowns, fewer than the {MIN_REDUNDANCY} that"
+            " show a misidentified light; take more frames"
+        )
 
 
 def _collect(frames: Sequence[DomeFrame], lights: int) -> Sightings:

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, project
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
-from estimator.calibration.dome_survey import CONNECTING_RAD, connected_subset
+from estimator.calibration.dome_survey import CONNECTING_RAD, check_redundancy, connected_subset
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
 
@@ -95,6 +95,7 @@ def predict(model: SurveyModel, body_from_lab: Rotation, seen: Mask, free_lens: 
         covariance = ba.covariance(terms, subset.bundle)
     except LinAlgError:
         raise ValueError("survey: the attitudes do not determine the unknowns; take more of them") from None
+    check_redundancy(subset, covariance)
     measured = np.zeros(len(bundle.position_m), dtype=bool)
     measured[subset.led] = True
     led_sigma_m = np.full(len(measured), model.leds_sigma_m)

@@ -83,11 +83,11 @@ def run_survey(
         run = adjusted(*rematched(run))
     if watch:
         watch(total, total)
-    check_plausible(run, prior, uncertainty)
+    check_plausible(run, before)
     return run
 
 
-def check_plausible(run: SurveyRun, prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> None:
+def check_plausible(run: SurveyRun, before: Assumed) -> None:
     """Raise InputError if the survey found a focal length or a lever arm that contradicts what was assumed before.
 
     If frames are misidentified, the adjustment can fit them with a model that is far from the real one, such as half
@@ -97,18 +97,17 @@ def check_plausible(run: SurveyRun, prior: CalibrationPrior, uncertainty: Survey
     an error. For frames that add next to nothing the variance is at least LEAST_SHARE^2 P0.
     """
     found, accuracy = run.survey, run.accuracy
-    lever = zip(prior.lever.camera_body_m, found.lever.camera_body_m, accuracy.lever_sigma_m, "xyz", strict=True)
-    focal_px = prior.camera.focal_px
-    lever_sigma_m, focal_sigma_px = assumed(prior, uncertainty).weight[2:] ** -0.5
-    rows = [(focal_px, found.camera.focal_px, accuracy.lens_sigma[0], focal_sigma_px, "focal px")]
+    lever = zip(before.camera_body_m, found.lever.camera_body_m, accuracy.lever_sigma_m, "xyz", strict=True)
+    lever_sigma_m, focal_sigma_px = before.weight[2:] ** -0.5
+    rows = [(before.focal_px, found.camera.focal_px, accuracy.lens_sigma[0], focal_sigma_px, "focal px")]
     rows += [
-        (1e3 * before, 1e3 * now, 1e3 * sigma, 1e3 * lever_sigma_m, f"lever {axis} mm")
-        for before, now, sigma, axis in lever
+        (1e3 * then, 1e3 * now, 1e3 * sigma, 1e3 * lever_sigma_m, f"lever {axis} mm")
+        for then, now, sigma, axis in lever
     ]
-    for before, now, sigma, known, name in rows:
-        if abs(now - before) > PLAUSIBLE * math.sqrt(max(known**2 - sigma**2, (LEAST_SHARE * known) ** 2)):
+    for then, now, sigma, known, name in rows:
+        if abs(now - then) > PLAUSIBLE * math.sqrt(max(known**2 - sigma**2, (LEAST_SHARE * known) ** 2)):
             raise InputError(
-                f"survey: {name} {now:.5g} ± {sigma:.2g} contradicts the assumed {before:.5g} ± {known:.2g}:"
+                f"survey: {name} {now:.5g} ± {sigma:.2g} contradicts the assumed {then:.5g} ± {known:.2g}:"
                 " lights are misidentified; allowed: further frames, or a larger uncertainty of what is assumed"
             )
 
