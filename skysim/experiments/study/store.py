@@ -124,6 +124,7 @@ class Store:
         with self.snapshot():
             found = [row for order in ("ASC", "DESC") for row in self.db.execute(query.format(order))]
             for part in self.parts():
+                part.trials(self._replicates())  # is as listed
                 columns = [row_parts.read_column(part.path, name)[[0, -1]] for name in ("point", "replicate", "scene")]
                 found += zip(*(column.tolist() for column in columns), strict=True)
         found = [self.checked(row, int, int, str) for row in found]
@@ -214,8 +215,8 @@ class Store:
         """All parts, in the order in which they were written."""
         if self.meta("format") != str(FORMAT_OF_PARTS):  # a store of an earlier skysim has no such table
             return []
-        rows = self.db.execute("SELECT part, rows, first, last FROM parts ORDER BY part")
-        known = (self.checked(row, int, int, int, int) for row in rows)
+        rows = self.db.execute("SELECT part, rows, wrong, first, last FROM parts ORDER BY part")
+        known = (self.checked(row, int, int, int, int, int) for row in rows)
         return [self._parts.setdefault(number, Part(self.part_path(number), *others)) for number, *others in known]
 
     @contextmanager
@@ -246,7 +247,7 @@ class Store:
         """(count,) mask of the trials in the store, failed ones included."""
         mask = np.zeros(count, bool)
         with self.snapshot():
-            rows = self.db.execute("SELECT trial FROM trials WHERE trial < ?", (count,))
+            rows = self.db.execute("SELECT trial FROM trials WHERE trial >= 0 AND trial < ?", (count,))
             mask[np.fromiter((trial for (trial,) in rows), np.int64)] = True
             for part in self.parts():
                 numbers = part.trials(self._replicates())
@@ -257,10 +258,10 @@ class Store:
         """Number of trials in the store, of failed trials, and of wrong attitudes."""
         query = "SELECT COUNT(*), COALESCE(SUM(error IS NOT NULL), 0), COALESCE(SUM(wrong), 0) FROM trials"
         with self.snapshot():
-            done, failed, wrong = self.db.execute(query).fetchone()
-            if self.parts():
-                more = self.db.execute("SELECT SUM(rows), SUM(wrong) FROM parts").fetchone()
-                done, wrong = done + more[0], wrong + more[1]
+            # A sum is no integer if one of its values is none.
+            done, failed, wrong = self.checked(self.db.execute(query).fetchone(), int, int, int)
+            parts = self.parts()
+        done, wrong = done + sum(part.rows for part in parts), wrong + sum(part.wrong for part in parts)
         return {"done": done, "failed": failed, "wrong": wrong}
 
     def failures(self) -> list[tuple[int, str]]:
@@ -369,6 +370,8 @@ class Store:
         """Raise InputError, instead of a decoding error, for values that skysim cannot have written."""
         try:
             yield
+        except InputError:
+            raise
         except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
             raise InputError(f"{self.path}: not a valid study store: {' '.join(str(error).split())[:120]}") from None
 
@@ -384,10 +387,14 @@ def to_array(name: str, column: Sequence[Any], texts: dict[Any, Any]) -> NDArray
     """A column as an array: objects for text, int64 for integers, otherwise floats with NaN for null.
 
     texts : texts so far, each of which is kept once
+    Raises TypeError for other values in a column of numbers; NumPy would read digits in bytes.
     """
     if name in TEXT_FIELDS or name in ("scene", "code", "error"):
         return np.array([texts.setdefault(text, text) for text in column], dtype=object)
-    return np.array(column, dtype=np.int64 if name in INTEGER_FIELDS or name in COLUMNS[:4] else float)
+    is_integer = name in INTEGER_FIELDS or name in COLUMNS[:4]
+    if not set(map(type, column)) <= ({int} if is_integer else {int, float, type(None)}):
+        raise TypeError(f"{name} is not a number in each row")
+    return np.array(column, dtype=np.int64 if is_integer else float)
 
 
 def ranges_of(points: Sequence[int], replicates: int) -> list[tuple[int, int]]:

@@ -134,18 +134,23 @@ def sync(path: Path) -> None:
 
 
 class Part:
-    """A part: its file, its number of rows, and the points of its first and its last row."""
+    """A part: its file, its numbers of rows and of wrong attitudes, and the points of its first and its last row."""
 
-    def __init__(self, path: Path, rows: int, first: int, last: int) -> None:
-        self.path, self.rows, self.first, self.last = path, rows, first, last
+    def __init__(self, path: Path, rows: int, wrong: int, first: int, last: int) -> None:
+        self.path, self.rows, self.wrong, self.first, self.last = path, rows, wrong, first, last
         self._trials: tuple[int, Array] = (0, np.empty(0, np.int64))
 
     def trials(self, replicates: int) -> Array:
-        """(N,) numbers of its trials, where a point has so many."""
+        """(N,) numbers of its trials, where a point has so many. Raises InputError for a part that is not as listed."""
         if self._trials[0] != replicates:
             point, replicate = (read_column(self.path, name) for name in ("point", "replicate"))
             if not len(point) == len(replicate) == self.rows > 0:
                 raise InputError(f"{self.path}: has {len(point)} rows; allowed: {self.rows}, as the study store lists")
+            if not (are_below(point, self.last + 1) and are_below(replicate, replicates)):
+                raise InputError(
+                    f"{self.path}: not a valid part of a study store: points and replicates; allowed: 0 to {self.last},"
+                    f" 0 to {replicates - 1}"
+                )
             self._trials = replicates, point * replicates + replicate
         return self._trials[1]
 
@@ -163,6 +168,11 @@ class Part:
             return whole[rows[0]] if len(rows) == 1 else np.concatenate([whole[one] for one in rows])
 
         return column if rows else None
+
+
+def are_below(numbers: Array, end: int) -> bool:
+    """Whether these are integers from 0 on and below the end."""
+    return bool(numbers.dtype.kind == "i" and numbers.min() >= 0 and numbers.max() < end)
 
 
 def read_column(path: Path, name: str) -> Array:

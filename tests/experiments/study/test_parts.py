@@ -423,6 +423,9 @@ def test_a_part_that_is_missing_or_damaged_is_named(tmp_path: Path) -> None:
     [
         ("UPDATE parts SET rows = 7 WHERE part = 2", r"000002\.parquet: has \d+ rows; allowed: 7"),
         ("UPDATE parts SET last = 'x' WHERE part = 2", r"s\.sqlite: not a valid study store: .*'x'"),
+        ("UPDATE parts SET wrong = x'31' WHERE part = 2", r"s\.sqlite: not a valid study store: .*b'1'"),
+        ("UPDATE parts SET rows = -1 WHERE part = 2", r"000002\.parquet: has \d+ rows; allowed: -1"),
+        ("UPDATE parts SET last = 0 WHERE part = 3", r"000003\.parquet: not a valid part .* allowed: 0 to 0, 0 to 39"),
         ("UPDATE meta SET value = '0' WHERE key = 'replicates'", r"s\.sqlite: not a valid study store: replicates 0"),
     ],
 )
@@ -434,6 +437,27 @@ def test_a_list_of_parts_that_skysim_cannot_have_written_is_one_clear_line(
         assert db.execute(change).rowcount
     with store.open_store(path) as kept, pytest.raises(InputError, match=message):
         kept.trial_range()
+
+
+@pytest.mark.parametrize(
+    ("column", "values"),
+    [
+        ("point", lambda point: point.astype(str).astype(object)),
+        ("point", lambda point: point + 0.5),
+        ("point", lambda point: -1 - point),
+        ("replicate", lambda replicate: replicate + 100),
+        ("replicate", lambda replicate: replicate[:1]),
+    ],
+)
+def test_a_part_with_other_values_is_one_clear_line(column: str, values: Callable[[Any], Any], tmp_path: Path) -> None:
+    path = filled(tmp_path / "s.sqlite", ALL)
+    part = tmp_path / "s.parts/000002.parquet"
+    columns = {name: row_parts.read_column(part, name) for name in store.COLUMNS if name != "trial"}
+    changed = columns | {column: values(columns[column])}
+    row_parts.write_part(part, {name: one[: len(changed[column])] for name, one in changed.items()})
+    for read in (store.Store.trial_range, store.Store.scenes, lambda kept: kept.done(10)):
+        with store.open_store(path) as kept, pytest.raises(InputError, match=r"^[^\n]*000002\.parquet: [^\n]+$"):
+            read(kept)
 
 
 def test_an_earlier_skysim_refuses_a_store_with_parts(tmp_path: Path) -> None:
