@@ -32,6 +32,7 @@ import numpy as np
 import psutil
 
 from benchmarks.timing import verdict
+from skysim.apps.gui.memory import QUIET_S
 from skysim.apps.gui.server import RECONNECT_S
 from skysim.core.types import Floats
 
@@ -48,6 +49,7 @@ TOKEN, WORKERS_LIMIT = "bench", 4
 HELD_S, PRESSES, CROWD = 6.0, 30, 20
 WARM_TABS, TABS = 3, int(os.environ.get("SKYSIM_BENCH_TABS", "20"))  # the first load code
 PLAY_S, LOOK_S = float(os.environ.get("SKYSIM_BENCH_PLAY_S", "120")), 2.0
+COLLECTED_S = 2 * QUIET_S  # until a closed page is collected
 IDLE_S = 0.1  # processor time in a second of a server that waits
 WARM_S = 180.0  # for compiling and loading on a busy machine
 # When a frame was drawn and a key went down, by the page's clock.
@@ -311,6 +313,7 @@ def memory(tabs: Any, server: Server) -> dict[str, Any]:
     for tab in range(WARM_TABS + TABS):
         opened(tabs, server).close()
         server.settle(0)
+        time.sleep(COLLECTED_S)
         levels.append(server.memory_mb())
         say(f"tab {tab + 1}: {levels[-1]:.1f} MB")
     return growth(f"memory over {TABS} tabs", levels[WARM_TABS:])

@@ -1,4 +1,4 @@
-"""Garbage collection of the server, so timed that no page waits for it."""
+"""Garbage collection of the server, while no page gets a frame."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import time
 from skysim.apps.gui.page.frame.sensor import FRAMES
 
 THRESHOLDS = 2_000, 10, 1_000  # new objects until a collection, and collections until one of older objects
-QUIET_S = 1.0  # without a new frame on any page, before closed pages are collected
+QUIET_S = 1.0  # after a page was closed, and without a new frame on any page, before closed pages are collected
 PATIENCE_S = 60.0  # after which they are collected although frames follow one another
 
 
@@ -34,7 +34,7 @@ def release_memory() -> None:
 
 
 class ClosedPages:
-    """Collects closed pages, many at once if many were closed, while no page gets a frame."""
+    """Collects closed pages, many at once if many were closed, while no page gets a frame, or PATIENCE_S later."""
 
     def __init__(self) -> None:
         self.waiting: asyncio.Task[None] | None = None
@@ -46,6 +46,7 @@ class ClosedPages:
 
     async def collect(self) -> None:
         end_s = time.monotonic() + PATIENCE_S
+        await asyncio.sleep(QUIET_S)
         while (now_s := time.monotonic()) < end_s and now_s - last_frame_s() < QUIET_S:
             await asyncio.sleep(QUIET_S)
         self.waiting = None  # a page that is closed from now on needs another collection

@@ -448,8 +448,10 @@ def test_closed_pages_are_collected_once_and_while_no_page_gets_a_frame(monkeypa
         await asyncio.sleep(0.5)
         assert len(collected) == 1
         assert collected[0] - frames.added_s > 0.2
-        closed.collect_soon()
-        await asyncio.sleep(0.1)
+        for _ in range(3):  # without a frame in between
+            closed.collect_soon()
+            await asyncio.sleep(0.05)
+        await asyncio.sleep(0.2)
         assert len(collected) == 2
 
     asyncio.run(close_while_another_plays())
