@@ -143,10 +143,10 @@ def survey(
 
     known_length    : rows of two lights and the distance between them in m; fixes the scale
     fit_distortion  : also fit k1, k2, p1, p2; k3 has no visible effect in a narrow field
-    loss            : "linear", or "cauchy", which tolerates wrong identifications: iteratively reweighted, its width
-        shrinking with the median residual; then residuals beyond 5 sigma are rejected and the rest is fitted by least
-        squares, so that the covariance is that of a least-squares fit. Errors of a light seen only twice are hard to
-        detect
+    loss            : "linear", or "cauchy", which tolerates wrong identifications: iteratively reweighted, for a noise
+        that shrinks with the median residual; then residuals beyond 5 sigma are rejected and the rest is fitted by
+        least squares, so that the covariance is that of a least-squares fit. Errors of a light seen only twice are hard
+        to detect
     reference_frame : row of the frame whose start attitude fixes the lab frame, instead of the start map
     leds_sigma_m    : standard deviation of the start map per axis; the map is then used as a measurement, which the
         weakly determined moves need. inf: the map is only a start value

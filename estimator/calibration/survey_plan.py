@@ -24,8 +24,9 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
 
 Mask = NDArray[np.bool_]
-MIN_SHARED = 8  # LEDs that an attitude shares with those before it, seen in another direction
-PLANNED_RAD = 1.2 * CONNECTING_RAD  # rms angle by which their rays cross: attitudes are not held exactly
+MIN_SHARED = 8  # LEDs that an attitude shares with those before it
+LEAST_CROSSING = 2  # LEDs that determine an attitude
+PLANNED_RAD = 1.7 * CONNECTING_RAD  # rms angle by which their rays cross: attitudes are not held exactly
 ATTITUDE_SIGMA_RAD = 0.05  # of an attitude before its frame is adjusted: next to nothing is known
 
 
@@ -138,10 +139,10 @@ def choose(
     2 x 3 rows of the Jacobian and A those of the attitude, the reduction is the sum over i of tr(P_i B_i' W_ii B_i
     P_i), W = (B P B' + s^2 A A' + I)^-1. Correlations between LEDs are left out, which is thirty times faster and no
     worse: 40 attitudes under a dome of 390 LEDs leave 0.66 mm rms, against 0.69 mm with all correlations. An attitude
-    must share MIN_SHARED LEDs with those before it, if any does, whose rays then cross by the rms angle PLANNED_RAD or
-    more, so that the frames are connected at any time. The
-    reductions hardly grow from choice to choice, so that a candidate is evaluated again only while its last value is
-    above the best (lazy greedy: Minoux 1978).
+    must share MIN_SHARED LEDs with those before it, so that the frames are connected at any time: LEDs whose rays cross
+    by the rms angle PLANNED_RAD or more, if any attitude has LEAST_CROSSING of these, else any LEDs. The reductions
+    hardly grow from choice to choice, so that a candidate is evaluated again only while its last value is above the
+    best (lazy greedy: Minoux 1978).
     """
     if np.shape(shown) != (len(candidates), len(model.leds.id)):
         raise ValueError(f"survey: shown has shape {np.shape(shown)}; allowed: {len(candidates), len(model.leds.id)}")
@@ -155,8 +156,7 @@ def choose(
     bound = np.array([np.inf if len(row.led) >= MIN_SHARED else 0.0 for row in rows])
     chosen: list[int] = []
     while len(chosen) < count:
-        shared = reach.shared() if reach.count.any() else shown.sum(axis=1)
-        best = _best(rows, blocks, bound, shared >= min(MIN_SHARED, shared[bound > 0].max(initial=0)))
+        best = _best(rows, blocks, bound, reach.connected(bound > 0))
         if best is None:
             break
         blocks[rows[best].led] -= _reduction(rows[best], blocks)
@@ -183,14 +183,15 @@ class _Reach:
     """Where each LED has been seen from, and what candidate attitudes share with that.
 
     The rms angle of an LED's rays is the rms distance of the camera positions from their mean, perpendicular to the
-    direction u of the LED, over its distance. With the camera at the radius r about the center of rotation, m the mean
-    of its positions c and a that of (u.c)^2, the mean square distance is r^2 - |m|^2 - (a - (u.m)^2).
+    direction u of the LED, over its mean distance from them. With the camera at the radius r about the center of
+    rotation, m the mean of its positions c and a that of (u.c)^2, the mean square distance is
+    r^2 - |m|^2 - (a - (u.m)^2). The LED at the distance R from the center is R - u.m from the camera.
     """
 
     def __init__(self, model: SurveyModel, candidates: Rotation, shown: Mask) -> None:
         place_m, self.arm_m = model.leds.position_m, np.array(model.lever.camera_body_m)
-        distance_m = np.linalg.norm(place_m, axis=1)
-        self.toward, self.least_m2 = place_m / distance_m[:, None], (PLANNED_RAD * distance_m) ** 2
+        self.distance_m = np.linalg.norm(place_m, axis=1)
+        self.toward = place_m / self.distance_m[:, None]
         self.count, self.along_m2, self.sum_m = (
             np.zeros(len(place_m)),
             np.zeros(len(place_m)),
@@ -212,15 +213,31 @@ class _Reach:
         np.add.at(self.sum_m, led, camera_m)
         np.add.at(self.along_m2, led, along_m**2)
 
-    def shared(self) -> Ints:
-        """(C,) LEDs of each candidate that have been seen before, and from elsewhere."""
+    def connected(self, useful: Mask) -> Mask:
+        """(C,) candidates that share MIN_SHARED LEDs with what has been seen, or as many as any useful one does.
+
+        LEDs count whose rays cross. If no useful candidate has LEAST_CROSSING of them, all shared ones count.
+        """
+        crossing, shared = self.shared()
+        if not self.count.any():
+            shared = self.counted(np.ones(len(self.row), dtype=bool))
+        if crossing[useful].max(initial=0) >= LEAST_CROSSING:
+            shared = crossing
+        return shared >= min(MIN_SHARED, shared[useful].max(initial=0))
+
+    def shared(self) -> tuple[Ints, Ints]:
+        """(C,) LEDs of each candidate that have been seen before: from another direction, and from any."""
         led, count = self.led, self.count[self.led] + 1
         mean_m = (self.sum_m[led] + self.camera_m) / count[:, None]
         mean_along_m = np.sum(mean_m * self.toward[led], axis=1)
         across_m2 = self.arm_m @ self.arm_m - np.sum(mean_m**2, axis=1)
         across_m2 -= (self.along_m2[led] + self.along_m**2) / count - mean_along_m**2
-        is_shared = (count > 1) & (across_m2 > self.least_m2[led])
-        return np.bincount(self.row[is_shared], minlength=len(self.candidates))
+        is_crossing = (count > 1) & (across_m2 > (PLANNED_RAD * (self.distance_m[led] - mean_along_m)) ** 2)
+        return self.counted(is_crossing), self.counted(count > 1)
+
+    def counted(self, sightings: Mask) -> Ints:
+        """(C,) number of sightings of each candidate, of those selected."""
+        return np.bincount(self.row[sightings], minlength=len(self.candidates))
 
 
 class _Row(NamedTuple):

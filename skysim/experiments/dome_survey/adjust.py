@@ -37,7 +37,8 @@ MOVED_ROUNDS = 2  # further rounds if LEDs are far from their places in the list
 
 # Share of a frame's lights that are matched, and of these that fit the adjustment: far less by chance.
 MIN_MATCHED = 0.5
-# The same as a share of the frames' median: a field shifted by one LED matches some 0.6 of its lights, a right one all.
+# The same at first, as a share of the frames' median: a field shifted by one LED matches some 0.6 of its lights, a
+# right one all. Later measured LEDs tell such fields apart, and frames count that show displaced LEDs.
 MIN_OF_MEDIAN = 0.8
 # Standard deviations by which a parameter may move from the assumed one, and the least of these, as a share of that
 # of the assumed one.
@@ -117,7 +118,9 @@ def identified_by_imu(
 ) -> tuple[list[int], list[Correspondences]]:
     """Rows of the frames that the IMU's attitudes identify, and their correspondences. Raises InputError for none."""
     matches = [match_by_imu(frame, prior, uncertainty) for frame in frames]
-    rows = well_matched([matched_share(frame, match, prior) for frame, match in zip(frames, matches, strict=True)])
+    shares = [matched_share(frame, match, prior) for frame, match in zip(frames, matches, strict=True)]
+    least = max(MIN_MATCHED, MIN_OF_MEDIAN * float(np.median(shares)))
+    rows = np.flatnonzero(np.array(shares) >= least).tolist()
     if not rows:
         raise InputError(
             f"survey: in none of the {len(frames)} frames do the lights fit the LEDs of the list; allowed: attitudes,"
@@ -126,16 +129,12 @@ def identified_by_imu(
     return rows, [matches[row] for row in rows]
 
 
-def well_matched(share: Sequence[float]) -> list[int]:
-    """Rows of the frames of which at least MIN_MATCHED of the lights are matched, and MIN_OF_MEDIAN of the median."""
-    shares = np.array(share)
-    return np.flatnonzero(shares >= max(MIN_MATCHED, MIN_OF_MEDIAN * np.median(shares))).tolist()
-
-
 def matched_share(frame: SurveyFrame, match: Correspondences, model: CalibrationPrior) -> float:
-    """Share of the lights of a frame that are matched, or of the LEDs in it if they are fewer."""
+    """Share of the lights of a frame that are matched, or of the LEDs in it if they are fewer; 0 if too few connect."""
+    if len(match.led) < MIN_SHARED_LEDS:
+        return 0.0
     visible = int(np.count_nonzero(model.camera.contains(model.pixels(frame.body_from_lab))))
-    return len(match.led) / max(1, min(len(frame.lights), visible))
+    return min(1.0, len(match.led) / max(1, min(len(frame.lights), visible)))
 
 
 def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], CalibrationPrior]:
@@ -150,18 +149,17 @@ def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], Calibra
     map_px = led_sigma_m(survey, run.uncertainty) * model.px_per_m
     sigma_px = np.hypot(map_px, max(survey.rms_px, prior.floor_px))
     tied = {row: frame for row, frame, ok in zip(run.rows, run.frames, survey.tied, strict=True) if ok}
-    matches, shares = list[Correspondences](), list[float]()
+    rows, matches = [], []
     for row, frame in enumerate(run.taken):
         match = match_by_survey(tied[row], model, sigma_px) if row in tied else None
-        share = matched_share(tied[row], match, model) if match else 0.0
-        if match is None or share < MIN_MATCHED:
-            match = match_by_imu(frame, model, run.uncertainty_after, map_px)
-            share = matched_share(frame, match, model)
+        if match is None or matched_share(tied[row], match, model) < MIN_MATCHED:
+            match = match_by_imu(frame, model, run.uncertainty_after, sigma_px)
+            if matched_share(frame, match, model) < MIN_MATCHED:
+                continue
+        rows.append(row)
         matches.append(match)
-        shares.append(share)
-    rows = well_matched(shares)
     # Keep the map from before the survey: it enters each adjustment as a measurement, as the assumed lever does.
-    return rows, [matches[row] for row in rows], replace(model, leds=prior.leds)
+    return rows, matches, replace(model, leds=prior.leds)
 
 
 def with_names(run: SurveyRun) -> SurveyRun:

@@ -1,8 +1,7 @@
 """Identification of the LEDs in the frames of a dome survey.
 
 The error of the IMU attitude shifts all lights of a frame together by more than the LED spacing. So `match_by_imu`
-first finds the most likely common shift, the minimum over candidate shifts t of
-|t|^2 / common^2 + sum_i min(d_i / individual, gate)^2, and then assigns detections to LEDs one to one. After an
+first finds the most likely common shift (`common_shift_px`), and then assigns detections to LEDs one to one. After an
 adjustment the predictions are good, and `match_by_survey` assigns directly.
 """
 
@@ -36,7 +35,7 @@ def prediction_sigmas_px(
 ) -> tuple[float, Floats]:
     """Standard deviations per coordinate in pixels: of the common shift of a frame, and (N,) of each LED individually.
 
-    map_px : (N,) those of the LEDs' places, as `uncertainty` has them if None
+    map_px : (N,) standard deviation of each LED's place; that of `uncertainty` if None
 
     The attitude error across the boresight and the lever arm error shift all lights alike. An attitude error moves the
     camera too: it turns the direction of an LED at the distance R from the center of rotation, d from the camera, by
@@ -78,10 +77,10 @@ def common_shift_px(
     """(2,) most likely common shift of (P, 2) predictions onto (S, 2) detections, pixels.
 
     Candidates are the shifts that move a prediction onto one of the ANCHOR_LIGHTS detections nearest to the image
-    center, where a roll error displaces least. The cost of a shift t is
-    |t|^2 / common_px^2 + sum_i min(d_i / individual_px, GATE_SIGMAS)^2, where d_i is the distance of detection i from
-    the nearest shifted prediction. The best candidate is refined by the mean residual of the detections in the gate,
-    weighted by 1 / individual_px^2.
+    center, where a roll error displaces least. The cost of a shift t is -2 ln of its likelihood,
+    |t|^2 / common_px^2 + sum_i min(d_i^2 / s_i^2 + 4 ln(s_i / s), GATE_SIGMAS^2), where d_i is the distance of
+    detection i from the nearest shifted prediction, s_i its individual_px and s the greatest of all. The best candidate
+    is refined by the mean residual of the detections in the gate, weighted by 1 / s_i^2.
     """
     inner = np.argsort(np.linalg.norm(detected_px - center_px, axis=1))[:ANCHOR_LIGHTS]
     candidates = (detected_px[inner, None] - predicted_px).reshape(-1, 2)
@@ -89,9 +88,10 @@ def common_shift_px(
     candidates = candidates[np.linalg.norm(candidates, axis=1) < limit_px]
     candidates = np.vstack([np.zeros((1, 2)), candidates])  # no shift is a candidate too
     distance_px, nearest = cKDTree(predicted_px).query(detected_px - candidates[:, None])
-    cost = np.minimum(distance_px / individual_px[nearest], GATE_SIGMAS)
-    best = int(np.argmin(np.sum(candidates**2, axis=1) / common_px**2 + np.sum(cost**2, axis=1)))
-    is_close = cost[best] < GATE_SIGMAS
+    sigma_px = individual_px[nearest]
+    cost = np.minimum((distance_px / sigma_px) ** 2 + 4 * np.log(sigma_px / individual_px.max()), GATE_SIGMAS**2)
+    best = int(np.argmin(np.sum(candidates**2, axis=1) / common_px**2 + np.sum(cost, axis=1)))
+    is_close = cost[best] < GATE_SIGMAS**2
     if not is_close.any():
         return candidates[best]
     led = nearest[best, is_close]

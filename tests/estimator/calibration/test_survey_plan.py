@@ -149,6 +149,18 @@ def test_planned_attitudes_are_connected_by_rays_that_cross() -> None:
         assert connecting.sum() >= survey_plan.MIN_SHARED
 
 
+@pytest.mark.parametrize(("arm_m", "least"), [(0.1, 20), (0.15, 25), (0.2, 15)])
+def test_a_plan_with_a_short_lever_still_connects_its_attitudes(arm_m: float, least: int) -> None:
+    """Few rays cross, so no attitude has as many as are wanted: LEDs that are only shared are better than none."""
+    camera = Camera(640, 480, 2500.0, (319.5, 239.5))
+    true = replace(model(400), camera=camera, lever_sigma_m=0.005, focal_sigma_px=9.0)
+    true = replace(true, lever=replace(true.lever, camera_body_m=np.array([0.0, 0.0, arm_m])))
+    candidates = attitudes(np.random.default_rng(3), 300)
+    shown = true.visible(candidates)
+    rows = survey_plan.choose(true, candidates, shown, 12)
+    assert survey_plan.predict(true, candidates[rows], shown[rows]).measured.sum() >= least
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 2])
 def test_one_wrong_light_of_a_hundred_does_not_lead_a_survey_astray(seed: int) -> None:

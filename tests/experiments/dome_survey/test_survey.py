@@ -17,7 +17,10 @@ from astropy.table import Table
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
+from surveyed_dome import NOISE_PX, attitudes, model, pixels
 
+from estimator.calibration import survey_faults
+from estimator.core.types import Centroids
 from estimator.trackers.dome_tracker import DomeTracker
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
@@ -25,6 +28,7 @@ from skysim.experiments.dome_survey import adjust, matching, procedure
 from skysim.experiments.dome_survey import frames as survey_frames
 from skysim.experiments.dome_survey import prior as survey_prior
 from skysim.experiments.dome_survey import stops as survey_stops
+from skysim.experiments.dome_survey.frames import SurveyFrame
 from skysim.scene import loader
 from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
 from skysim.tracking import dome_map_file, factory
@@ -246,6 +250,50 @@ def test_a_common_shift_is_found_though_neighbors_are_nearer_than_it(seed: int) 
     found = matching.common_shift_px(seen, predicted, 100.0, np.full(60, 5.0), (500.0, 500.0))
     # The mean of 35 lights, 5 px each, and of strangers that stand within the gate.
     assert np.linalg.norm(found - shift) < 5 * 5 / np.sqrt(35)
+
+
+def test_leds_of_an_unknown_place_do_not_attract_a_shift() -> None:
+    """Two thirds of a field are known to 25 px, so that many of them lie near any light; the others to 7 px."""
+    rng, missed = np.random.default_rng(1), 0
+    for _ in range(40):
+        across, down = np.meshgrid(75.0 * np.arange(25), 75.0 * np.arange(25))
+        predicted = np.column_stack([across.ravel(), down.ravel()]) + rng.normal(0, 22, (625, 2)) - 550
+        sigma_px = np.where(predicted[:, 0] < 250, 7.0, 25.0)
+        shift = rng.normal(0, 90, 2)
+        seen = predicted + shift + sigma_px[:, None] * rng.normal(size=(625, 2))
+        seen = seen[((seen > 0) & (seen < 700)).all(axis=1)]
+        found = matching.common_shift_px(seen, predicted, 90.0, sigma_px, (350.0, 350.0))
+        missed += np.linalg.norm(found - shift) > 30
+    assert missed <= 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_board_that_is_displaced_is_found_whole(seed: int) -> None:
+    """Five neighboring LEDs 40 mm off: frames that show all of them match two thirds of their lights."""
+    rng, dome = np.random.default_rng(seed), model(120)
+    listed_m, held = dome.leds.position_m, attitudes(rng, 40)
+    board = np.argsort(np.linalg.norm(listed_m - listed_m[20], axis=1))[:5]
+    along = np.cross(listed_m[20], [1.0, 0.0, 0.0])
+    place_m = listed_m + rng.normal(0, 0.002, listed_m.shape)
+    place_m[board] += 0.04 * along / np.linalg.norm(along)
+    lever = replace(dome.lever, camera_body_m=dome.lever.camera_body_m + rng.normal(0, 0.004, 3))
+    prior = survey_prior.CalibrationPrior(dome.camera, dome.leds, lever, NOISE_PX, 0.002, np.ones(120))
+    frames = []
+    for index, attitude in enumerate(held):
+        xy_px = pixels(dome, place_m, attitude)
+        xy_px = xy_px[dome.camera.contains(xy_px)]
+        lights = Centroids(
+            xy_px + rng.normal(0, NOISE_PX, xy_px.shape), np.full(len(xy_px), NOISE_PX), np.ones(len(xy_px))
+        )
+        by_imu = Rotation.from_rotvec(UNCERTAINTY.imu_sigma_rad * rng.normal(size=3)) * attitude
+        frames.append(SurveyFrame(lights, by_imu, index))
+    run = adjust.run_survey(frames, prior, UNCERTAINTY)
+    survey = run.survey
+    found, _ = survey_faults.displaced(listed_m, survey.leds.position_m, survey.led_covariance_m2)
+    assert set(found) == set(board)
+    error_m = np.linalg.norm(survey.leds.position_m - place_m, axis=1)
+    assert error_m[board].max() < 0.005
 
 
 def test_pairs_are_the_cheapest_of_all_that_there_are() -> None:
