@@ -26,7 +26,7 @@ from estimator.core.camera import Camera
 Mask = NDArray[np.bool_]
 MIN_SHARED = 8  # LEDs that an attitude shares with those before it
 LEAST_CROSSING = 2  # LEDs that determine an attitude
-PLANNED_RAD = 1.7 * CONNECTING_RAD  # rms angle by which their rays cross: attitudes are not held exactly
+PLANNED_RAD = 1.7 * CONNECTING_RAD  # rms angle by which their rays cross; with less, AFIT's LEDs err by a third more
 ATTITUDE_SIGMA_RAD = 0.05  # of an attitude before its frame is adjusted: next to nothing is known
 
 
@@ -192,11 +192,8 @@ class _Reach:
         place_m, self.arm_m = model.leds.position_m, np.array(model.lever.camera_body_m)
         self.distance_m = np.linalg.norm(place_m, axis=1)
         self.toward = place_m / self.distance_m[:, None]
-        self.count, self.along_m2, self.sum_m = (
-            np.zeros(len(place_m)),
-            np.zeros(len(place_m)),
-            np.zeros((len(place_m), 3)),
-        )
+        self.count, self.along_m2 = np.zeros((2, len(place_m)))
+        self.sum_m = np.zeros_like(place_m)
         self.candidates, (self.row, self.led) = candidates, np.nonzero(shown)
         self.camera_m, self.along_m = self.positions(candidates, self.row, self.led)
 
