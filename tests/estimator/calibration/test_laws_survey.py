@@ -12,11 +12,12 @@ from hypothesis import strategies as some
 from hypothesis.extra.numpy import arrays
 from laws import ANY, NUMBERS, SEEDS, answered, assert_covariance, law, turn, units
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration import star_field
+from estimator.calibration import dome_survey, star_field
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
 from estimator.calibration.gauge import Gauge, Subset, align_attitudes
@@ -60,6 +61,12 @@ def nudged(rng: np.random.Generator, true: Bundle, by: float) -> Bundle:
     return true.apply_step(rng.normal(0, by, 3 * LIGHTS), rng.normal(0, by, 3 * FRAMES + 3 + 3))
 
 
+def whole_matrix(terms: ba.NormalEquations) -> Floats:
+    """The normal matrix of all unknowns, lights first."""
+    coupling = terms.coupling.toarray()
+    return np.block([[block_diag(*terms.by_led), coupling.T], [coupling, terms.rest]])
+
+
 # Bundle adjustment
 
 
@@ -93,15 +100,7 @@ def test_lights_eliminated_are_the_whole_system_solved(rng: np.random.Generator,
     bundle = nudged(rng, true, 1e-3)
     weight = rng.uniform(0.1, 1, len(seen.led))
     terms, (led_free, rest_free) = ba.normal_equations(bundle, seen, weight), ba.gauge_freedoms(bundle)
-    n = 3 * LIGHTS
-    whole = np.zeros((n + len(terms.rest),) * 2)
-    for k in range(LIGHTS):
-        whole[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = terms.by_led[k]
-    whole[n:, :n], whole[:n, n:], whole[n:, n:] = (
-        terms.coupling.toarray(),
-        terms.coupling.toarray().T,
-        terms.rest,
-    )
+    whole = whole_matrix(terms)
     assert_covariance(whole)
     still = whole @ np.concatenate([led_free, rest_free])  # they change no pixel
     np.testing.assert_allclose(still, 0, rtol=0, atol=1e-9 * np.abs(whole).max())
@@ -138,6 +137,30 @@ def test_what_is_assumed_is_a_measurement_of_its_weight(
     slope = (costs[0] - costs[1]) / (2 * step)
     pull = 2 * (terms.rhs_led @ led + terms.rhs_rest @ rest)
     np.testing.assert_allclose(slope, pull, rtol=1e-3, atol=1e-5 * max(costs) + 1e-9 * max(costs) / step)
+
+
+@law(dome_survey.redundancy, dome_survey.check_redundancy)
+@given(rng=SEEDS, list_m=some.floats(1e-4, 0.1), rows=some.integers(40, FRAMES * LIGHTS))
+def test_redundant_coordinates_are_those_that_the_unknowns_do_not_follow(
+    rng: np.random.Generator, list_m: float, rows: int
+) -> None:
+    """By definition: their number less the trace of the hat matrix, which takes pixels to those of the fit."""
+    true, seen = dome(rng, 0.1)
+    seen = seen.take(rng.permutation(len(seen.led))[:rows])
+    every = np.ones(rows)
+    pixels = whole_matrix(ba.normal_equations(true, seen, every))
+    known = replace(true, map_sigma_m=list_m, assumed=Assumed(true.camera_body_m, 0.005, LENS[0], 5.0))
+    terms = ba.normal_equations(known, seen, every)
+    part = Subset(known, seen, np.arange(LIGHTS), np.arange(FRAMES), np.arange(rows))
+    covariances = ba.covariance(terms, known)
+    spare = 2 * rows - np.trace(np.linalg.solve(whole_matrix(terms), pixels))
+    assert dome_survey.redundancy(part, covariances) == pytest.approx(spare, abs=1e-3)
+    assert (answered(lambda: dome_survey.check_redundancy(part, covariances) or True) is None) == (
+        spare < dome_survey.MIN_REDUNDANCY
+    )
+    # Without the list the pixels leave the four moves of the gauge undetermined.
+    alone = replace(part, bundle=true)
+    assert dome_survey.redundancy(alone, covariances) == 2 * rows - (len(pixels) - 4)
 
 
 @law(ba.adjust, ba.fit_attitudes, ba.covariance_in_gauge)
