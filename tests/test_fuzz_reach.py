@@ -81,7 +81,6 @@ OUT_OF_REACH = {
     "skysim.dynamics.controllers.interface.ControllerSetup.of_tree": OURS,
     "skysim.dynamics.multibody.view.shapes.laboratory": "reads the MJCF text that we export",
     "skysim.dynamics.profiles.load.load_profiles": "hands a scene's files on to `read_profile`",
-    "skysim.results.files.row_parts.read_column": OURS,
     "skysim.results.report.write_page": "takes a picture of ours into a page",
     "skysim.experiments.study.execution.setups.code_version": SOURCES,
     "skysim.experiments.study.execution.setups.scene_hash": SOURCES,
