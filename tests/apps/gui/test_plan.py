@@ -281,7 +281,7 @@ def test_check_map_and_survey_in_the_page(page: Any) -> None:
     page.get_by_text("no flight: fly the survey's attitudes").first.wait_for()
     page.get_by_role("button", name="Plan", exact=True).click()
     page.get_by_role("button", name="Begin anew", exact=True).click()
-    page.get_by_text("after 2 frames").wait_for()  # the steps of a new plan
+    page.get_by_text("after 4 frames").wait_for()  # the steps of a new plan
     chosen(page, "Scene", "shefex2")
     page.get_by_text("Plan begins a survey").wait_for()
     assert adjust.is_disabled()
