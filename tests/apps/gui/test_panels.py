@@ -431,6 +431,7 @@ def test_a_compressed_file_is_not_sent_to_a_browser_that_asks_for_a_plain_one() 
     assert [dict(one["headers"])[b"accept-encoding"] for one in starts[::2]] == [b"gzip", b"identity", b"gzip"]
 
 
+@pytest.mark.slow
 def test_closed_pages_are_collected_once_and_while_no_page_gets_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     """A collection of all pages takes as long as many frames, and a page's frames need not wait for it."""
     collected, frames = list[float](), TabFrames(lambda _: None)

@@ -210,6 +210,7 @@ def test_a_frame_of_a_stop_shows_a_vehicle_that_stands_there(testbed: Testbed) -
     assert (first.lab_from_body * stops[0].inv()).magnitude() < 1e-12
 
 
+@pytest.mark.slow
 def test_an_imu_error_shifts_a_frame_by_what_is_predicted(testbed: Testbed) -> None:
     """The camera is off the center of rotation, so that it moves too: the LEDs shift by half as much again."""
     prior = survey_prior.calibration_prior(testbed)
@@ -252,6 +253,7 @@ def test_a_common_shift_is_found_though_neighbors_are_nearer_than_it(seed: int) 
     assert np.linalg.norm(found - shift) < 5 * 5 / np.sqrt(35)
 
 
+@pytest.mark.slow
 def test_leds_of_an_unknown_place_do_not_attract_a_shift() -> None:
     """Two thirds of a field are known to 25 px, so that many of them lie near any light; the others to 7 px."""
     rng, missed = np.random.default_rng(1), 0
