@@ -47,8 +47,8 @@ from estimator.core.camera import Camera
 CAUCHY = 2.385
 LOSSES: dict[str, float] = {"linear": np.inf, "cauchy": CAUCHY}
 GATE = 5.0  # residuals above this many robust sigmas are outliers in the final fit
-MIN_REDUNDANCY = 8  # coordinates more than unknowns, for a survey that estimates its noise from them
 GROSS_GATE = 6.0  # the same for the first rejection, after only the attitudes are fitted
+MIN_REDUNDANCY = 8  # coordinates more than unknowns, for a survey that estimates its noise from them
 CROSSING_RAD = 0.005  # least rms angle between the rays to one light; below, its distance is undetermined
 CONNECTING_RAD = 2 * CROSSING_RAD  # of lights that connect frames before they are adjusted: the angle is not yet exact
 NOISE_ROUNDS, NOISE_TOLERANCE = 8, 0.01  # of the noise estimated from the residuals; the tolerance is relative

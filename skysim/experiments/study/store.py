@@ -258,7 +258,7 @@ class Store:
         """Number of trials in the store, of failed trials, and of wrong attitudes."""
         query = "SELECT COUNT(*), COALESCE(SUM(error IS NOT NULL), 0), COALESCE(SUM(wrong), 0) FROM trials"
         with self.snapshot():
-            # A sum is no integer if one of its values is none.
+            # SQLite's sum is an integer only if all values are.
             done, failed, wrong = self.checked(self.db.execute(query).fetchone(), int, int, int)
             parts = self.parts()
         done, wrong = done + sum(part.rows for part in parts), wrong + sum(part.wrong for part in parts)

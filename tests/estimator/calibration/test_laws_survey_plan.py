@@ -50,6 +50,11 @@ def test_a_longer_plan_begins_as_a_shorter_one(rng: np.random.Generator, count: 
     shown = assumed.visible(candidates)
     plan = survey_plan.choose(assumed, candidates, shown, 12)
     assert survey_plan.choose(assumed, candidates, shown, count) == plan[:count]
+    covered = shown[plan[0]]
+    for row in plan[1:]:
+        reachable = (shown & covered).sum(axis=1)
+        assert reachable[row] >= min(survey_plan.LEAST_CROSSING, reachable.max())
+        covered = covered | shown[row]
     assert answered(lambda: survey_plan.choose(assumed, candidates, shown[:, :-1], count)) is None
 
 
