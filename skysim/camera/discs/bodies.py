@@ -116,10 +116,14 @@ def whole(
 
 
 def behind(bodies: Sequence[BodyLight], occluded: OcclusionTest | None) -> OcclusionTest | None:
-    """The test for sources that the discs of these bodies or anything else hide; None if nothing can."""
+    """The test for sources that the discs of these bodies or anything else hide; None if nothing can.
+
+    The bodies hide only what is at infinity.
+    """
 
     def hidden(place: Floats) -> NDArray[np.bool_]:
-        by_discs = [body.hides(place[:, :3]) for body in bodies]
+        far = place[:, 3] == 0
+        by_discs = [far & body.hides(place[:, :3]) for body in bodies]
         return np.any([*by_discs, *([occluded(place)] if occluded else [])], axis=0)
 
     return hidden if bodies else occluded
@@ -145,5 +149,7 @@ def hidden_points(body: BodyLight, nearer: Sequence[BodyLight], occluded: Occlus
 
 def concatenated(truths: Sequence[SourceTruth]) -> SourceTruth:
     """The rows of several truths, in their order."""
+    if len(truths) == 1:
+        return truths[0]
     names = [field.name for field in fields(SourceTruth)]
     return SourceTruth(**{name: np.concatenate([getattr(truth, name) for truth in truths]) for name in names})
