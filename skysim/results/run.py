@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.core.types import Attitude
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.io.files import make_folder, write_image, write_table
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Frame, FrameRow, Telemetry, Truth
 from skysim.results import report, scoring, stretch, telemetry_report
 from skysim.results.files.frames import remove_results, write_frame
