@@ -37,7 +37,7 @@ from skysim.results.metrics import WRONG_RAD
 from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 from skysim.tracking import onboard_model
 from skysim.tracking import settings as tracker_settings
 from skysim.tracking.external import adapter
@@ -147,11 +147,11 @@ def load(name: str, who: str, frames: int) -> Scene:
 
 def render_frames(scene: Scene, seed: int) -> Iterator[tuple[Frame, Truth]]:
     """Yield the frames of a scene, each at rest at its own uniformly random attitude."""
-    testbed = build_testbed(scene)
+    lab = build_lab(scene)
     for n in range(scene.exposure.frames):
         cam_from_icrs = Rotation.random(rng=np.random.default_rng([seed, n]))
-        still = Trajectory.at_rest(cam_from_icrs.inv() * testbed.mount.cam_from_body, testbed.duration_s)
-        yield render_frame(replace(testbed, trajectory=still), n)
+        still = Trajectory.at_rest(cam_from_icrs.inv() * lab.camera.mount.cam_from_body, lab.duration_s)
+        yield render_frame(replace(lab, trajectory=still), n)
 
 
 def lattice(width_px: int, height_px: int) -> NDArray:

@@ -17,8 +17,8 @@ from skysim.experiments.configs import with_config
 from skysim.results import metrics, scoring
 from skysim.scene.scene import Scene
 from skysim.simulation import run
+from skysim.simulation.lab import Lab, build_tracker
 from skysim.simulation.run import FrameResult
-from skysim.simulation.testbed import Testbed, build_tracker
 from skysim.tracking import factory
 from skysim.tracking.external.interface import FAILED, SOLVED
 
@@ -49,17 +49,17 @@ class TrackerScore:
     refusals: dict[str, int]
 
 
-def build_trackers(testbed: Testbed, names: Sequence[str]) -> dict[str, factory.Estimator]:
+def build_trackers(lab: Lab, names: Sequence[str]) -> dict[str, factory.Estimator]:
     """Set up the trackers by name, all with the scene's tracker options and onboard model. Raises InputError."""
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
         raise InputError(f"--tracker {repeated[0]}: given twice; allowed: once")
-    scenes = {name: with_config(testbed.scene, "tracker", name=name) for name in names}
-    return {name: build_tracker(replace(testbed, scene=scene)) for name, scene in scenes.items()}
+    scenes = {name: with_config(lab.scene, "tracker", name=name) for name in names}
+    return {name: build_tracker(replace(lab, scene=scene)) for name, scene in scenes.items()}
 
 
 def compare_frames(
-    testbed: Testbed, estimators: Mapping[str, factory.Estimator]
+    lab: Lab, estimators: Mapping[str, factory.Estimator]
 ) -> Iterator[tuple[Frame, Truth, dict[str, FrameRow]]]:
     """Yield each frame with its truth and the row of each tracker.
 
@@ -69,13 +69,13 @@ def compare_frames(
     order = list(estimators)
     closed_loop_tracker = order[0]  # the tracker whose solutions updated the attitude filter
     for name in order:
-        run.warm_up(testbed, estimators[name])
-    for frame, truth, seconds in run.render_frames(testbed):
+        run.warm_up(lab, estimators[name])
+    for frame, truth, seconds in run.render_frames(lab):
         rows = {}
         for name in order:
-            report = testbed.reports.get(frame.index) if name == closed_loop_tracker else None
+            report = lab.reports.get(frame.index) if name == closed_loop_tracker else None
             report = report or factory.solve_frame(estimators[name], frame)
-            rows[name] = scoring.row(FrameResult(frame, truth, report, seconds), testbed.scene, testbed.mount)
+            rows[name] = scoring.row(FrameResult(frame, truth, report, seconds), lab.scene, lab.camera.mount)
         yield frame, truth, rows
         order.append(order.pop(0))
 

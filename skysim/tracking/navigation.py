@@ -95,10 +95,16 @@ class Navigation:
             compensation = self.earth_body_rad_s(self.attitude_wxyz("filter"))
             self.filter.propagate(ends_s, measured.angle_rad - compensation * self.step_s, measured.saturated)
 
-    def imu_samples(self) -> imu.Increments:
-        """The IMU samples that are kept."""
+    def imu_samples(self, since_s: float = -math.inf) -> imu.Increments:
+        """The kept IMU samples from about this time on: whole control periods."""
+        if not self.measured:
+            none = np.zeros((0, 3))
+            return imu.Increments(np.zeros(0), self.step_s, none, none, np.zeros(0, bool), np.zeros(0, bool))
+        first = len(self.measured) - 1
+        while first > 0 and self.measured[first - 1].t_s[-1] >= since_s:
+            first -= 1
         columns = zip(
-            *((m.t_s, m.angle_rad, m.velocity_m_s, m.saturated, m.overloaded) for m in self.measured),
+            *((m.t_s, m.angle_rad, m.velocity_m_s, m.saturated, m.overloaded) for m in self.measured[first:]),
             strict=True,
         )
         t_s, angle, velocity, saturated, overloaded = (np.concatenate(column) for column in columns)

@@ -15,7 +15,7 @@ from skysim.scene import loader
 from skysim.scene.sections.camera import BaffleConfig
 from skysim.scene.sections.orbit import EarthConfig
 from skysim.simulation.exposure import render_frame, stray_light_e_s
-from skysim.simulation.testbed import Testbed, bodies_during, build_testbed
+from skysim.simulation.lab import Lab, bodies_during, build_lab
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
 BAND = Band.from_efficiency(0.5)  # flat from 400 to 1000 nm
@@ -34,34 +34,34 @@ def sphere(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(earth_glow, "AIR_M", 1.0)
 
 
-def in_space(ra_deg: float, dec_deg: float, **keys: str) -> Testbed:
+def in_space(ra_deg: float, dec_deg: float, **keys: str) -> Lab:
     start = f"{{ra_deg: {ra_deg}, dec_deg: {dec_deg}, roll_deg: 0}}"
     given = {"camera.baffle": TABLE, "motion.start": start, "start_time": "2012-06-24T21:00:00", "background": "[]"}
     overrides = given | {key.replace("__", "."): value for key, value in keys.items()}
-    testbed = build_testbed(loader.load("shefex2", overrides))
-    return testbed.at_rest(testbed.trajectory.lab_from_body[0], 0)
+    lab = build_lab(loader.load("shefex2", overrides))
+    return lab.at_rest(lab.start, 0)
 
 
-def stray_of(testbed: Testbed, t_s: float = 0.0) -> dict[str, float]:
-    cam_from_lab = testbed.mount.cam_from_body * testbed.trajectory.lab_from_body[0].inv()
-    return stray_light_e_s(testbed, bodies_during(testbed, t_s), cam_from_lab, t_s)
+def stray_of(lab: Lab, t_s: float = 0.0) -> dict[str, float]:
+    cam_from_lab = lab.camera.mount.cam_from_body * lab.start.inv()
+    return stray_light_e_s(lab, bodies_during(lab, t_s), cam_from_lab, t_s)
 
 
 def test_the_sun_s_light_is_its_irradiance_times_the_transmittance() -> None:
     """1361 W/m2 of a black body of 5772 K, counted in photons: Kopp & Lean 2011; V = -26.74 gives 4 % more."""
-    testbed = in_space(90.0, -20.0, light__bodies="{moon: false, planets: false}")
-    sun = bodies_during(testbed, 0.0)[0]
+    lab = in_space(90.0, -20.0, light__bodies="{moon: false, planets: false}")
+    sun = bodies_during(lab, 0.0)[0]
     m = np.linalg.norm(np.cross(sun.place.direction, [0.0, np.cos(np.radians(20)), np.sin(np.radians(-20))]))
     angle_deg = np.degrees(np.arcsin(m))
     assert 40 < angle_deg < 50
     wavelength_m = np.linspace(100e-9, 100e-6, 400_001)
     power = wavelength_m**-5 / np.expm1(0.014387769 / (wavelength_m * 5772))
     power *= 1361 / integrate.simpson(power, x=wavelength_m) / 1.0165**2  # aphelion was ten days later
-    response = np.interp(wavelength_m, testbed.band.wavelength_m, testbed.band.response, left=0, right=0)
+    response = np.interp(wavelength_m, lab.camera.band.wavelength_m, lab.camera.band.response, left=0, right=0)
     electrons = integrate.simpson(power * wavelength_m / 1.98644586e-25 * response, x=wavelength_m)
     pst = 10 ** (-3 - 4 * (angle_deg - 20) / 30)
-    expected = electrons * pst * testbed.scene.camera.pixel_m**2
-    assert stray_of(testbed)["sun"] == pytest.approx(expected, rel=0.05)
+    expected = electrons * pst * lab.scene.camera.pixel_m**2
+    assert stray_of(lab)["sun"] == pytest.approx(expected, rel=0.05)
 
 
 @pytest.mark.parametrize("phase_deg", [0.0, 70.0, 130.0])
@@ -125,8 +125,8 @@ def test_a_frame_has_the_stray_light_in_every_pixel() -> None:
 @pytest.mark.slow
 def test_the_light_follows_the_orbit_and_the_date() -> None:
     """The Sun's is none behind the Earth; the Earth's is strongest over the day side; both change with the season."""
-    testbed = in_space(90.0, 60.0, light__bodies="{}", orbit=ORBIT)
-    around = [stray_of(testbed, t_s) for t_s in range(0, 5670, 210)]
+    lab = in_space(90.0, 60.0, light__bodies="{}", orbit=ORBIT)
+    around = [stray_of(lab, t_s) for t_s in range(0, 5670, 210)]
     assert 0.55 < np.mean(["sun" in one for one in around]) < 1
     earth = np.array([one["earth"] for one in around])
     assert earth.max() > 100 * earth.min()
@@ -137,9 +137,9 @@ def test_the_light_follows_the_orbit_and_the_date() -> None:
 
 def test_a_body_below_the_skyline_gives_no_light() -> None:
     site = {"site": "{latitude_deg: 53, longitude_deg: 9}", "light__air": "{}", "light__bodies": "{planets: false}"}
-    testbed = in_space(250.0, 60.0, **site, start_time="2012-06-24T23:00:00")
-    assert "sun" not in stray_of(testbed)
-    assert stray_of(testbed, 12 * 3600.0)["sun"] > 0
+    lab = in_space(250.0, 60.0, **site, start_time="2012-06-24T23:00:00")
+    assert "sun" not in stray_of(lab)
+    assert stray_of(lab, 12 * 3600.0)["sun"] > 0
 
 
 def test_no_body_gives_no_light() -> None:

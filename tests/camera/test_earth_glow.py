@@ -11,7 +11,7 @@ from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.scene import loader
 from skysim.scene.sections.orbit import EarthConfig
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 
 BAND = Band.from_efficiency("interline")
@@ -66,10 +66,10 @@ def test_the_limb_is_where_its_dip_says() -> None:
         "exposure.time": "10 us",
         "background": "[]",
     }
-    testbed = build_testbed(loader.load("shefex2", keys | {"start_time": "2012-06-22T09:00:00"}))
-    testbed = testbed.at_rest(testbed.trajectory.lab_from_body[0], 0)
-    frame, _ = render_frame(testbed, 0)
-    camera, image = testbed.scene.camera, frame.image_dn
+    lab = build_lab(loader.load("shefex2", keys | {"start_time": "2012-06-22T09:00:00"}))
+    lab = lab.at_rest(lab.start, 0)
+    frame, _ = render_frame(lab, 0)
+    camera, image = lab.scene.camera, frame.image_dn
     middle = image[:, round(camera.center_px[0])] - image.min()
     assert middle.max() > 0
     rows = np.flatnonzero(middle > middle.max() / 2)

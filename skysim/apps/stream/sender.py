@@ -14,7 +14,8 @@ from skysim.apps.stream.pacing import Pace
 from skysim.apps.stream.packet import Packet, build_packet
 from skysim.apps.stream.sinks import Sink
 from skysim.simulation import run
-from skysim.simulation.testbed import Testbed, exposure_window
+from skysim.simulation.lab import Lab
+from skysim.simulation.timing import exposure_window
 
 DELAY_WINDOW = 10_000  # newest delays from which the quantiles are computed
 
@@ -51,18 +52,18 @@ class SenderStats:
 
 
 def send(
-    testbed: Testbed, pace: Pace, sinks: list[Sink], stats: SenderStats, publish: Callable[[Packet], None] | None = None
+    lab: Lab, pace: Pace, sinks: list[Sink], stats: SenderStats, publish: Callable[[Packet], None] | None = None
 ) -> None:
-    """Simulate a testbed and send each frame when it is due, until the last frame or until all sinks have failed.
+    """Simulate a lab and send each frame when it is due, until the last frame or until all sinks have failed.
 
     Late frames are dropped, unless pacing is off or the scene has a filter: then the loop needs every frame.
-    testbed: as built, before its motion is simulated;  publish : also called with each packet
+    lab: as built, before its motion is simulated;  publish : also called with each packet
     """
-    may_drop = testbed.scene.filter is None
-    for captured in run.live(testbed, None, pace.is_on_time if may_drop else None):
+    may_drop = lab.scene.filter is None
+    for captured in run.live(lab, None, pace.is_on_time if may_drop else None):
         frame = captured.frame
-        window = exposure_window(testbed.scene, frame.index, frame.exposure_s)
-        end_s = window.close_s(testbed.scene.camera.height_px)  # with a rolling shutter, of the last row
+        window = exposure_window(lab.scene, frame.index, frame.exposure_s)
+        end_s = window.close_s(lab.scene.camera.height_px)  # with a rolling shutter, of the last row
         if pace.zero_s is None:
             pace.start(end_s)  # so that the first frame has no delay
         pace.wait(end_s)
@@ -76,4 +77,4 @@ def send(
         stats.record(1e3 * (now_s - due_s), dropped)
         if sinks and not publish and all(sink.fault for sink in sinks):
             return
-    stats.dropped = testbed.scene.exposure.frames - stats.rendered  # and those after the last rendered
+    stats.dropped = lab.scene.exposure.frames - stats.rendered  # and those after the last rendered

@@ -22,7 +22,7 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.motion import MotionConfig
 from skysim.simulation import run
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 
 YAWS_DEG = (0.0, 120.0, 240.0)
 AXES_DEG = (0.0, 90.0, 45.0)  # of the tilting at each of these, from body x
@@ -127,9 +127,9 @@ def fly(scene: Scene, assumptions: Assumptions, uncertainty: Uncertainty, watch:
 
     The frames from the first one near the tilt stop on are left out, because the torque of a contact is unknown.
     """
-    testbed = run.simulate_motion(build_testbed(scene), watch)
-    rows = measured_attitudes(testbed, watch)
-    vehicle, log = testbed.vehicle, testbed.log
+    lab = run.simulate_motion(build_lab(scene), watch)
+    rows = measured_attitudes(lab, watch)
+    vehicle, log = lab.vehicle, lab.log
     tilts_deg = np.array([multibody.tilt_deg(attitude) for _, attitude, *_ in rows])
     contact = np.flatnonzero(tilts_deg > scene.vehicle.tilt_stop_deg - STOP_MARGIN_DEG)
     kept = rows[: contact[0]] if len(contact) else rows
@@ -150,16 +150,14 @@ def fly(scene: Scene, assumptions: Assumptions, uncertainty: Uncertainty, watch:
         *vehicle.trims.added(vehicle.trims.position_m),
         np.array(shared),
     )
-    return Flight(record, vehicle, testbed.scene.exposure.frames, len(rows), len(rows) - len(kept))
+    return Flight(record, vehicle, lab.scene.exposure.frames, len(rows), len(rows) - len(kept))
 
 
-def measured_attitudes(
-    testbed: Testbed, watch: ProgressCallback | None
-) -> list[tuple[float, Rotation, Floats, Floats]]:
+def measured_attitudes(lab: Lab, watch: ProgressCallback | None) -> list[tuple[float, Rotation, Floats, Floats]]:
     """Of every frame that the tracker solved: time, attitude, (3, 3) covariance in body axes, and its shared part."""
-    body_from_cam = testbed.mount.cam_from_body.inv()
+    body_from_cam = lab.camera.mount.cam_from_body.inv()
     R_body_from_cam, rows = body_from_cam.as_matrix(), []
-    for result in run.run(testbed, build_tracker(testbed)):
+    for result in run.run(lab, build_tracker(lab.camera)):
         attitude = result.report.attitude
         if attitude.cam_from_ref is not None and attitude.covariance_rad2 is not None:
             systematic = np.zeros((3, 3)) if attitude.systematic_rad2 is None else attitude.systematic_rad2
@@ -168,7 +166,7 @@ def measured_attitudes(
             )
             rows.append((result.frame.t_mid_s, (body_from_cam * attitude.cam_from_ref).inv(), covariance, shared))
         if watch:
-            watch(result.frame.index + 1, testbed.scene.exposure.frames)
+            watch(result.frame.index + 1, lab.scene.exposure.frames)
     return rows
 
 

@@ -36,7 +36,7 @@ from skysim.apps.cli.options import (
 
 if TYPE_CHECKING:
     from skysim.core.types import FrameRow
-    from skysim.simulation.testbed import Testbed
+    from skysim.simulation.lab import Lab
 
 
 def run(
@@ -62,28 +62,28 @@ def run(
     from skysim.results.run import Recorder, score_frames
     from skysim.simulation.checks import check
     from skysim.simulation.compilation import on_two_processes
+    from skysim.simulation.lab import build_lab
     from skysim.simulation.run import simulate_motion
-    from skysim.simulation.testbed import build_testbed
 
     stages = selected_stages(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
     if tracker is not None:
         stages["name"] = tracker
     loaded = load(scene, frames, seed, [*(set_ or []), *(f"tracker.{key}={name}" for key, name in stages.items())])
-    testbed = build_testbed(loaded, used_programs(program, scene_names(loaded)))
-    plan = check(testbed)
+    lab = build_lab(loaded, used_programs(program, scene_names(loaded)))
+    plan = check(lab)
     for finding in plan.findings:
         terminal.print_error(with_location(finding))
     with on_two_processes(*LOADED[-1]):
         with terminal.progress_callback("simulating the motion") as update:
-            testbed = simulate_motion(testbed, update)
-        scored = terminal.eager_first(score_frames(testbed))
-    recorder = Recorder(output_folder(out, loaded.name), testbed, plan)
+            lab = simulate_motion(lab, update)
+        scored = terminal.eager_first(score_frames(lab))
+    recorder = Recorder(output_folder(out, loaded.name), lab, plan)
     for frame in terminal.progress(scored, loaded.exposure.frames, loaded.title):
         recorder.add(frame)
-    views = terminal.write_3d_views(testbed, recorder.folder) if scene_3d else []
+    views = terminal.write_3d_views(lab, recorder.folder) if scene_3d else []
     command = shlex.join(["skysim", *sys.argv[1:]])
     statistics = recorder.finish(command, views)
-    heads = run_heads(testbed, recorder.folder, command)
+    heads = run_heads(lab, recorder.folder, command)
     if json:
         rows = {"rows": [asdict(row) for row in recorder.rows]}
         terminal.print_json({"scene": loaded.name, **statistics, **rows, **({"heads": heads} if heads else {})})
@@ -99,12 +99,12 @@ def run(
         typer.launch(statistics["report"])
 
 
-def run_heads(testbed: Testbed, folder: Path, command: str) -> dict[str, dict[str, Any]]:
+def run_heads(lab: Lab, folder: Path, command: str) -> dict[str, dict[str, Any]]:
     """Render, solve and write the frames of the further star cameras, each to its folder; their statistics by name."""
     from skysim.results.run import Recorder, score_frames
 
     statistics = {}
-    for config, head in zip(testbed.scene.heads, testbed.heads, strict=True):
+    for config, head in zip(lab.scene.heads, lab.cameras[1:], strict=True):
         recorder = Recorder(folder / config.name, head)
         for frame in terminal.progress(score_frames(head), head.scene.exposure.frames, config.name):
             recorder.add(frame)
@@ -127,17 +127,17 @@ def render(
     from skysim.results.run import Recorder
     from skysim.simulation import run as simulation
     from skysim.simulation.checks.dome import assumptions
-    from skysim.simulation.testbed import build_testbed
+    from skysim.simulation.lab import build_lab
 
     loaded = load(scene, frames, seed, set_)
-    testbed = build_testbed(loaded)
-    if warning := assumptions.camera_outside_warning(loaded, testbed.mount):
+    lab = build_lab(loaded)
+    if warning := assumptions.camera_outside_warning(loaded, lab.camera.mount):
         terminal.print_error(warning)
     with terminal.progress_callback("simulating the motion") as update:
-        testbed = simulation.simulate_motion(testbed, update)
+        lab = simulation.simulate_motion(lab, update)
     folder, paths = output_folder(out, loaded.name), list[str]()
     folders = [folder, *(folder / head.name for head in loaded.heads)]
-    for camera, own_folder in zip(testbed.cameras, folders, strict=True):
+    for camera, own_folder in zip(lab.cameras, folders, strict=True):
         rendered = terminal.eager_first(simulation.render_frames(camera))
         recorder = Recorder(own_folder, camera)
         paths += [
@@ -164,15 +164,15 @@ def compare(
     from skysim.experiments import tracker_comparison
     from skysim.results.run import Recorder
     from skysim.simulation import run as simulation
-    from skysim.simulation.testbed import build_testbed
+    from skysim.simulation.lab import build_lab
 
     loaded = load(scene, frames, seed, set_, tracker)
-    testbed = build_testbed(loaded, used_programs(program, [*tracker, *scene_names(loaded)]))
-    entrants = tracker_comparison.build_trackers(testbed, tracker)
+    lab = build_lab(loaded, used_programs(program, [*tracker, *scene_names(loaded)]))
+    entrants = tracker_comparison.build_trackers(lab, tracker)
     with terminal.progress_callback("simulating the motion", quiet=json) as update:
-        testbed = simulation.simulate_motion(testbed, update)
-    solved = terminal.eager_first(tracker_comparison.compare_frames(testbed, entrants))
-    recorder = Recorder(output_folder(out, loaded.name), testbed)
+        lab = simulation.simulate_motion(lab, update)
+    solved = terminal.eager_first(tracker_comparison.compare_frames(lab, entrants))
+    recorder = Recorder(output_folder(out, loaded.name), lab)
     rows: dict[str, list[FrameRow]] = {name: [] for name in entrants}
     for frame, truth, row_by_tracker in terminal.progress(solved, loaded.exposure.frames, loaded.title, quiet=json):
         recorder.write(frame, truth)

@@ -47,7 +47,7 @@ def stream(
     from skysim.apps.stream.pacing import Pace
     from skysim.apps.stream.sinks import READER_GONE, Sink, folder_writer, pipe_writer
     from skysim.core.io import files
-    from skysim.simulation.testbed import build_testbed
+    from skysim.simulation.lab import build_lab
 
     if folder is None and http is None and pipe is None:
         raise InputError("skysim stream: no output; give --folder DIR, --http PORT or --pipe PATH")
@@ -55,16 +55,16 @@ def stream(
         raise InputError(f"--host {host}: has no effect without --http; allowed: --http PORT --host {host}")
     if endless and frames is not None:
         raise InputError("skysim stream: give either --frames N or --endless")
-    testbed = replace(build_testbed(load(scene, frames, seed, set_)), endless=endless)
+    lab = replace(build_lab(load(scene, frames, seed, set_)), endless=endless)
     sinks = []
     if folder is not None:
         sinks.append(Sink("folder", folder_writer(folder)))
     if pipe is not None:
         sinks.append(Sink("pipe", pipe_writer(pipe)))
-    stats, pace = sender.SenderStats(), Pace(speed, testbed.scene.exposure.rate_hz)
+    stats, pace = sender.SenderStats(), Pace(speed, lab.scene.exposure.rate_hz)
     with serving(http, host, lambda: stats.statistics(sinks)) as hub:
         try:
-            sender.send(testbed, pace, sinks, stats, hub.publish if hub else None)
+            sender.send(lab, pace, sinks, stats, hub.publish if hub else None)
         except KeyboardInterrupt:
             print(file=sys.stderr)
         finally:

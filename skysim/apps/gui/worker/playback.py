@@ -19,8 +19,9 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, Telemetry
 from skysim.results import telemetry_report
 from skysim.simulation import exposure, run
+from skysim.simulation.lab import Lab, build_tracker
 from skysim.simulation.run import FrameResult
-from skysim.simulation.testbed import Testbed, build_tracker, exposure_window
+from skysim.simulation.timing import exposure_window
 
 MAX_POINTS = 500  # of a curve on the page, roughly
 FLOOR = 1e-3  # arcsec; lower limit of values on a logarithmic axis
@@ -45,12 +46,12 @@ class Flight:
     Its computation is a series of short steps, so that the worker does other tasks between them.
 
     file : pixels of the first frames, so that playing them costs no rendering;  shown : number of the shown frame
-    moved : the testbed after the simulation of its motion, None before;  told : number of frames reported by `advance`
+    moved : the lab after the simulation of its motion, None before;  told : number of frames reported by `advance`
     """
 
     def __init__(self, bench: Workbench) -> None:
         self.bench, self.frames, self.file = bench, list[KeptFrame](), tempfile.TemporaryFile()  # noqa: SIM115
-        self.moved: Testbed | None = None
+        self.moved: Lab | None = None
         self.shown: int | None = None
         self.told, self.told_log = 0, False
         self.progress = (0.0, 1.0)
@@ -58,7 +59,7 @@ class Flight:
 
     def compute(self) -> Iterator[tuple[float, float]]:
         """Simulate the motion, then render and solve every frame; yields (done, total) of either."""
-        self.moved = yield from run.motion_steps(self.bench.testbed)
+        self.moved = yield from run.motion_steps(self.bench.lab)
         count = self.moved.scene.exposure.frames
         yield 0, count
         tracker = build_tracker(self.moved)
@@ -148,7 +149,7 @@ def curves(log: Telemetry) -> MotionLog:
     return MotionLog(tuple(log.t_s[::every].tolist()), thinned)
 
 
-def filter_errors(moved: Testbed, result: FrameResult, t_s: float) -> tuple[float, float]:
+def filter_errors(moved: Lab, result: FrameResult, t_s: float) -> tuple[float, float]:
     """Error of the filter, and angle between the star tracker's attitude and the filter's, arcsec; NaN if none."""
     log = moved.log
     if log.lab_from_filter is None:

@@ -116,7 +116,7 @@ class Worker:
         """Set up a scene and render a first frame; angles_deg : of another attitude than the kept one or the start."""
         bench = Workbench.open(scene, overrides, self.current)
         if angles_deg is not None:
-            bench.lab_from_body = pointing.from_angles(bench.scene, bench.testbed.mount, angles_deg)
+            bench.lab_from_body = pointing.from_angles(bench.scene, bench.lab.camera.mount, angles_deg)
         self.current = bench
         self.scene, self.overrides, self.flight, self.pushed = scene, dict(overrides), None, None
         surveyed = self.surveyed is not None and self.surveyed.is_of(bench.scene)
@@ -128,12 +128,14 @@ class Worker:
 
     def point(self, angles_deg: Triple, solve: bool) -> FrameView:
         bench = self.workbench
-        bench.lab_from_body = pointing.from_angles(bench.scene, bench.testbed.mount, angles_deg)
+        bench.lab_from_body = pointing.from_angles(bench.scene, bench.lab.camera.mount, angles_deg)
         return self.render(solve)
 
     def move(self, right: float, up: float, roll_deg: float, solve: bool) -> FrameView:
         bench = self.workbench
-        bench.lab_from_body = pointing.moved(bench.scene, bench.testbed.mount, bench.lab_from_body, right, up, roll_deg)
+        bench.lab_from_body = pointing.moved(
+            bench.scene, bench.lab.camera.mount, bench.lab_from_body, right, up, roll_deg
+        )
         return self.render(solve)
 
     def push(self, grip: Grip | None, elapsed_s: float, solve: bool) -> PushedView:
@@ -143,7 +145,7 @@ class Worker:
         """
         bench = self.workbench
         if self.pushed is None or self.pushed.lab_from_body is not bench.lab_from_body:
-            self.pushed = Push(bench.testbed, bench.lab_from_body)
+            self.pushed = Push(bench.lab, bench.lab_from_body)
         self.pushed.advance(grip, elapsed_s)
         bench.lab_from_body = self.pushed.lab_from_body
         view = bench.render(self.pushed.seen(bench.next_run()), solve)
@@ -152,10 +154,10 @@ class Worker:
         return PushedView(view, float(np.linalg.norm(self.pushed.torque_nm)), math.degrees(rate_rad_s))
 
     def check(self) -> PlanCheck:
-        return planning.check(self.workbench.testbed)
+        return planning.check(self.workbench.lab)
 
     def ambiguity(self) -> AmbiguityMap:
-        return planning.ambiguity(self.workbench.testbed)
+        return planning.ambiguity(self.workbench.lab)
 
     def plan_survey(self, frames: int) -> SurveyPlan:
         """Begin a survey of the scene's dome."""

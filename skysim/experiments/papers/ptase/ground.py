@@ -29,7 +29,7 @@ from skysim.results.metrics import WRONG_RAD, extremum, proportion, rms
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
 from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.sources import stars
 from skysim.tracking import factory
 
@@ -109,13 +109,13 @@ def uncalibrated_overrides(direction_rad: float) -> dict[str, str]:
 
 def photograph_and_solve(overrides: dict[str, str], local: list[datetime.datetime], seed: int) -> FrameSolutions:
     """Render and solve a frame at each time from the Earth-fixed camera."""
-    testbed = build_testbed(loader.load("ptase_2003", NIGHT | overrides))
-    tracker, tripod = build_tracker(testbed), cam_from_itrs()
+    lab = build_lab(loader.load("ptase_2003", NIGHT | overrides))
+    tracker, tripod = build_tracker(lab.camera), cam_from_itrs()
     estimated_deg, true_deg = np.full((len(local), 3), np.nan), np.empty((len(local), 3))
     error_rad = np.full(len(local), np.nan)
     for n, time in enumerate(local):
         cam_from_icrs = tripod * itrs_from_icrs(time)
-        testbed_at_time = earth_fixed(at_time(testbed.in_run(seed + n), time), cam_from_icrs)
+        testbed_at_time = earth_fixed(at_time(lab.in_run(seed + n), time), cam_from_icrs)
         frame, _ = exposure.render_frame(testbed_at_time, 0)
         solution = factory.solve_frame(tracker, frame).attitude
         true_deg[n] = paper_angles_deg(cam_from_icrs)
@@ -125,19 +125,19 @@ def photograph_and_solve(overrides: dict[str, str], local: list[datetime.datetim
     return FrameSolutions(local, estimated_deg, true_deg, error_rad)
 
 
-def at_time(testbed: Testbed, local: datetime.datetime) -> Testbed:
+def at_time(lab: Lab, local: datetime.datetime) -> Lab:
     """The test bed under the air and the Moon of a local time."""
-    return replace(testbed, scene=testbed.scene.model_copy(update={"start_time": local + UTC_LESS_LOCAL}))
+    return replace(lab, scene=lab.scene.model_copy(update={"start_time": local + UTC_LESS_LOCAL}))
 
 
-def earth_fixed(testbed: Testbed, cam_from_icrs: Rotation) -> Testbed:
-    """Testbed with a motion around the first frame's exposure: the given attitude at mid-exposure, rotation at the
+def earth_fixed(lab: Lab, cam_from_icrs: Rotation) -> Lab:
+    """Lab with a motion around the first frame's exposure: the given attitude at mid-exposure, rotation at the
     sidereal rate, and the scene's vibration."""
-    body_at_middle = cam_from_icrs.inv() * testbed.mount.cam_from_body
+    body_at_middle = cam_from_icrs.inv() * lab.camera.mount.cam_from_body
     # The sky turns at the sidereal rate about the celestial pole, the z axis of ICRS (precession neglected).
     rate_body = EARTH_RATE_RAD_S * body_at_middle.inv().apply([0.0, 0.0, 1.0])
-    vibration = Vibration.draw(testbed.scene.motion, random_stream(testbed.scene.seed, JITTER, 0))
-    return replace(testbed, trajectory=vibration.add_to(constant_rate(testbed.scene, body_at_middle, rate_body)))
+    vibration = Vibration.draw(lab.scene.motion, random_stream(lab.scene.seed, JITTER, 0))
+    return replace(lab, trajectory=vibration.add_to(constant_rate(lab.scene, body_at_middle, rate_body)))
 
 
 def table_2(options: ExperimentOptions) -> ExperimentResult:

@@ -26,7 +26,7 @@ from skysim.results.plots import INK, MARKS
 from skysim.scene.loader import load
 from skysim.scene.sections.light import UniformGlowConfig
 from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking.exposure_control import ExposureController
 
 REPEATS = 15
@@ -119,31 +119,31 @@ class ExposureLoop:
         defaults = {"tracker.exposure_control": f"{{mean_dn: {MEAN_DN}}}", "tracker.detector": "sequential"}
         fixed = exposure_override(start_ms) | {"tracker.brightest": str(MAX_CENTROIDS)}
         scene = load("shefex2", defaults | overrides | fixed)
-        self.testbed = replace(build_testbed(scene), trajectory=Trajectory.at_rest(lab_from_body, 100.0))
+        self.lab = replace(build_lab(scene), trajectory=Trajectory.at_rest(lab_from_body, 100.0))
         self.controller, self.frames = ExposureController(scene), 0
 
     def take_frame(self, glare_e_s: float = 0.0, planets: int = 0) -> float:
         """Render a frame with stray light and planets; return the next commanded exposure time in ms."""
-        testbed = self.testbed
+        lab = self.lab
         if glare_e_s:
-            glow = (*testbed.scene.background, UniformGlowConfig(kind="uniform", e_s=glare_e_s))
-            testbed = replace(testbed, scene=testbed.scene.model_copy(update={"background": glow}))
+            glow = (*lab.scene.background, UniformGlowConfig(kind="uniform", e_s=glare_e_s))
+            lab = replace(lab, scene=lab.scene.model_copy(update={"background": glow}))
         if planets:
-            testbed = replace(testbed, sources=with_planets(testbed, planets))
-        frame, _ = exposure.render_frame(testbed, self.frames, exposure_s=self.controller.exposure_s)
+            lab = replace(lab, sources=with_planets(lab, planets))
+        frame, _ = exposure.render_frame(lab, self.frames, exposure_s=self.controller.exposure_s)
         self.frames += 1
         self.controller.update(frame)
         return 1e3 * self.controller.exposure_s
 
 
-def with_planets(testbed: Testbed, count: int) -> Sources:
+def with_planets(lab: Lab, count: int) -> Sources:
     """The light sources, with the `count` brightest stars well inside the detector raised to a planet's magnitude."""
-    visible, size_px = exposure.render_frame(testbed, 0)[1].sources, np.array(testbed.canvas.shape[::-1])
+    visible, size_px = exposure.render_frame(lab, 0)[1].sources, np.array(lab.camera.canvas.shape[::-1])
     inside = np.all((visible.xy_px > EDGE_PX) & (visible.xy_px < size_px - EDGE_PX), axis=1)
     chosen = visible.id[inside][np.argsort(-visible.electrons[inside])[:count]]
-    is_planet = np.isin(testbed.sources.id, chosen)
-    factor = np.where(is_planet, 10 ** (0.4 * (testbed.sources.magnitude - PLANET_MAG)), 1.0)
-    return replace(testbed.sources, strength=testbed.sources.strength * factor)
+    is_planet = np.isin(lab.camera.sources.id, chosen)
+    factor = np.where(is_planet, 10 ** (0.4 * (lab.camera.sources.magnitude - PLANET_MAG)), 1.0)
+    return replace(lab.camera.sources, strength=lab.camera.sources.strength * factor)
 
 
 def random_attitudes(count: int, seed: int) -> Rotation:

@@ -63,7 +63,7 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
         frames.remove_results(file_io.make_folder(folder))
         try:
             for frame, truth, report in islice(replayed_frames(setup, row.seed), MAX_FRAMES):
-                frames.write_frame(folder, frame, truth, setup.testbed.scene)
+                frames.write_frame(folder, frame, truth, setup.lab.scene)
                 files.append(folder / f"frame_{frame.index:04d}.fits")
                 pictures.append(folder / f"frame_{frame.index:04d}.annotated.png")
                 match, xy_px = report.attitude.match, report.centroids.xy_px
@@ -90,8 +90,8 @@ def replayed_frames(setup: Setup, seed: int) -> Iterator[tuple[Frame, Truth, Rep
         frame, truth, _ = trials.render_trial_frame(setup._replace(trial=frame_trial), seed)
         yield frame, truth, solve_or_failed(lambda: trials.solved_centroids(setup, [seed])[0][1])
     elif isinstance(trial, FlightTrial):
-        testbed = run.simulate_motion(trials.flight_testbed(setup, seed))
-        for result in run.run(testbed, setup.estimator):
+        lab = run.simulate_motion(trials.flight_testbed(setup, seed))
+        for result in run.run(lab, setup.estimator):
             yield result.frame, result.truth, result.report
     else:
         frame, truth, streak_px = trials.render_trial_frame(setup, seed)

@@ -18,7 +18,7 @@ from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.plan import Trial, TrialSpec, digest, resolve_point
 from skysim.scene.loader import file_names
 from skysim.scene.scene import Scene
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking import factory
 from skysim.tracking.external.interface import TRACKERS
 
@@ -28,7 +28,7 @@ CACHE_SIZE = 4  # setups that a worker caches
 class Setup(NamedTuple):
     """A scene prepared for trials: hardware without simulated motion, tracker with its index, trial, scene hash."""
 
-    testbed: Testbed
+    lab: Lab
     estimator: factory.Estimator
     trial: Trial
     scene_hash: str
@@ -68,14 +68,14 @@ def build_setup(spec: TrialSpec, settings: Settings) -> Setup:
     scene, trial = resolve_point(spec, settings)
     hash_ = scene_hash(scene)
     for setup in CACHE.setups.values():
-        if setup.scene_hash == hash_ and setup.testbed.programs == spec.programs:
+        if setup.scene_hash == hash_ and setup.lab.programs == spec.programs:
             return setup._replace(trial=trial)
     # A test bed whose scene differs only in section `tracker` has the same hardware.
-    cached = (setup.testbed for setup in CACHE.setups.values())
+    cached = (setup.lab for setup in CACHE.setups.values())
     same = (one for one in cached if one.scene.model_copy(update={"tracker": scene.tracker}) == scene)
-    testbed = next(same, None) or build_testbed(scene, spec.programs)
-    testbed = replace(testbed, scene=scene, programs=spec.programs)
-    return Setup(testbed, build_tracker(testbed), trial, hash_)
+    lab = next(same, None) or build_lab(scene, spec.programs)
+    lab = replace(lab, scene=scene, programs=spec.programs)
+    return Setup(lab, build_tracker(lab.camera), trial, hash_)
 
 
 def scene_hash(scene: Scene) -> str:

@@ -27,7 +27,7 @@ from skysim.experiments.dome_survey.survey_run import SurveyRun
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import HoldConfig, SlewConfig
 from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 from skysim.tracking import dome_map_file, onboard_model
 from skysim.tracking import settings as tracker_settings
 
@@ -41,13 +41,13 @@ UNCERTAINTY = prior.survey_uncertainty()  # that `skysim survey` assumes
 class Survey:
     """A survey of a scene's dome, with the uncertainties that `skysim survey` assumes.
 
-    testbed, before : with the errors of the onboard model before the survey, and this model
+    lab, before : with the errors of the onboard model before the survey, and this model
     noise_px : standard deviation of a centroid's coordinates, by which attitudes are chosen
     taken : the frames that were flown;  run : the newest adjustment that succeeded
     """
 
     scene: Scene
-    testbed: Testbed
+    lab: Lab
     before: CalibrationPrior
     noise_px: float
     taken: list[TakenFrame] = field(default_factory=list)
@@ -73,7 +73,7 @@ class Survey:
             run, refusal = None, str(error)
             so_far = findings.coverage_before(frames, self.before, UNCERTAINTY, self.noise_px)
         counts = findings.coverage_statistics(so_far)
-        truth = report.truth_statistics(run, self.before, self.testbed) if run else {}
+        truth = report.truth_statistics(run, self.before, self.lab) if run else {}
         found = SurveyFound(
             frames=len(taken),
             connected=int(run.survey.tied.sum()) if run else 0,
@@ -108,8 +108,8 @@ class Survey:
         known = {frame.row for frame in self.taken if frame.flown == flight.bench.scene}
         if known >= set(rows):
             raise InputError("survey: it has the frames of this flight; allowed: a flight of the next attitudes")
-        settings = tracker_settings.assumed_settings(self.testbed.scene)
-        camera = onboard_model.assumed_camera(self.testbed.scene)
+        settings = tracker_settings.assumed_settings(self.lab.scene)
+        camera = onboard_model.assumed_camera(self.lab.scene)
         assert flight.moved is not None
         new = []
         for row in (row for row in rows if row not in known):
@@ -156,9 +156,9 @@ class TakenFrame:
 def begin(scene: Scene, frames: int) -> tuple[Survey, SurveyPlan]:
     """A new survey of a scene's dome and its first attitudes. Raises InputError."""
     allow(frames)
-    testbed, before, plan = procedure.plan_survey(scene, UNCERTAINTY, frames, tilt_deg(scene))
+    lab, before, plan = procedure.plan_survey(scene, UNCERTAINTY, frames, tilt_deg(scene))
     steps = tuple(plan_step(*step) for step in plan.steps())
-    survey = Survey(scene, testbed, before, plan.model.sigma_px)
+    survey = Survey(scene, lab, before, plan.model.sigma_px)
     return survey, survey_plan(plan.lab_from_body, plan.shown, steps)
 
 
