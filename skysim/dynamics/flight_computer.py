@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from skysim.core.quantities.units import RPM_RAD_S
+from skysim.core.constants import RPM_RAD_S
 from skysim.core.types import Floats
 from skysim.dynamics.actuators import CmgSet, Desaturator, FanSet, WheelSet
 from skysim.dynamics.attitude_control import Pid, build_controller

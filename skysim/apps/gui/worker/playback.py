@@ -15,7 +15,7 @@ from skysim.apps.gui.messages import NAN, FlightStep, FrameRow, FrameView, Motio
 from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.workbench import Workbench, tracker_result
 from skysim.core import quaternion
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, Mount, Telemetry
 from skysim.results import telemetry_report
 from skysim.simulation.flight import Flight, Shot
