@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.detector.detector import Detector
 from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Mount, Sources
 from skysim.dynamics import guidance, multibody
 from skysim.dynamics.multibody.view import mjcf_export
@@ -128,8 +128,8 @@ class Lab:
         camera = self.cameras[number]
         return replace(self, scene=camera.scene, cameras=(camera,))
 
-    def with_tracker(self, scene: Scene) -> Lab:
-        """The same hardware for a scene that differs from this one in trackers only."""
+    def with_scene(self, scene: Scene) -> Lab:
+        """The same hardware for another scene, of which it would be built alike: other trackers, exposures or times."""
         scenes = [scene, *(scene.of_head(n) for n in range(len(scene.heads)))]
         cameras = tuple(replace(camera, scene=own) for camera, own in zip(self.cameras, scenes, strict=True))
         return replace(self, scene=scene, cameras=cameras)

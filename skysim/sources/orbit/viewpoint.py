@@ -5,9 +5,10 @@ from __future__ import annotations
 import datetime
 from dataclasses import dataclass
 
+from skysim.core.time import tt_jd
 from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.orbit.camera_orbit import CameraOrbit, state_at
-from skysim.sources.solar_system.observer import GcrsState, Observer, observe_at, site_in_gcrs, tt_jd
+from skysim.sources.solar_system.observer import GcrsState, Observer, observe_at, site_in_gcrs
 
 
 @dataclass(frozen=True, slots=True)

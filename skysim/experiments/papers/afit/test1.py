@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration.home_position import pooled
+from skysim.core.constants import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
@@ -79,7 +79,7 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
         for stage, lab in enumerate(stands):
             # The same board with nine other LEDs, by another hardware seed.
             scene = with_config(lab.scene, "light.layout", hardware_seed=hardware_seed)
-            other_leds = replace(lab, scene=scene, sources=light_sources(scene, lab.camera.band))
+            other_leds = lab.with_scene(scene).with_camera(sources=light_sources(scene, lab.camera.band))
             rng = random_stream(options.seed, stage, n)
             runs[stage].append(take_board(other_leds, images, rng))
     found_arcsec = lattice_angles(stands[0], options.trials(20, 2), random_stream(options.seed, 2))
@@ -186,7 +186,7 @@ def draw_angles(fig: Any, angles_arcsec: Floats) -> None:
     axes = fig.subplots()
     axes.hist(angles_arcsec.ravel(), np.arange(1200, 4000, 20), color=INK[0], label="ours")
     # Angles about the bearing of two LEDs of the lattice, in a board at 48 in.
-    for n, angle_rad in enumerate(2 * np.arctan(PITCH_M * np.sqrt(SQUARED_DISTANCES) / 2 / (48 * 0.0254))):
+    for n, angle_rad in enumerate(2 * np.arctan(PITCH_M * np.sqrt(SQUARED_DISTANCES) / 2 / (48 * INCH_M))):
         label = "8 mm lattice" if n == 0 else None
         axes.axvline(np.degrees(angle_rad) * 3600, ls="--", color=INK[1], label=label)
     axes.set(xlabel="angle of a pair (arcsec)", ylabel="pairs in all images")
