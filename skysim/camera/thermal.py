@@ -69,7 +69,8 @@ def leds_at(config: ThermalConfig, leds: Sources, t_s: float) -> Sources:
     difference_k = temperature_c(config, t_s) - config.reference_c
     anchor_m = np.array([0.0, 0.0, config.anchor_height_m])
     place = leds.place.copy()
-    place[:, :3] += PPM * config.dome_ppm_k * difference_k * (place[:, :3] - anchor_m) + config.creep_m
+    moved_m = PPM * config.dome_ppm_k * difference_k * (place[:, :3] - anchor_m) + config.creep_m
+    place[:, :3] += place[:, 3:] * moved_m  # stars stay
     return replace(leds, place=place)
 
 

@@ -18,14 +18,14 @@ from estimator.trackers.pipeline import Clock
 from skysim.camera import thermal
 from skysim.camera.detector.added_charge import AddedCharge
 from skysim.camera.detector.detector import add_snr_and_saturation, expose, saturation_dn, smear
-from skysim.camera.discs.bodies import behind, concatenated, render_bodies
+from skysim.camera.discs.bodies import concatenated, render_bodies
 from skysim.camera.glow import background
 from skysim.camera.render import Window, in_view, project, render
 from skysim.camera.stray import ghosts, glare
 from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Frame, SourceTruth, Trajectory, Truth
 from skysim.simulation.lab import StarCamera
-from skysim.simulation.lights.light import Beam, Exposure, Lit, Seeds, beam_of
+from skysim.simulation.lights.light import Beam, Exposure, Lit, Seeds, any_of, beam_of
 from skysim.simulation.timing import exposure_window, frame_end_s, time_tag_error_s
 
 
@@ -75,20 +75,23 @@ def exposure_of(
     seeds : None for the expectation, see `Exposure`
     """
     mount, optics, scene = camera.mount, camera.optics, camera.scene
+    middle_s = window.middle_s(scene.camera.height_px)
     if camera.mount_error is not None:
         mount = replace(mount, cam_from_body=camera.mount_error * mount.cam_from_body)
     if scene.thermal is not None:
-        mount, optics = thermal.camera_at(scene.thermal, mount, optics, window.middle_s(scene.camera.height_px))
-    return Exposure(index, window, trajectory, mount, optics, camera.band, camera.viewpoint, seeds)
+        mount, optics = thermal.camera_at(scene.thermal, mount, optics, middle_s)
+    lab_from_body = trajectory.attitude_at(middle_s)
+    return Exposure(index, window, trajectory, lab_from_body, mount, optics, camera.band, camera.viewpoint, seeds)
 
 
 def draw_glow(image: NDArray[Any], beam: Beam, exposure_s: float) -> None:
     """Set the (H, W) image to the extended light of a beam: first the smooth light together, then light with edges."""
-    smooth = np.atleast_2d(sum(lit.glow for lit in beam.lits))
-    background.fill(image, smooth, exposure_s)
-    for lit in beam.lits:
-        for glow in lit.edged:
-            background.add(image, glow.e_s, glow.share * exposure_s)
+    smooth = sum(lit.glow() for lit in beam.lits if lit.glow)
+    background.fill(image, np.atleast_2d(smooth), exposure_s)
+    for edged in (lit.edged for lit in beam.lits if lit.edged):
+        glow = edged.e_s()
+        if glow is not None:
+            background.add(image, glow, edged.share * exposure_s)
 
 
 def draw_lights(image: NDArray[Any], beam: Beam, exposure: Exposure) -> SourceTruth:
@@ -98,8 +101,7 @@ def draw_lights(image: NDArray[Any], beam: Beam, exposure: Exposure) -> SourceTr
         exposed = exposure.exposed(path.optics)
         for lit in beam.lits:
             if lit.points is not None:
-                hidden = behind(beam.discs, lit.occlusion)
-                drawn = render(image, lit.points, *exposed, lit.emitter, hidden)
+                drawn = render(image, lit.points, *exposed, lit.emitter, any_of(beam.before(lit)))
                 truths.append(ghosts.as_ghosts(drawn, path.number))
             if lit.discs:
                 bodies = render_bodies(image, lit.discs, exposed, lit.occlusion)
@@ -127,15 +129,16 @@ def truth_of(beam: Beam, exposure: Exposure, sources: SourceTruth) -> Truth:
 
 def hidden_ids(beam: Beam, exposure: Exposure) -> NDArray[np.int64]:
     """(M,) ids of the points that something hides and that would otherwise be on the chip at mid-exposure."""
-    return np.concatenate([np.zeros(0, np.int64), *(hidden_of(lit, exposure) for lit in beam.lits if lit.hidden_by)])
+    return np.concatenate([np.zeros(0, np.int64), *(hidden_of(lit, exposure) for lit in beam.lits)])
 
 
 def hidden_of(lit: Lit, exposure: Exposure) -> NDArray[np.int64]:
     """(M,) the ids of `hidden_ids` of one light."""
-    if lit.points is None:
+    occludes = lit.occlusion
+    if lit.points is None or occludes is None:
         return np.zeros(0, np.int64)
     near = lit.points.take(in_view(lit.points, exposure.optics, exposure.pose, reach=0.0))
     xy_px = project(near, exposure.optics, exposure.pose)[0][0]
     size_px = np.array([exposure.optics.camera.width_px, exposure.optics.camera.height_px])
     on_chip = ((xy_px > -0.5) & (xy_px < size_px - 0.5)).all(axis=1)
-    return near.id[on_chip & lit.occludes(near.place)]
+    return near.id[on_chip & occludes(near.place)]

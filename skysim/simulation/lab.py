@@ -30,7 +30,7 @@ from skysim.simulation.lights.registry import build_lights
 from skysim.simulation.user_parts import NO_PARTS, UserParts
 from skysim.sources import catalog, stars
 from skysim.sources.dome.layouts.led_list import led_list
-from skysim.sources.orbit.camera_orbit import build_orbit
+from skysim.sources.orbit.camera_orbit import CameraOrbit, build_orbit
 from skysim.sources.orbit.viewpoint import Viewpoint
 from skysim.sources.photometry import Band
 from skysim.tracking import factory, settings
@@ -48,7 +48,7 @@ class StarCamera:
     canvas  : (H, W) array in which every frame's light is drawn; float64 where noise is off, since such a frame
               is the expectation itself, and float32 otherwise
     lights  : in this camera's band, from the farthest to the lens, see `simulation.lights`
-    viewpoint   : its place on the Earth or in its orbit, in time
+    orbit   : about the Earth; None for a camera on the ground
     run_seed    : of what all cameras share in a run; what is drawn for this camera has its scene's seed
     mount_error : rotation of the real camera from the assumed mount; None for none
     """
@@ -61,9 +61,14 @@ class StarCamera:
     band: Band
     canvas: NDArray[Any]
     lights: tuple[Light, ...]
-    viewpoint: Viewpoint
+    orbit: CameraOrbit | None
     run_seed: int
     mount_error: Rotation | None = None
+
+    @property
+    def viewpoint(self) -> Viewpoint:
+        """Its place on the Earth or in its orbit, in the time of its scene."""
+        return Viewpoint(self.scene.start_time, self.scene.site, self.orbit)
 
     @property
     def seeds(self) -> Seeds:
@@ -79,14 +84,6 @@ class StarCamera:
     def sources(self) -> Sources:
         """The stars or LEDs of that light at the scene's start."""
         return self.known.sources
-
-    def with_light(self, light: Light) -> StarCamera:
-        """The camera with a light in place of that of the same class."""
-        return replace(self, lights=tuple(light if type(one) is type(light) else one for one in self.lights))
-
-    def with_sources(self, sources: Sources) -> StarCamera:
-        """The camera with other stars or LEDs."""
-        return self.with_light(self.known.with_sources(sources))
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,12 +113,20 @@ class Lab:
 
     def in_run(self, seed: int) -> Lab:
         """The same hardware in the run of another seed: other noise, jitter, timing and phases of the LEDs' clocks."""
-        lab = self.with_tracker(self.scene.model_copy(update={"seed": seed}))
+        lab = self.with_scene(self.scene.model_copy(update={"seed": seed}))
         return replace(lab, cameras=tuple(replace(camera, run_seed=seed) for camera in lab.cameras))
 
     def with_camera(self, **changes: Any) -> Lab:
         """The lab with changed fields of its main camera."""
         return replace(self, cameras=(replace(self.camera, **changes), *self.cameras[1:]))
+
+    def with_light(self, light: Light) -> Lab:
+        """The lab with a light in place of that of the same class, before its main camera."""
+        return self.with_camera(lights=tuple(light if type(one) is type(light) else one for one in self.camera.lights))
+
+    def with_sources(self, sources: Sources) -> Lab:
+        """The lab with other stars or LEDs before its main camera."""
+        return self.with_light(self.camera.known.with_sources(sources))
 
     def of_camera(self, number: int) -> Lab:
         """The lab with one of its cameras only."""
@@ -171,7 +176,8 @@ def build_camera(
 ) -> StarCamera:
     """The main camera of a scene, with the light in its band."""
     band = Band.from_camera(scene.camera)
-    viewpoint = Viewpoint(scene.start_time, scene.site, build_orbit(scene.orbit, scene.start_time))
+    orbit = build_orbit(scene.orbit, scene.start_time)
+    viewpoint = Viewpoint(scene.start_time, scene.site, orbit)
     return StarCamera(
         name=MAIN,
         scene=scene,
@@ -181,7 +187,7 @@ def build_camera(
         band=band,
         canvas=build_canvas(scene),
         lights=build_lights(Plan(scene, band, vehicle, viewpoint, shown)),
-        viewpoint=viewpoint,
+        orbit=orbit,
         run_seed=scene.seed,
     )
 

@@ -116,14 +116,10 @@ def whole(
 
 
 def behind(bodies: Sequence[BodyLight], occluded: OcclusionTest | None) -> OcclusionTest | None:
-    """The test for sources that the discs of these bodies or anything else hide; None if nothing can.
-
-    The bodies hide only what is at infinity.
-    """
+    """The test for sources that the discs of these bodies or anything else hide; None if nothing can."""
 
     def hidden(place: Floats) -> NDArray[np.bool_]:
-        far = place[:, 3] == 0
-        by_discs = [far & body.hides(place[:, :3]) for body in bodies]
+        by_discs = [body.hides(place[:, :3]) for body in bodies]
         return np.any([*by_discs, *([occluded(place)] if occluded else [])], axis=0)
 
     return hidden if bodies else occluded

@@ -31,10 +31,13 @@ def pst(baffle: BaffleConfig, directions: Floats, boresight: Floats) -> Floats:
 
 
 def stray_of_bodies_e_s_m2(baffle: BaffleConfig, bodies: Sequence[BodyLight], boresight: Floats) -> dict[str, float]:
-    """Photo-electrons s^-1 m^-2 of the chip that each body causes, as a point at its center; boresight: (3,)."""
+    """Photo-electrons s^-1 m^-2 of the chip that each body causes, by its name, as a point at its center.
+
+    boresight : (3,)
+    """
     directions = np.array([body.place.direction for body in bodies]).reshape(-1, 3)
     through = pst(baffle, directions, boresight)
-    return {body.name: body.flux_e_s_m2 * float(t) for body, t in zip(bodies, through, strict=True)}
+    return {body.title: body.flux_e_s_m2 * float(t) for body, t in zip(bodies, through, strict=True)}
 
 
 def earth_around(config: EarthConfig, observer_m: Floats, sun_m: Floats, band: Band) -> tuple[Floats, Floats]:

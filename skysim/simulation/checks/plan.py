@@ -15,13 +15,12 @@ from skysim.dynamics import guidance
 from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.attitudes import Attitudes
-from skysim.simulation.checks.detection import Context, context_of, usable
+from skysim.simulation.checks.detection import Context, context_of
 from skysim.simulation.checks.dome import assumptions, lookalike, reflections
-from skysim.simulation.checks.expected_error import expected
-from skysim.simulation.checks.facts import ARCSEC, FACTS, Fact, Sampled, Samples, short
+from skysim.simulation.checks.facts import ARCSEC, FACTS, Fact, short
 from skysim.simulation.checks.findings import FINDINGS
+from skysim.simulation.checks.sampling import Samples, sampled
 from skysim.simulation.checks.sky import air, bodies, claims, depth, stray
-from skysim.simulation.checks.views import views
 from skysim.simulation.lab import Lab
 from skysim.simulation.reference_limits import check_reference
 from skysim.sources.dome.placement.ambiguity import Ambiguity
@@ -100,13 +99,6 @@ def samples_of(context: Context, frames: Attitudes, tilt_deg: float | None) -> S
     """What the camera sees at the frames and within reach."""
     reach = attitudes.within_reach(context.lab.scene, context.lab.camera.mount, frames, tilt_deg)
     return Samples(sampled(frames, context), sampled(reach, context))
-
-
-def sampled(at: Attitudes, context: Context) -> Sampled:
-    """What the camera sees at some attitudes, and the expected errors there."""
-    seen = views(context.lab, context.beliefs.lights, at, context.camera)
-    used = [usable(view, context) for view in seen]
-    return Sampled(at, seen, used, expected(used, at, context))
 
 
 def broken_assumptions(lab: Lab) -> list[str]:

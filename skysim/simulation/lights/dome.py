@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from skysim.camera.glow.display_glow import black_glow
+from skysim.camera.render import Window
 from skysim.camera.thermal import leds_at
 from skysim.core.types import Sources
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
@@ -49,16 +50,16 @@ class LedDome(KnownLight):
         if self.thermal is not None:
             leds = leds_at(self.thermal, leds, exposure.t_s)
         if exposure.seeds is not None:
-            leds = self.pulsed(leds, exposure, exposure.seeds.run)
-        return Lit("LEDs", leds, self.emitter, edged=black_pixels(self.config, exposure, left))
+            leds = self.pulsed(leds, exposure.seeds.run, exposure.index, exposure.window, exposure.t_s)
+        return Lit("LEDs", True, leds, self.emitter, edged=black_pixels(self.config, exposure, left))
 
-    def pulsed(self, leds: Sources, exposure: Exposure, seed: int) -> Sources:
-        """The LEDs with their pulses and codes in the run of a seed."""
-        window, timing = exposure.window, self.timing(seed)
+    def pulsed(self, leds: Sources, seed: int, index: int, window: Window, middle_s: float) -> Sources:
+        """The LEDs with their pulses and codes in a frame of the run of a seed; middle_s : mid-exposure."""
+        timing = self.timing(seed)
         if timing.clocks:
-            leds = timing.clocks.lights_at(leds, exposure.t_s, window.exposure_s)
+            leds = timing.clocks.lights_at(leds, middle_s, window.exposure_s)
         if timing.codes:
-            leds = timing.codes.shown(leds, window.open_s, window.exposure_s, exposure.index)
+            leds = timing.codes.shown(leds, window.open_s, window.exposure_s, index)
         return leds
 
     def timing(self, seed: int) -> LedTiming:
@@ -78,12 +79,10 @@ class CollimatedDisplay(KnownLight):
     config: CollimatedDisplayConfig
 
     def during(self, exposure: Exposure) -> Lit:
-        return Lit("stars", self.sources, self.emitter, edged=black_pixels(self.config, exposure))
+        return Lit("stars", True, self.sources, self.emitter, edged=black_pixels(self.config, exposure))
 
 
-def black_pixels(
-    config: DomeConfig | CollimatedDisplayConfig, exposure: Exposure, share: float = 1.0
-) -> tuple[EdgedGlow, ...]:
-    """The light of a display's black pixels; empty without a display, or if its black is dark."""
-    black = black_glow(config, exposure.optics, exposure.cam_from_lab, exposure.camera_m, exposure.band)
-    return () if black is None else (EdgedGlow(black, share),)
+def black_pixels(config: DomeConfig | CollimatedDisplayConfig, exposure: Exposure, share: float = 1.0) -> EdgedGlow:
+    """The light of a display's black pixels; none without a display, or if its black is dark."""
+    optics, cam_from_lab, camera_m = exposure.optics, exposure.cam_from_lab, exposure.camera_m
+    return EdgedGlow(lambda: black_glow(config, optics, cam_from_lab, camera_m, exposure.band), share)

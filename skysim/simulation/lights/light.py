@@ -9,16 +9,17 @@ forecast (`simulation.checks`) counts it.
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable, Iterable
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import NamedTuple, Self
+from functools import cached_property, partial
+from typing import ClassVar, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.discs.bodies import FEW
+from skysim.camera.discs.bodies import FEW, centers_of
 from skysim.camera.discs.disc_image import Exposed
 from skysim.camera.optics import Optics
 from skysim.camera.render import OcclusionTest, Poses, Window, poses
@@ -46,6 +47,7 @@ class Exposure:
     index      : of the frame
     window     : when it is exposed
     trajectory : of the vehicle
+    lab_from_body : its attitude at mid-exposure
     mount, optics : at mid-exposure, as temperature and errors of the mount have them
     band       : of the chip
     viewpoint  : the camera's place on the Earth or in its orbit
@@ -55,6 +57,7 @@ class Exposure:
     index: int
     window: Window
     trajectory: Trajectory
+    lab_from_body: Rotation
     mount: Mount
     optics: Optics
     band: Band
@@ -75,11 +78,6 @@ class Exposure:
     def observer(self) -> Observer:
         """The camera among the bodies of the solar system at mid-exposure."""
         return self.viewpoint.observer_at(self.t_s)
-
-    @cached_property
-    def lab_from_body(self) -> Rotation:
-        """The vehicle's attitude at mid-exposure."""
-        return self.trajectory.attitude_at(self.t_s)
 
     @cached_property
     def cam_from_lab(self) -> Rotation:
@@ -120,33 +118,50 @@ class Exposure:
 
 
 class Occluder(NamedTuple):
-    """What hides lights: its name for messages ("the Earth"), and the test for places."""
+    """What hides lights.
+
+    name  : for messages, such as "the Earth"
+    hides : which of N places, as in `Sources`, are behind it
+    whole : whether it hides a disc as a whole, by its center
+    """
 
     name: str
     hides: OcclusionTest
+    whole: bool = False
+
+
+def any_of(occluders: Sequence[Occluder]) -> OcclusionTest | None:
+    """The test for places that any of these hides; None for none of them."""
+
+    def hidden(place: Floats) -> NDArray[np.bool_]:
+        return np.any([occluder.hides(place) for occluder in occluders], axis=0)
+
+    return hidden if occluders else None
 
 
 class EdgedGlow(NamedTuple):
     """Extended light with edges.
 
-    e_s   : (h, w) electrons s^-1 px^-1 at even nodes from the first pixel's center to the last one's, or of all pixels
+    e_s   : gives (h, w) electrons s^-1 px^-1 at even nodes from the first pixel's center to the last one's, or of all
+        pixels; None if none of it is in the field
     share : of that light that is left
     """
 
-    e_s: Floats
+    e_s: Callable[[], Floats | None]
     share: float = 1.0
 
 
 class Lit(NamedTuple):
-    """What one light gives to an exposure.
+    """What one light gives to an exposure. Extended light, which takes longest, is computed when it is asked for.
 
     name    : what it is, for messages
+    known   : whether a tracker can find itself by it
     points  : whose images are drawn along their paths
     emitter : how points in the laboratory shine
     discs   : resolved bodies, the farthest first
-    glow    : smooth extended light, electrons s^-1 px^-1: a number, or (h, w) at `background.node_directions`
-    edged   : extended light with edges
-    around  : (M, 3) directions and (M,) irradiances, photo-electrons s^-1 m^-2, of extended light also beside the
+    glow    : gives its smooth extended light, electrons s^-1 px^-1: a number, or (h, w) at `background.node_directions`
+    edged   : its extended light with edges
+    around  : gives (M, 3) directions and (M,) irradiances, photo-electrons s^-1 m^-2, of extended light also beside the
         field, which a baffle may let through
     hides   : what it hides of the lights before it
     hidden_by : what may hide this light
@@ -154,11 +169,12 @@ class Lit(NamedTuple):
     """
 
     name: str
+    known: bool = False
     points: Sources | None = None
     emitter: Emitter = Emitter()
     discs: tuple[BodyLight, ...] = ()
-    glow: Floats | float = 0.0
-    edged: tuple[EdgedGlow, ...] = ()
+    glow: Callable[[], Floats | float] | None = None
+    edged: EdgedGlow | None = None
     around: Callable[[], tuple[Floats, Floats]] | None = None
     hides: Occluder | None = None
     hidden_by: tuple[Occluder, ...] = ()
@@ -166,19 +182,15 @@ class Lit(NamedTuple):
 
     def behind(self, occluder: Occluder) -> Lit:
         """The same light with one more thing that may hide it."""
+        if occluder.whole and self.discs:
+            hidden = occluder.hides(centers_of(self.discs).place)
+            return self._replace(discs=tuple(itertools.compress(self.discs, ~hidden)))
         return self._replace(hidden_by=(*self.hidden_by, occluder))
-
-    def occludes(self, place: Floats) -> NDArray[np.bool_]:
-        """(N,) which of N places, as in `Sources`, anything hides."""
-        hidden = np.zeros(len(place), bool)
-        for occluder in self.hidden_by:
-            hidden |= occluder.hides(place)
-        return hidden
 
     @property
     def occlusion(self) -> OcclusionTest | None:
-        """`occludes`; None if nothing can hide the light."""
-        return self.occludes if self.hidden_by else None
+        """The test for places that anything hides; None if nothing can hide the light."""
+        return any_of(self.hidden_by)
 
 
 class Path(NamedTuple):
@@ -213,8 +225,20 @@ class Beam(NamedTuple):
 
     @property
     def discs(self) -> tuple[BodyLight, ...]:
-        """The discs of all lights, which hide what is at infinity behind them."""
+        """The discs of all lights."""
         return tuple(disc for lit in self.lits for disc in lit.discs)
+
+    def before(self, lit: Lit) -> tuple[Occluder, ...]:
+        """All that may hide the points of a light: what it is behind, and the discs, if it is at infinity."""
+        return (*lit.hidden_by, *(Occluder(disc.title, partial(behind_disc, disc)) for disc in self.discs))
+
+
+def behind_disc(disc: BodyLight, place: Floats) -> NDArray[np.bool_]:
+    """(N,) which of N places are at infinity and behind a disc."""
+    return (place[:, 3] == 0) & disc.hides(place[:, :3])
+
+
+AnyLight = TypeVar("AnyLight", bound="Light")
 
 
 class Light:
@@ -222,14 +246,18 @@ class Light:
 
     A light that shines or hides overrides `during`; one that changes what others give overrides `through`. What is
     drawn at random is drawn from the exposure's seeds, so that the same lights serve any run.
+
+    only_adds : whether it neither hides nor changes others, and no tracker knows it
     """
+
+    only_adds: ClassVar[bool] = False
 
     def during(self, exposure: Exposure) -> Lit:
         """What it gives to an exposure."""
         raise NotImplementedError
 
     def through(self, beam: Beam, exposure: Exposure) -> Beam:
-        """The beam after this light: what it gives is added."""
+        """The beam after this light: what it gives is added, and it hides what it can of those before."""
         return beam.plus(self.during(exposure))
 
 
@@ -247,6 +275,15 @@ class KnownLight(Light):
     def with_sources(self, sources: Sources) -> Self:
         """The same light with other sources."""
         return replace(self, sources=sources)
+
+
+class Obstacle(Light):
+    """Something that hides lights; `during` gives its occluder, and is quick."""
+
+
+def find_light(lights: Iterable[Light], kind: type[AnyLight]) -> AnyLight | None:
+    """The first light of a class; None if there is none."""
+    return next((light for light in lights if isinstance(light, kind)), None)
 
 
 def beam_of(lights: Iterable[Light], exposure: Exposure) -> Beam:

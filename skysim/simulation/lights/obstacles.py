@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from skysim.core.types import Floats
 from skysim.dynamics import multibody
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.lights.light import Exposure, Light, Lit, Occluder
+from skysim.simulation.lights.light import Exposure, Light, Lit, Obstacle, Occluder
 from skysim.simulation.lights.plan import Plan
 from skysim.sources.dome.shell.surface import Surface, build_surface
 
@@ -20,7 +20,7 @@ INWARD_FRACTION = 1e-6  # an LED is moved off its wall by this fraction of its d
 
 
 @dataclass(frozen=True)
-class Vehicle(Light):
+class Vehicle(Obstacle):
     """Parts of the vehicle that are in the way at mid-exposure."""
 
     obstacles: multibody.Obstacles
@@ -31,7 +31,7 @@ class Vehicle(Light):
 
 
 @dataclass(frozen=True)
-class DomeWall(Light):
+class DomeWall(Obstacle):
     """The dome's wall before its own LEDs, for a camera that is outside of it."""
 
     wall: Surface

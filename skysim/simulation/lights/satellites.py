@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.orbit import SatellitesConfig
@@ -21,6 +22,7 @@ class Satellites(Light):
     elements : of the file; None without one
     """
 
+    only_adds: ClassVar[bool] = True
     config: SatellitesConfig
     elements: Elements | None
 
@@ -37,7 +39,7 @@ class Satellites(Light):
         if self.config.random and exposure.seeds:
             found += random_satellites(self.config.random, exposure.view, exposure.seeds.camera, exposure.index)
         points = as_sources(found, exposure.band) if found else None
-        return Lit("satellites", points, satellites=tuple(light.truth for light in found))
+        return Lit("satellites", points=points, satellites=tuple(light.truth for light in found))
 
 
 def build(plan: Plan) -> Iterator[Light]:

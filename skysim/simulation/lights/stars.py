@@ -21,7 +21,7 @@ class Stars(KnownLight):
     """Stars whose places hold for the whole scene."""
 
     def during(self, exposure: Exposure) -> Lit:
-        return Lit("stars", self.sources, self.emitter)
+        return Lit("stars", True, self.sources, self.emitter)
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class StarsInOrbit(KnownLight):
         near = self.sources.take(self.sources.within(view.boresight, reach_rad))
         now_m_s = 1e3 * exposure.observer.velocity_km_s
         direction = stars.seen_at_velocity(near.place[:, :3], self.velocity_m_s, now_m_s)
-        return Lit("stars", replace(near, place=np.column_stack([direction, np.zeros(len(near))])), self.emitter)
+        return Lit("stars", True, replace(near, place=np.column_stack([direction, np.zeros(len(near))])), self.emitter)
 
 
 def stars_of(config: StarsConfig, plan: Plan) -> KnownLight:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 from skysim.camera.stray.wall import images_in_wall, wall_glow
+from skysim.core.types import Floats
 from skysim.scene.sections.leds import WarmUpConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lights.known import known_light
@@ -15,22 +17,36 @@ from skysim.sources.dome.led import warm_up_factor
 from skysim.sources.dome.reflection.dome import ReflectingDome, reflecting_dome
 
 
+def images_of(name: str) -> str:
+    """The name of the images of lights in the wall."""
+    return f"images of {name} in the wall"
+
+
+IMAGES = images_of("LEDs")
+
+
 @dataclass(frozen=True)
 class WallGlow(Light):
     """The glow of wall and floor, which wanes with the LEDs as they warm up."""
 
+    only_adds: ClassVar[bool] = True
     dome: ReflectingDome
     warm_up: WarmUpConfig | None
 
     def during(self, exposure: Exposure) -> Lit:
-        glow = wall_glow(self.dome, exposure.optics, exposure.cam_from_lab, exposure.camera_m, exposure.band)
-        return Lit("the dome's wall", glow=warm_up_factor(self.warm_up, exposure.t_s) * glow)
+        return Lit("the dome's wall", glow=lambda: self.glow(exposure))
+
+    def glow(self, exposure: Exposure) -> Floats:
+        """(h, w) electrons s^-1 px^-1 at the nodes of the background."""
+        full = wall_glow(self.dome, exposure.optics, exposure.cam_from_lab, exposure.camera_m, exposure.band)
+        return warm_up_factor(self.warm_up, exposure.t_s) * full
 
 
 @dataclass(frozen=True)
 class Mirror(Light):
     """The images of the LEDs, and of other lights in the laboratory, in the wall."""
 
+    only_adds: ClassVar[bool] = True
     dome: ReflectingDome
 
     def through(self, beam: Beam, exposure: Exposure) -> Beam:
@@ -43,7 +59,7 @@ class Mirror(Light):
         """The images of one light, which the same things hide."""
         assert lit.points is not None
         images = images_in_wall(self.dome, lit.points, exposure.optics, exposure.cam_from_lab, exposure.camera_m)
-        return Lit(f"images of {lit.name} in the wall", images, lit.emitter, hidden_by=lit.hidden_by)
+        return Lit(images_of(lit.name), False, images, lit.emitter, hidden_by=lit.hidden_by)
 
 
 def build(plan: Plan) -> Iterator[Light]:
