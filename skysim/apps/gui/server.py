@@ -22,10 +22,10 @@ from starlette.responses import FileResponse, PlainTextResponse, RedirectRespons
 from starlette.routing import Route, Router
 
 from skysim.apps.gui import memory
-from skysim.apps.gui.page.frame.sensor import FRAMES
-from skysim.apps.gui.page.frame.served import display_of
-from skysim.apps.gui.page.page import Tab
-from skysim.apps.gui.page.panels.photo import LIMIT_BYTES
+from skysim.apps.gui.page.tab import Tab
+from skysim.apps.gui.panels.photo import LIMIT_BYTES
+from skysim.apps.gui.views.sensor import FRAMES
+from skysim.apps.gui.views.served import display_of
 from skysim.apps.gui.worker.session import Workers
 from skysim.apps.gui.worker.study_process import StudyProcess, is_shown
 from skysim.scene.loader import find

@@ -15,14 +15,14 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 from labpage import CHROMIUM, SLOW_MS, chosen, come, panel, set_to, status
 
 from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan
-from skysim.apps.gui.page.panels.plan import (
+from skysim.apps.gui.panels.plan import (
     ambiguity_text,
     greatest_tilt_deg,
     prediction_text,
     survey_flight,
     survey_lines,
 )
-from skysim.apps.gui.page.style import color_scale
+from skysim.apps.gui.shared.style import color_scale
 from skysim.apps.gui.worker.scene import planning, survey
 from skysim.apps.gui.worker.tasks import Worker
 from skysim.core import quaternion

@@ -26,8 +26,8 @@ from labpage import (
     status,
 )
 
-from skysim.apps.gui.page.shell import history
-from skysim.apps.gui.state import View
+from skysim.apps.gui.page import history
+from skysim.apps.gui.shared.state import View
 from skysim.core.errors import InputError
 
 pytest_plugins = ["labpage"]

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 from nicegui import ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo
-from skysim.apps.gui.page.shell.csv_table import csv_table
+from skysim.apps.gui.shared.csv_table import csv_table
 
 if TYPE_CHECKING:
-    from skysim.apps.gui.page.page import Tab
+    from skysim.apps.gui.page.tab import Tab
 
 MAX_LINES, MAX_ROWS = 500, 10_000
 COLUMNS = (

@@ -42,7 +42,7 @@ class Contents:
             self.send(self.take())
 
 
-class LiveField(ui.element, component="js/live_field.js", esm={"skysim-frame": "js"}):  # type: ignore[call-arg]
+class LiveField(ui.element, component="js/live_field.js", esm={"skysim-live": "js"}):  # type: ignore[call-arg]
     """An element whose content travels with the frames."""
 
     def __init__(self, contents: Contents, tag: str, type: str = "") -> None:

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 from nicegui import ui
 
 from skysim.apps.gui.messages import FlightStep, FrameRow, MotionLog
-from skysim.apps.gui.page import keys
-from skysim.apps.gui.page.forms import FEEDBACKS, loop_overrides
-from skysim.apps.gui.page.frame.live import LiveInput, LiveText
-from skysim.apps.gui.page.panels.strips import StripChart, rms_line, strips
-from skysim.apps.gui.page.shell.csv_table import csv_table
+from skysim.apps.gui.panels.strips import StripChart, rms_line, strips
+from skysim.apps.gui.shared import keys
+from skysim.apps.gui.shared.csv_table import csv_table
+from skysim.apps.gui.shared.forms import FEEDBACKS, loop_overrides
+from skysim.apps.gui.shared.live import LiveInput, LiveText
 
 if TYPE_CHECKING:
-    from skysim.apps.gui.page.page import Tab
+    from skysim.apps.gui.page.tab import Tab
 
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
 CONTROL_KEYS = ("motion.control", "motion.maneuver")

@@ -10,16 +10,16 @@ import numpy as np
 from nicegui import ui
 
 from skysim.apps.gui.messages import Detection, Light
-from skysim.apps.gui.page.frame.overlay import MAX_TRUTH_MARKS, NEAR_PX
+from skysim.apps.gui.views.overlay import MAX_TRUTH_MARKS, NEAR_PX
 
 if TYPE_CHECKING:
-    from skysim.apps.gui.page.page import Tab
+    from skysim.apps.gui.page.tab import Tab
 
 HEADS = ("light", "V", "e⁻", "x, px", "y, px", "error, px", "taken for")
 UPDATE_S = 0.5
 
 
-class Table(ui.element, component="lights.js"):  # type: ignore[call-arg]
+class Table(ui.element, component="js/lights.js"):  # type: ignore[call-arg]
     """The table, implemented in lights.js."""
 
 

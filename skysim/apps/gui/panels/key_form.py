@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 from nicegui import run, ui
 
-from skysim.apps.gui.page import forms, keys
-from skysim.apps.gui.page.shell.wording import for_page
+from skysim.apps.gui.shared import forms, keys
+from skysim.apps.gui.shared.wording import for_page
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
-    from skysim.apps.gui.page.page import Tab
+    from skysim.apps.gui.page.tab import Tab
 
 
 class KeyForm:

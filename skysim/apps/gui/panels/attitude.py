@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 from nicegui import ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, TrackerResult
-from skysim.apps.gui.page.frame.live import LiveInput, LiveText
-from skysim.apps.gui.page.style import format_number
+from skysim.apps.gui.shared.live import LiveInput, LiveText
+from skysim.apps.gui.shared.style import format_number
 
 if TYPE_CHECKING:
-    from skysim.apps.gui.page.page import Tab
+    from skysim.apps.gui.page.tab import Tab
     from skysim.apps.gui.worker.photo import Photo
 
 ANGLES_JS = "() => emit([...document.querySelectorAll('.lab-angle')].map(field => field.value))"

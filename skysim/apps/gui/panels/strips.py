@@ -10,8 +10,8 @@ from typing import Any
 from nicegui import ui
 
 from skysim.apps.gui.messages import FrameRow, MotionLog
-from skysim.apps.gui.page.frame.live import Contents
-from skysim.apps.gui.page.style import CURVE_COLORS, TOOLTIP, chart_color
+from skysim.apps.gui.shared.live import Contents
+from skysim.apps.gui.shared.style import CURVE_COLORS, TOOLTIP, chart_color
 
 BAND_COLOR = "#8b95a5"
 STRIP_PX, HEAD_PX, AXIS_PX = 118, 22, 24  # height of a strip, of its title and legend, of the time axis
@@ -77,7 +77,7 @@ class Strip:
         return tuple(curve for curve in self.curves if curve.points)
 
 
-class Dots(ui.element, component="strips.js"):  # type: ignore[call-arg]
+class Dots(ui.element, component="js/strips.js"):  # type: ignore[call-arg]
     """Dots over a strip, implemented in strips.js."""
 
 

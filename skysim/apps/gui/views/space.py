@@ -11,13 +11,13 @@ from nicegui import ui
 from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo
-from skysim.apps.gui.page.space.push import PushControl
-from skysim.apps.gui.page.style import DARK, color_scale
+from skysim.apps.gui.shared.style import DARK, color_scale
+from skysim.apps.gui.views.push import PushControl
 from skysim.core.types import Floats
 from skysim.dynamics.multibody import Shape
 
 if TYPE_CHECKING:
-    from skysim.apps.gui.page.page import Tab
+    from skysim.apps.gui.page.tab import Tab
 
 VIEWS = {
     "outside": "from beside the laboratory",
@@ -30,7 +30,7 @@ AXIS, MOST_AXIS_M = 0.35, 1.2  # length of the axes over the distance from which
 DIGITS = 5  # of meters
 
 
-class Space(ui.element, component="js/space.js", esm={"skysim-space": "js"}):  # type: ignore[call-arg]
+class Space(ui.element, component="js/space.js", esm={"skysim-views": "js"}):  # type: ignore[call-arg]
     """The picture, implemented in space.js."""
 
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from skysim.apps.gui.page.shell.wording import for_page
+from skysim.apps.gui.shared.wording import for_page
 from skysim.apps.gui.worker.photo import SUFFIXES, Stages
 
 if TYPE_CHECKING:
-    from skysim.apps.gui.page.page import Tab
+    from skysim.apps.gui.page.tab import Tab
     from skysim.apps.gui.worker.photo import Photo
 
 LIMIT_BYTES = 64 * 2**20

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from nicegui import ui
 
-from skysim.apps.gui.page import keys
+from skysim.apps.gui.shared import keys
 
 
 def help_dialog() -> ui.dialog:

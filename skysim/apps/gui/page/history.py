@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from nicegui import ui
 
 if TYPE_CHECKING:
-    from skysim.apps.gui.page.page import Tab
-    from skysim.apps.gui.state import View
+    from skysim.apps.gui.page.tab import Tab
+    from skysim.apps.gui.shared.state import View
 
 SETTLED = 3  # times of the timer without a change after which the next one is a new step
 WRITE_S = 0.4  # browsers refuse more than about 200 entries in 30 s

@@ -14,27 +14,27 @@ from typing import Any
 from nicegui import run, ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
-from skysim.apps.gui.page import forms, keys, style
-from skysim.apps.gui.page.frame.live import Contents, LiveText
-from skysim.apps.gui.page.frame.sensor import FRAMES, Sensor
-from skysim.apps.gui.page.panels import lights, monte_carlo
-from skysim.apps.gui.page.panels.attitude import AttitudeCard
-from skysim.apps.gui.page.panels.lights import LightsPanel
-from skysim.apps.gui.page.panels.monte_carlo import MonteCarloPanel
-from skysim.apps.gui.page.panels.photo import PhotoPanel
-from skysim.apps.gui.page.panels.plan import PlanPanel
-from skysim.apps.gui.page.panels.run import RunPanel
-from skysim.apps.gui.page.settings.scene import ScenePanel
-from skysim.apps.gui.page.settings.tracker import TrackerPanel
-from skysim.apps.gui.page.shell.actions import Actions
-from skysim.apps.gui.page.shell.arrangement import Arrangement
-from skysim.apps.gui.page.shell.help import help_dialog
-from skysim.apps.gui.page.shell.history import History
-from skysim.apps.gui.page.shell.log import LogPanel
-from skysim.apps.gui.page.shell.palette import Palette
-from skysim.apps.gui.page.shell.wording import for_page
-from skysim.apps.gui.page.space.space import Scene3D
-from skysim.apps.gui.state import View
+from skysim.apps.gui.page.actions import Actions
+from skysim.apps.gui.page.arrangement import Arrangement
+from skysim.apps.gui.page.help import help_dialog
+from skysim.apps.gui.page.history import History
+from skysim.apps.gui.page.log import LogPanel
+from skysim.apps.gui.page.palette import Palette
+from skysim.apps.gui.panels import lights, monte_carlo
+from skysim.apps.gui.panels.attitude import AttitudeCard
+from skysim.apps.gui.panels.lights import LightsPanel
+from skysim.apps.gui.panels.monte_carlo import MonteCarloPanel
+from skysim.apps.gui.panels.photo import PhotoPanel
+from skysim.apps.gui.panels.plan import PlanPanel
+from skysim.apps.gui.panels.run import RunPanel
+from skysim.apps.gui.panels.scene import ScenePanel
+from skysim.apps.gui.panels.tracker import TrackerPanel
+from skysim.apps.gui.shared import forms, keys, style
+from skysim.apps.gui.shared.live import Contents, LiveText
+from skysim.apps.gui.shared.state import View
+from skysim.apps.gui.shared.wording import for_page
+from skysim.apps.gui.views.sensor import FRAMES, Sensor
+from skysim.apps.gui.views.space import Scene3D
 from skysim.apps.gui.worker import export
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.session import Session, WorkerLost

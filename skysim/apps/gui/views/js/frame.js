@@ -1,10 +1,10 @@
 // The frame: its pixels come as numbers, so zoom, limits, colors, values under the cursor, loupe and cut are made here,
 // without the server. Marks are drawn together with their frame, so that they never appear on another one.
-import { setContents } from "skysim-frame/live.js";
-import { colorTable, decode, palette, profile, reader, shadeTable } from "skysim-frame/pixels.js";
-import { drawGrid, drawHighlight, drawLoupe, drawMarks, drawNames } from "skysim-frame/marks.js";
-import { drawHistogram, drawProfile, levelAt, nearestLevel } from "skysim-frame/plots.js";
-import { directionText, gridLines } from "skysim-frame/sky.js";
+import { setContents } from "skysim-live/live.js";
+import { colorTable, decode, palette, profile, reader, shadeTable } from "skysim-views/pixels.js";
+import { drawGrid, drawHighlight, drawLoupe, drawMarks, drawNames } from "skysim-views/marks.js";
+import { drawHistogram, drawProfile, levelAt, nearestLevel } from "skysim-views/plots.js";
+import { directionText, gridLines } from "skysim-views/sky.js";
 
 const REST_MS = 400; // without another frame, after which all pixels of the frame are fetched
 const AHEAD = 1; // frames that are fetched while another one is drawn

@@ -1,9 +1,9 @@
 // The laboratory in three dimensions: the shapes of its MJCF file, the lights as they shine, the vehicle's attitude.
 // It is drawn only when something has changed: without a graphics card a picture takes the time of a frame.
 import { OrbitControls, THREE } from "nicegui-scene";
-import { drawNames } from "skysim-frame/marks.js";
-import { Lights } from "skysim-space/lights.js";
-import { axes, band, solid } from "skysim-space/solids.js";
+import { drawNames } from "skysim-views/marks.js";
+import { Lights } from "skysim-views/lights.js";
+import { axes, band, solid } from "skysim-views/solids.js";
 
 const BUSY_MS = 1000, SMOOTH_MS = 33; // between pictures without a graphics card, and with one or under the mouse
 const REACH_PX = 12;

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.apps.gui.messages import AmbiguityMap, PlanCheck, SurveyFound, SurveyPlan
-from skysim.apps.gui.page import forms
-from skysim.apps.gui.page.style import color_scale
+from skysim.apps.gui.shared import forms
+from skysim.apps.gui.shared.style import color_scale
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
 from skysim.experiments.dome_survey import stops
 from skysim.scene.sections.motion import PRESCRIBED
 
 if TYPE_CHECKING:
-    from skysim.apps.gui.page.page import Tab
+    from skysim.apps.gui.page.tab import Tab
 
 # Of a survey that is flown: few frames while the vehicle slews, and a whole exposure in each hold.
 SURVEY_RATE_HZ, HOLD_PERIODS = 0.5, 2.0

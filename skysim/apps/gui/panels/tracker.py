@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from skysim.apps.gui.page import forms, keys
-from skysim.apps.gui.page.settings.key_form import KeyForm
+from skysim.apps.gui.panels.key_form import KeyForm
+from skysim.apps.gui.shared import forms, keys
 
 if TYPE_CHECKING:
-    from skysim.apps.gui.page.page import Tab
+    from skysim.apps.gui.page.tab import Tab
 
 SENSOR, IDENTIFIER = "sensor, F6", "identifier, F7"
 NAMES = {  # by group and key

@@ -11,7 +11,7 @@ from skysim.apps.gui.messages import Triple
 from skysim.apps.gui.worker.scene.push import Grip
 
 if TYPE_CHECKING:
-    from skysim.apps.gui.page.page import Tab
+    from skysim.apps.gui.page.tab import Tab
 
 COAST_S = 60.0  # after a drag, until the vehicle is held
 

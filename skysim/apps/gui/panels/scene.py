@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 from nicegui import run, ui
 
-from skysim.apps.gui.page import forms
-from skysim.apps.gui.page.settings.key_form import KeyForm
+from skysim.apps.gui.panels.key_form import KeyForm
+from skysim.apps.gui.shared import forms
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
-    from skysim.apps.gui.page.page import Tab
+    from skysim.apps.gui.page.tab import Tab
 
 
 class ScenePanel:

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from nicegui.events import KeyEventArguments
 
-from skysim.apps.gui.page import keys
-from skysim.apps.gui.page.shell.palette import Command
+from skysim.apps.gui.page.palette import Command
+from skysim.apps.gui.shared import keys
 from skysim.apps.gui.worker import export
 from skysim.apps.gui.worker.scene import pointing
 
 if TYPE_CHECKING:
-    from skysim.apps.gui.page.page import Tab
+    from skysim.apps.gui.page.tab import Tab
 
 
 class Actions:

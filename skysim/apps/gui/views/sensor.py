@@ -29,17 +29,17 @@ from skysim.apps.gui.messages import (
     SceneInfo,
     TrackerResult,
 )
-from skysim.apps.gui.page import keys
-from skysim.apps.gui.page.frame import overlay
-from skysim.apps.gui.page.frame.live import LiveText
-from skysim.apps.gui.page.frame.served import ServedFrame, TabFrames, display_of
-from skysim.apps.gui.page.frame.star_names import NAMES
+from skysim.apps.gui.shared import keys
+from skysim.apps.gui.shared.live import LiveText
+from skysim.apps.gui.views import overlay
+from skysim.apps.gui.views.served import ServedFrame, TabFrames, display_of
+from skysim.apps.gui.views.star_names import NAMES
 from skysim.core.types import Floats
 from skysim.results import stretch
 from skysim.sources.solar_system.bodies import NAMES as BODIES
 
 if TYPE_CHECKING:
-    from skysim.apps.gui.page.page import Tab
+    from skysim.apps.gui.page.tab import Tab
     from skysim.apps.gui.worker.photo import Photo
 
 FIRST_START = "The first frame on a machine takes up to a minute, because the code is compiled."
@@ -54,7 +54,7 @@ AHEAD = 2  # frames that the browser fetches while it draws another one
 DRAW_TIMEOUT_S = 1.0  # for the browser to report a drawn frame
 
 
-class Canvas(ui.element, component="js/frame.js", esm={"skysim-frame": "js"}):  # type: ignore[call-arg]
+class Canvas(ui.element, component="js/frame.js", esm={"skysim-views": "js"}):  # type: ignore[call-arg]
     """The frame with its loupe and plot, implemented in frame.js."""
 
 

@@ -12,8 +12,8 @@ from urllib.parse import quote
 from nicegui import run, ui
 from pydantic import ValidationError
 
-from skysim.apps.gui.page import forms, keys
-from skysim.apps.gui.page.style import CURVE_COLORS, TOOLTIP, chart_color, format_number
+from skysim.apps.gui.shared import forms, keys
+from skysim.apps.gui.shared.style import CURVE_COLORS, TOOLTIP, chart_color, format_number
 from skysim.apps.gui.worker.study_process import (
     PAGE_STUDY,
     RESPONSES,
@@ -32,7 +32,7 @@ from skysim.experiments.study.store import STORE
 from skysim.scene.loader import load
 
 if TYPE_CHECKING:
-    from skysim.apps.gui.page.page import Tab
+    from skysim.apps.gui.page.tab import Tab
 
 POLL_S = 0.5
 TRIAL_KINDS = {"centroids": "centroids", "frames": "rendered frames"}
