@@ -24,8 +24,7 @@ from starlette.routing import Route, Router
 from skysim.apps.gui import memory
 from skysim.apps.gui.page.tab import Tab
 from skysim.apps.gui.panels.photo import LIMIT_BYTES
-from skysim.apps.gui.views.sensor import FRAMES
-from skysim.apps.gui.views.served import display_of
+from skysim.apps.gui.views.served import FRAMES, display_of
 from skysim.apps.gui.worker.session import Workers
 from skysim.apps.gui.worker.study_process import StudyProcess, is_shown
 from skysim.scene.loader import find
@@ -264,8 +263,7 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
         session = await pool.wait(lambda: tab.is_open, lambda text: tab.sensor.show_waiting(text, QUEUED))
         if session is None:  # the tab was closed while it waited
             return
-        tab.session, tab.new_session = session, pool.take
-        await tab.start()
+        await tab.start(session, pool.take)
 
 
 def serve(

@@ -22,8 +22,7 @@ from skysim.apps.gui.messages import ALL_PIXELS, LIMITS, Display, Lights, Pixels
 from skysim.apps.gui.server import Guard
 from skysim.apps.gui.shared.live import Contents
 from skysim.apps.gui.views import served as served_module
-from skysim.apps.gui.views.sensor import FRAMES
-from skysim.apps.gui.views.served import KEPT_FRAMES, ServedFrame, TabFrames, display_of
+from skysim.apps.gui.views.served import FRAMES, KEPT_FRAMES, ServedFrame, TabFrames, display_of
 from skysim.apps.gui.worker.pixels import (
     BINS,
     HEADER_BYTES,

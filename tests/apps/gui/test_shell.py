@@ -11,7 +11,7 @@ from labpage import CHROMIUM, NARROW, WIDE, Server, changed, come, onto_the_page
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.page.palette import Command, matching
+from skysim.apps.gui.page.actions import Command, matching
 from skysim.apps.gui.page.tab import PANELS
 from skysim.apps.gui.shared import style
 from skysim.apps.gui.shared.wording import for_page

@@ -71,7 +71,8 @@ class Arrangement:
     """
 
     def __init__(self, charts: list[ui.echart]) -> None:
-        self.charts, self.dark = charts, ui.dark_mode(True)
+        self.charts = charts
+        self.dark = ui.dark_mode(True)
         ui.add_body_html(f"<script>{SPLITTER_JS}</script>")
 
     @staticmethod

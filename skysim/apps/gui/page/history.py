@@ -7,13 +7,13 @@ back button and a shared link read a view from the address in the same way as un
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import Awaitable, Callable
+from typing import Any
 
 from nicegui import ui
 
-if TYPE_CHECKING:
-    from skysim.apps.gui.page.tab import Tab
-    from skysim.apps.gui.shared.state import View
+from skysim.apps.gui.shared.context import Shown
+from skysim.apps.gui.shared.state import View
 
 SETTLED = 3  # times of the timer without a change after which the next one is a new step
 WRITE_S = 0.4  # browsers refuse more than about 200 entries in 30 s
@@ -48,17 +48,29 @@ document.addEventListener("keydown", event => {
 
 
 class History:
-    """Writes a tab's view to the browser, and shows the view of an address.
+    """Writes a page's view to the browser, and shows the view of an address.
 
     home : the server's scene; a stored view is that of a server for the same one
+    show_query : shows the view of an address;  is_settling : whether the page does not show its view yet
     written : the view in the address;  pending : the newest query that is asked for while another is being shown
     moving : whether the last change was of attitude or time alone;  unchanged : times of the timer since then
     """
 
-    def __init__(self, tab: Tab, home: str) -> None:
-        self.tab, self.home = tab, home
+    def __init__(
+        self,
+        page: Shown,
+        home: str,
+        show_query: Callable[[str], Awaitable[None]],
+        is_settling: Callable[[], bool],
+    ) -> None:
+        self.page = page
+        self.home = home
+        self.show_query = show_query
+        self.is_settling = is_settling
         self.written: View | None = None
-        self.showing, self.moving, self.unchanged = False, False, 0
+        self.showing = False
+        self.moving = False
+        self.unchanged = 0
         self.pending: str | None = None
         ui.add_body_html(f"<script>{JS}</script>")
         ui.on("view", self.asked)
@@ -70,16 +82,17 @@ class History:
 
     def write(self) -> None:
         """Timer: write a changed view; a movement that goes on replaces the address, other changes add a step."""
-        view = self.tab.state
-        waits = self.showing or self.tab.view is None or self.tab.run_panel.wanted_s is not None
-        if view is self.written or waits:
+        view = self.page.state
+        if view is self.written or self.showing or self.is_settling():
             self.unchanged += 1
             return
-        before, self.written = self.written, view
+        before = self.written
+        self.written = view
         moves = before is not None and view.same_step(before)
         goes_on = moves and self.moving and self.unchanged < SETTLED
         push = before is not None and before != view and not goes_on
-        self.moving, self.unchanged = moves, 0
+        self.moving = moves
+        self.unchanged = 0
         arguments = ", ".join(json.dumps(value) for value in (view.query(), push, self.home))
         ui.run_javascript(f"skysimHistory.write({arguments})")
 
@@ -91,7 +104,8 @@ class History:
 
     def adopt(self) -> None:
         """The address names the page's view already."""
-        self.written, self.moving = self.tab.state, False
+        self.written = self.page.state
+        self.moving = False
 
     async def asked(self, event: Any) -> None:
         """The browser has gone to another address of this page: show its view; of several, the newest."""
@@ -101,8 +115,9 @@ class History:
         self.showing = True
         try:
             while self.pending is not None:
-                query, self.pending = self.pending, None
-                await self.tab.show_query(query)
+                query = self.pending
+                self.pending = None
+                await self.show_query(query)
                 self.adopt()
         finally:
             self.showing = False

@@ -4,29 +4,46 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from nicegui import ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo
+from skysim.apps.gui.shared.context import Shown
 from skysim.apps.gui.shared.csv_table import csv_table
 
-if TYPE_CHECKING:
-    from skysim.apps.gui.page.tab import Tab
-
-MAX_LINES, MAX_ROWS = 500, 10_000
+MAX_LINES = 500
+MAX_ROWS = 10_000
 COLUMNS = (
-    *("time", "scene", "noise", "detector", "identifier", "status", "detected", "identified"),
-    *("true_1_deg", "true_2_deg", "true_3_deg", "found_1_deg", "found_2_deg", "found_3_deg"),
-    *("cross_arcsec", "roll_arcsec", "cross_sigma_arcsec", "roll_sigma_arcsec", "wrong"),
+    "time",
+    "scene",
+    "noise",
+    "detector",
+    "identifier",
+    "status",
+    "detected",
+    "identified",
+    "true_1_deg",
+    "true_2_deg",
+    "true_3_deg",
+    "found_1_deg",
+    "found_2_deg",
+    "found_3_deg",
+    "cross_arcsec",
+    "roll_arcsec",
+    "cross_sigma_arcsec",
+    "roll_sigma_arcsec",
+    "wrong",
 )
 
 
 class LogPanel:
     """The log, the newest line first. rows : of the identifications, with the cells of COLUMNS"""
 
-    def __init__(self, tab: Tab) -> None:
-        self.tab, self.lines, self.rows = tab, list[str](), list[tuple[Any, ...]]()
+    def __init__(self, page: Shown) -> None:
+        self.page = page
+        self.lines: list[str] = []
+        self.rows: list[tuple[Any, ...]] = []
         self.button = ui.button("CSV of the identifications", on_click=self.download).props("dense flat size=sm")
         self.button.mark("log-csv").set_enabled(False)
         self.label = ui.label("Nothing yet.").classes("mono lab-log").mark("log")
@@ -42,12 +59,13 @@ class LogPanel:
         self.button.set_enabled(True)
 
     def download(self) -> None:
-        ui.download(csv_table(COLUMNS, self.rows), f"{Path(self.tab.scene).stem}_log.csv")
+        ui.download(csv_table(COLUMNS, self.rows), f"{Path(self.page.state.scene).stem}_log.csv")
 
 
 def line(view: FrameView, info: SceneInfo) -> str:
     """An identification in a line."""
-    noise, result = "with" if info.noise else "without", view.result
+    noise = "with" if info.noise else "without"
+    result = view.result
     if result is None or result.angles_deg is None:
         return f"identify {noise} noise: {result.status if result else 'no result'}"
     counts = f"{result.identified} of {len(result.detections)}"

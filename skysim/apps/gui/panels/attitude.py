@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from nicegui import ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, TrackerResult
-from skysim.apps.gui.shared.live import LiveInput, LiveText
+from skysim.apps.gui.shared.context import PageContext
+from skysim.apps.gui.shared.live import Contents, LiveInput, LiveText
 from skysim.apps.gui.shared.style import format_number
-
-if TYPE_CHECKING:
-    from skysim.apps.gui.page.tab import Tab
-    from skysim.apps.gui.worker.photo import Photo
+from skysim.apps.gui.worker.photo import Photo
 
 ANGLES_JS = "() => emit([...document.querySelectorAll('.lab-angle')].map(field => field.value))"
 
@@ -21,11 +19,14 @@ ANGLES_JS = "() => emit([...document.querySelectorAll('.lab-angle')].map(field =
 class AttitudeCard:
     """True and estimated angles with the error, and the algorithms of the tracker's four stages.
 
-    shows_photo: whether the card shows an image that is not of the current scene
+    contents : of the tab's live fields
+    shows_photo : whether the card shows an image that is not of the current scene
     """
 
-    def __init__(self, tab: Tab) -> None:
-        self.tab, self.shows_photo = tab, False
+    def __init__(self, page: PageContext, contents: Contents) -> None:
+        self.page = page
+        self.contents = contents
+        self.shows_photo = False
         with ui.element("div").classes("lab-card"):
             with ui.element("div").classes("lab-grid"):
                 ui.label("attitude").classes("quiet")
@@ -33,14 +34,14 @@ class AttitudeCard:
                 ui.label("true (F5)").classes("quiet")
                 self.inputs = [self.angle_input(n) for n in range(3)]
                 ui.label("tracker").classes("quiet")
-                self.estimates = [LiveText(tab.contents, "–").classes("mono num") for _ in range(3)]
+                self.estimates = [LiveText(contents, "–").classes("mono num") for _ in range(3)]
                 ui.label("error").classes("quiet")
-                self.errors = [LiveText(tab.contents, "–").classes("mono num") for _ in range(3)]
-            self.status = LiveText(tab.contents).classes("mono ellipsis lab-status").mark("status")
+                self.errors = [LiveText(contents, "–").classes("mono num") for _ in range(3)]
+            self.status = LiveText(contents).classes("mono ellipsis lab-status").mark("status")
             self.stages = ui.label(" ").classes("quiet ellipsis").mark("stages")
 
     def angle_input(self, n: int) -> LiveInput:
-        field = LiveInput(self.tab.contents, "text").props(f'aria-label="angle {n + 1}"')
+        field = LiveInput(self.contents, "text").props(f'aria-label="angle {n + 1}"')
         return field.classes("mono lab-angle").mark(f"angle-{n}").on("keydown.enter", self.point, js_handler=ANGLES_JS)
 
     def set_scene(self, scene_info: SceneInfo) -> None:
@@ -55,21 +56,26 @@ class AttitudeCard:
 
     async def point(self, event: Any) -> None:
         """Point the camera at the typed angles."""
-        self.tab.stop_playback()
-        self.tab.show_message("")
+        self.page.stop_playback()
+        self.page.show_message("")
         try:
             angles = tuple(float(text) for text in event.args)
         except (TypeError, ValueError):
-            self.tab.show_message("an angle is not a number; allowed: degrees, e.g. 83.6")
+            self.page.show_message("an angle is not a number; allowed: degrees, e.g. 83.6")
             return
-        if await self.tab.show_live(self.tab.session.run("point", angles, self.tab.solving)):
+        if await self.page.show_live("point", angles, self.page.solving):
             for field in self.inputs:
                 field.run_method("blur")  # so that the arrow keys move the camera again
 
+    def focus(self) -> None:
+        """Give the first angle the keyboard focus."""
+        self.inputs[0].run_method("focus")
+
     def show(self, view: FrameView) -> None:
-        if self.shows_photo and self.tab.scene_info:
+        info = self.page.scene_info
+        if self.shows_photo and info:
             self.shows_photo = False
-            self.set_headers(self.tab.scene_info.names)
+            self.set_headers(info.names)
             self.set_placeholder("")
         for field, angle in zip(self.inputs, view.angles_deg, strict=True):
             field.set_value(format_angle(angle))

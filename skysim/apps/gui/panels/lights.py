@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from nicegui import ui
 
 from skysim.apps.gui.messages import Detection, Light
 from skysim.apps.gui.views.overlay import MAX_TRUTH_MARKS, NEAR_PX
-
-if TYPE_CHECKING:
-    from skysim.apps.gui.page.tab import Tab
+from skysim.apps.gui.views.sensor import Sensor
 
 HEADS = ("light", "V", "e⁻", "x, px", "y, px", "error, px", "taken for")
 UPDATE_S = 0.5
@@ -24,19 +22,17 @@ class Table(ui.element, component="js/lights.js"):  # type: ignore[call-arg]
 
 
 class LightsPanel:
-    """Panel with the table, which is sent while it is open and the frame is another one.
+    """Panel with the table. sent : number of the frame in it"""
 
-    sent : number of the frame in the table
-    """
-
-    def __init__(self, tab: Tab) -> None:
-        self.tab, self.sent = tab, 0
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        self.sent = 0
         self.table = Table().mark("lights")
 
     def update(self) -> None:
-        """Timer, every UPDATE_S: send the table of a new frame."""
-        sensor = self.tab.sensor
-        if self.tab.tabs.value != "Lights" or self.sent == sensor.sent_number:
+        """Send the table of the sensor's frame if it is another one; every UPDATE_S while the panel is open."""
+        sensor = self.sensor
+        if self.sent == sensor.sent_number:
             return
         self.sent = sensor.sent_number
         detections = sensor.result.detections if sensor.result else ()

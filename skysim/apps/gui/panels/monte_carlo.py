@@ -6,13 +6,14 @@ import math
 import signal
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 from nicegui import run, ui
 from pydantic import ValidationError
 
 from skysim.apps.gui.shared import forms, keys
+from skysim.apps.gui.shared.context import PageContext
 from skysim.apps.gui.shared.style import CURVE_COLORS, TOOLTIP, chart_color, format_number
 from skysim.apps.gui.worker.study_process import (
     PAGE_STUDY,
@@ -31,20 +32,29 @@ from skysim.experiments.study.plan import Plan, TrialSection
 from skysim.experiments.study.store import STORE
 from skysim.scene.loader import load
 
-if TYPE_CHECKING:
-    from skysim.apps.gui.page.tab import Tab
-
 POLL_S = 0.5
 TRIAL_KINDS = {"centroids": "centroids", "frames": "rendered frames"}
 
 
 class MonteCarloPanel:
-    """Panel that runs one study at a time."""
+    """Panel that runs one study at a time.
 
-    def __init__(self, tab: Tab) -> None:
-        self.tab, self.process, self.run_number = tab, StudyProcess(Path()), 0
+    out : folder of the studies;  user, tab : the browser and its tab, which are in the names of their folders
+    process : the study;  run_number : of the tab's last Monte Carlo study
+    failed : trials that the page lists, see `StudyResults`
+    stopped : whether the study was stopped and can be continued;  starting : whether its process is being started
+    """
+
+    def __init__(self, page: PageContext, out: Path, user: str, tab: str) -> None:
+        self.page = page
+        self.out = out
+        self.user = user
+        self.tab = tab
+        self.process = StudyProcess(Path())
+        self.run_number = 0
         self.failed: tuple[tuple[int, str], ...] = ()
-        self.stopped = self.starting = False
+        self.stopped = False
+        self.starting = False
         with ui.row().classes("w-full no-wrap items-center gap-2"):
             self.study_select = ui.select({}, value=None).props('dense outlined options-dense aria-label="Study"')
             self.study_select.classes("flex-grow").mark("study").on_value_change(self.study_chosen)
@@ -77,16 +87,17 @@ class MonteCarloPanel:
         self.list_reports()
 
     def set_scene(self) -> None:
-        options = {"": f"Monte Carlo of {Path(self.tab.scene).stem}"}
+        options = {"": f"Monte Carlo of {Path(self.page.state.scene).stem}"}
         options |= {path.stem: f"{path.stem}: {title_of(path)}" for path in sorted(STUDIES.glob("*.yaml"))}
         self.study_select.set_options(options, value=self.study_select.value or "")
-        if self.tab.scene_info:
-            self.field.set_value(round(self.tab.scene_info.field_deg, 3))
+        info = self.page.scene_info
+        if info:
+            self.field.set_value(round(info.field_deg, 3))
         self.show_noise()
 
     def show_noise(self) -> None:
         """Say what the centroids' noise is as an angle, in the middle of the frame."""
-        info = self.tab.scene_info
+        info = self.page.scene_info
         angle = f"{float(self.noise.value or 0) * info.pixel_arcsec:.3g}″" if info else ""
         self.noise_text.set_text(f"noise of a centroid: {angle} an axis")
 
@@ -97,14 +108,22 @@ class MonteCarloPanel:
 
     async def set_field_of_view(self) -> None:
         """Change the scene's field of view by the focal length."""
+        state = self.page.state
+        field_deg = float(self.field.value or 0)
         try:
-            change = await run.io_bound(
-                forms.field_override, self.tab.scene_path, self.tab.overrides, float(self.field.value or 0)
-            )
+            change = await run.io_bound(forms.field_override, state.scene, state.overrides, field_deg)
         except InputError as error:
-            self.tab.show_message(str(error))
+            self.page.show_message(str(error))
             return
-        await self.tab.apply_overrides(change)
+        await self.page.apply_overrides(change)
+
+    def focus(self) -> None:
+        """Give the number of runs the keyboard focus."""
+        keys.focus(self.count)
+
+    def close(self) -> None:
+        """End the study with the page; its trials so far are kept."""
+        self.process.stop(signal.SIGTERM)
 
     async def start_or_stop(self) -> None:
         if not self.process.running:
@@ -125,12 +144,12 @@ class MonteCarloPanel:
             self.starting = False
         if started:
             fault = await self.process.wait()
-            if self.tab.is_open:
+            if self.page.is_open:
                 self.show_end("" if self.stopped else fault)
 
     async def start_process(self) -> bool:
         """Start the process of the chosen study; return whether it could be."""
-        self.tab.show_message("")
+        self.page.show_message("")
         try:
             StudyProcess.check_count()
             path = await run.io_bound(self.study_file)
@@ -138,22 +157,22 @@ class MonteCarloPanel:
             if study.study.optimize is not None:
                 raise InputError(f"{path.stem}: has the key optimize; allowed: studies with a design")
         except InputError as error:
-            self.tab.show_message(str(error))
+            self.page.show_message(str(error))
             return False
-        self.process = StudyProcess(path.parent if not self.study_select.value else self.tab.out / path.stem)
+        self.process = StudyProcess(path.parent if not self.study_select.value else self.out / path.stem)
         self.process.total = study.trials
         self.bar.set_value(0)
         self.button.set_text("Stop")
         self.stopped = False
         self.note.set_text("starting …")
-        self.tab.log(f"study {path.stem}: {study.trials} trials")
-        unused = [] if self.study_select.value else sorted(self.tab.overrides.keys() - study.spec.base.keys())
+        self.page.log(f"study {path.stem}: {study.trials} trials")
+        unused = [] if self.study_select.value else sorted(self.page.state.overrides.keys() - study.spec.base.keys())
         if unused:
-            self.tab.show_message(f"trials of {self.kind.value} do not use {', '.join(unused)}", "quiet")
-        self.tab.set_state(study=self.process.folder.name)
+            self.page.show_message(f"trials of {self.kind.value} do not use {', '.join(unused)}", "quiet")
+        self.page.set_state(study=self.process.folder.name)
         resumable = (self.process.folder / STORE).is_file()
         await self.process.start(path, "resume" if resumable else "run")
-        if not self.tab.is_open:  # closed meanwhile, when there was no process to end
+        if not self.page.is_open:  # closed meanwhile, when there was no process to end
             self.process.stop(signal.SIGTERM)
         return True
 
@@ -171,26 +190,26 @@ class MonteCarloPanel:
             trial |= {"false_lights": int(self.false_lights.value or 0)}
         if not (self.count.value and 1 <= self.count.value <= 100_000):
             raise InputError("runs: allowed: 1 to 100000")
-        settings = self.tab.scene_path, self.effective_overrides(trial), trial, int(self.count.value)
+        scene = forms.absolute_path(self.page.state.scene)
+        settings = scene, self.effective_overrides(scene, trial), trial, int(self.count.value)
         # A stopped run with unchanged settings is resumed from its own file.
         before = self.process.folder / "monte_carlo.yaml"
         if self.stopped and before.is_file() and before.read_text() == monte_carlo(*settings, self.run_number):
             return before
         self.run_number += 1
         text = monte_carlo(*settings, self.run_number)
-        folder = files.make_folder(self.tab.out / f"{PAGE_STUDY}{self.tab.user}_{self.tab.id}_{self.run_number}")
+        folder = files.make_folder(self.out / f"{PAGE_STUDY}{self.user}_{self.tab}_{self.run_number}")
         files.write_text(folder / "monte_carlo.yaml", text)
         return folder / "monte_carlo.yaml"
 
-    def effective_overrides(self, trial: dict[str, Any]) -> dict[str, str]:
+    def effective_overrides(self, scene: str, trial: dict[str, Any]) -> dict[str, str]:
         """The changes of the scene that have an effect on a trial; a study with others would be refused."""
-        overrides = dict(self.tab.overrides)
+        overrides = dict(self.page.state.overrides)
         try:
             section = TrialSection.model_validate({"trial": trial})
         except ValidationError:  # the study's loader says in one line what is wrong
             return overrides
-        scene = load(self.tab.scene_path, overrides)
-        unused = unused_options.unused_overrides(overrides, scene, section.trial)
+        unused = unused_options.unused_overrides(overrides, load(scene, overrides), section.trial)
         return {key: text for key, text in overrides.items() if key not in unused}
 
     def show_end(self, fault: str) -> None:
@@ -200,39 +219,42 @@ class MonteCarloPanel:
             self.show(results)
         done = results.done if results else 0
         if fault:
-            self.tab.show_message(fault)
+            self.page.show_message(fault)
         self.show_count(done)
-        self.tab.log(f"study ended: {done} of {self.process.total} trials")
+        self.page.log(f"study ended: {done} of {self.process.total} trials")
         self.list_reports()
 
     async def show_study(self, name: str) -> None:
         """Show the results of a study of the page's folder, as after a reload; a stopped one can be continued."""
         if self.process.running or self.starting:
             return
-        folder = self.tab.out / name
-        is_here = name and folder.parent == self.tab.out and is_shown(name, self.tab.user)
+        folder = self.out / name
+        is_here = name and folder.parent == self.out and is_shown(name, self.user)
         found = await run.io_bound(stored_study, folder) if is_here else None
         if found is None:
-            self.tab.set_state(study="")
+            self.page.set_state(study="")
             return
-        self.process, study = StudyProcess(folder), found
-        self.process.total, self.stopped = study.trials, True
+        self.process = StudyProcess(folder)
+        self.process.total = found.trials
+        self.stopped = True
         self.study_select.set_value(name if (STUDIES / f"{name}.yaml").is_file() else "")
         if not self.study_select.value:
-            self.set_fields(name, study)
+            self.set_fields(name, found)
         results = await run.io_bound(self.process.results)
-        self.tab.set_state(study=name)
+        self.page.set_state(study=name)
         if results:
             self.show(results)
             self.show_count(results.done)
 
     def set_fields(self, name: str, study: Plan) -> None:
         """Fill in the fields with the settings of a Monte Carlo study of this page, so that Start continues it."""
-        number, trial = name.rpartition("_")[2], study.spec.trial
+        number = name.rpartition("_")[2]
+        trial = study.spec.trial
         self.run_number = int(number) if number.isdigit() else 0
         self.count.set_value(study.trials)
         self.kind.set_value(trial["kind"])
-        noise_px, magnitude_sigma = trial.get("noise_px"), trial.get("magnitude_sigma")
+        noise_px = trial.get("noise_px")
+        magnitude_sigma = trial.get("magnitude_sigma")
         self.with_noise.set_value(noise_px != 0 or magnitude_sigma != 0)
         if self.with_noise.value and noise_px is not None:
             self.noise.set_value(noise_px)
@@ -278,18 +300,18 @@ class MonteCarloPanel:
     async def replay(self, number: int) -> None:
         """Repeat a failed trial and show its frame in the sensor view."""
         study = next(iter(self.process.folder.glob("*.yaml")), STUDIES / f"{self.study_select.value}.yaml")
-        self.tab.stop_playback()
-        photo = await self.tab.run_task(
+        self.page.stop_playback()
+        photo = await self.page.run_task(
             "replay", str(study), str(self.process.folder), number, activity=f"replaying trial {number} …"
         )
         if photo:
-            self.tab.display_photo(photo, kind="replay", study=self.process.folder.name, trial=number)
-            self.tab.log(f"replayed trial {number}: {photo.result.status}")
+            self.page.show_photo(photo, kind="replay", study=self.process.folder.name, trial=number)
+            self.page.log(f"replayed trial {number}: {photo.result.status}")
 
     def list_reports(self) -> None:
         self.reports.clear()
         with self.reports:
-            folders = finished(self.tab.out, self.tab.user)
+            folders = finished(self.out, self.user)
             for folder in folders[:12]:
                 done = time.strftime("%d %b %H:%M", time.localtime((folder / "report.html").stat().st_mtime))
                 with ui.row().classes("w-full no-wrap gap-3"):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from nicegui import run, ui
@@ -15,19 +15,22 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.apps.gui.messages import AmbiguityMap, PlanCheck, SurveyFound, SurveyPlan
+from skysim.apps.gui.panels.run import RunPanel
 from skysim.apps.gui.shared import forms
+from skysim.apps.gui.shared.context import PageContext
 from skysim.apps.gui.shared.style import color_scale
+from skysim.apps.gui.views.space import Scene3D
+from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
 from skysim.experiments.dome_survey import stops
 from skysim.scene.sections.motion import PRESCRIBED
 
-if TYPE_CHECKING:
-    from skysim.apps.gui.page.tab import Tab
-
 # Of a survey that is flown: few frames while the vehicle slews, and a whole exposure in each hold.
-SURVEY_RATE_HZ, HOLD_PERIODS = 0.5, 2.0
-TILT_MARGIN_DEG, TILT_STEPS = 0.5, 61  # to the vehicle's stop, and points of a slew at which its tilt is looked at
+SURVEY_RATE_HZ = 0.5
+HOLD_PERIODS = 2.0
+TILT_MARGIN_DEG = 0.5  # to the vehicle's stop
+TILT_STEPS = 61  # points of a slew at which its tilt is looked at
 FRAMES = 20  # of a survey, at first
 ALIKE = 0.9  # of the LEDs that coincide: a tracker without a prior refuses the field as ambiguous
 UNCHECKED = "Check computes what this scene will show and how accurate its tracker will be. Nothing is rendered."
@@ -42,12 +45,15 @@ UNPLANNED = (
 class PlanPanel:
     """Panel with three parts, each computed at a button's press and cleared when the scene changes.
 
+    scene_3d : in which it colors LEDs;  run_panel : which flies the survey
     taken : frames of the survey, once they are adjusted;  colored : its LEDs and how well it knows each
     legends : what the colors of the LEDs in the 3-D view mean, by what has colored them; the last one is shown
     """
 
-    def __init__(self, tab: Tab) -> None:
-        self.tab = tab
+    def __init__(self, page: PageContext, scene_3d: Scene3D, run_panel: RunPanel) -> None:
+        self.page = page
+        self.scene_3d = scene_3d
+        self.run_panel = run_panel
         self.plan: SurveyPlan | None = None
         self.taken = 0
         self.colored: tuple[NDArray[np.int64], Floats] | None = None
@@ -83,7 +89,7 @@ class PlanPanel:
             column.clear()
             with column:
                 ui.label(text).classes("quiet")
-        info = self.tab.scene_info
+        info = self.page.scene_info
         if not (info and info.surveyed):
             self.clear_survey()
         elif self.colored:
@@ -91,7 +97,7 @@ class PlanPanel:
 
     def color(self, by: str, ids: NDArray[np.int64], values: Floats) -> None:
         """Color LEDs of the 3-D view, and show what that means."""
-        self.tab.scene_3d.color_lights(ids, values)
+        self.scene_3d.color_lights(ids, values)
         for name, legend in self.legends.items():
             legend.set_visibility(name == by)
 
@@ -120,13 +126,13 @@ class PlanPanel:
         try:
             yield
         finally:
-            if self.tab.is_open:
+            if self.page.is_open:
                 self.enable()
 
     # The check.
 
     async def check(self) -> None:
-        found: PlanCheck | None = await self.tab.run_task("check", activity="checking the scene …")
+        found: PlanCheck | None = await self.page.run_task("check", activity="checking the scene …")
         if found is None:
             return
         self.facts.clear()
@@ -143,7 +149,7 @@ class PlanPanel:
     # The ambiguity map.
 
     async def map(self) -> None:
-        found: AmbiguityMap | None = await self.tab.run_task("ambiguity", activity="comparing the fields …")
+        found: AmbiguityMap | None = await self.page.run_task("ambiguity", activity="comparing the fields …")
         if found is None:
             return
         self.fields.clear()
@@ -166,7 +172,7 @@ class PlanPanel:
             question = f"A new survey forgets the {self.taken} frames of this one."
             if self.taken and not await confirmed(question, "Begin anew"):
                 return
-            found: SurveyPlan | None = await self.tab.run_task(
+            found: SurveyPlan | None = await self.page.run_task(
                 "plan_survey", int(self.frames.value or 0), activity="planning the survey …"
             )
             if found is not None:
@@ -176,14 +182,15 @@ class PlanPanel:
     async def adjust(self) -> None:
         """Adjust the dome to the frames flown, and show what they measure and the attitudes to hold next."""
         with self.working():
-            found: SurveyFound | None = await self.tab.run_task(
+            found: SurveyFound | None = await self.page.run_task(
                 "adjust_survey", int(self.frames.value or 0), activity="adjusting the survey …"
             )
             if found is None:
                 return
-            self.taken, lines = found.frames, survey_lines(found)
+            self.taken = found.frames
+            lines = survey_lines(found)
             self.show_survey([*lines, prediction_text(found.plan)], found.plan)
-            self.tab.log(f"survey of {Path(self.tab.scene).name}: {lines[0]}")
+            self.page.log(f"survey of {Path(self.page.state.scene).name}: {lines[0]}")
             if not found.refusal:
                 self.save_map.set_enabled(True)
                 self.colored = found.ids, found.known
@@ -213,24 +220,27 @@ class PlanPanel:
     async def point(self, number: int) -> None:
         """Show the frame at an attitude of the plan."""
         assert self.plan is not None
-        self.tab.stop_playback()
-        await self.tab.show_live(self.tab.session.run("point", self.plan.angles_deg[number], self.tab.solving))
+        self.page.stop_playback()
+        await self.page.show_live("point", self.plan.angles_deg[number], self.page.solving)
 
     async def fly_plan(self) -> None:
         """Change the scene's maneuver to the plan's attitudes, in order, and compute this flight."""
         assert self.plan is not None
-        tab = self.tab
+        scene = self.page.state.scene
         with self.working():
-            flight = survey_flight, tab.scene, dict(tab.overrides), self.plan.angles_deg
-            overrides = await tab.await_result(run.io_bound(*flight))
-            if overrides is not None and await tab.open(tab.scene, overrides):
-                tab.tabs.set_value("Run")
-                await tab.run_panel.simulate()
+            try:
+                overrides = await run.io_bound(survey_flight, scene, self.page.state.overrides, self.plan.angles_deg)
+            except InputError as error:
+                self.page.show_message(str(error))
+                return
+            if self.page.is_open and await self.page.open(scene, overrides):
+                self.page.show_panel("Run")
+                await self.run_panel.simulate()
 
     async def download_map(self) -> None:
-        data: bytes | None = await self.tab.run_task("survey_map")
+        data: bytes | None = await self.page.run_task("survey_map")
         if data is not None:
-            ui.download(data, f"{Path(self.tab.scene).stem}_leds.ecsv")
+            ui.download(data, f"{Path(self.page.state.scene).stem}_leds.ecsv")
 
 
 async def confirmed(question: str, action: str) -> bool:
@@ -295,7 +305,8 @@ def survey_flight(
     """
     before = forms.validated_scene(scene, overrides)
     rate_hz = min(SURVEY_RATE_HZ, before.exposure.rate_hz)
-    legs, at = list[dict[str, object]](), guidance.start_attitude(before.motion)
+    legs: list[dict[str, object]] = []
+    at = guidance.start_attitude(before.motion)
     for angles in angles_deg:
         attitude = stops.from_angles(np.array([angles]))[0]
         if greatest_tilt_deg(at, attitude) > before.vehicle.tilt_stop_deg - TILT_MARGIN_DEG:

@@ -5,21 +5,21 @@ from __future__ import annotations
 import asyncio
 import bisect
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from nicegui import ui
 
 from skysim.apps.gui.messages import FlightStep, FrameRow, MotionLog
 from skysim.apps.gui.panels.strips import StripChart, rms_line, strips
 from skysim.apps.gui.shared import keys
+from skysim.apps.gui.shared.context import PageContext
 from skysim.apps.gui.shared.csv_table import csv_table
 from skysim.apps.gui.shared.forms import FEEDBACKS, loop_overrides
-from skysim.apps.gui.shared.live import LiveInput, LiveText
-
-if TYPE_CHECKING:
-    from skysim.apps.gui.page.tab import Tab
+from skysim.apps.gui.shared.live import Contents, LiveInput, LiveText
+from skysim.apps.gui.views.sensor import Sensor
 
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
 CONTROL_KEYS = ("motion.control", "motion.maneuver")
@@ -31,26 +31,38 @@ DRAW_S = 0.7  # between two drawings of the strips while frames come
 class RunPanel:
     """Panel that computes the flight, plays, pauses, steps and seeks.
 
+    sensor : which shows its frames;  contents : of the tab's live fields
+    feedback : of the scene's controller; None without a controller
     rows, log : of the computed frames and of the motion;  residuals : of the identified lights, see `FlightStep`
     computing, stopping : whether the flight is being computed, and whether it shall end
     playing, showing : whether it plays, and whether `play_on` shows its frames;  slot : of the panel in the page
-    wanted_s : time to be shown once the flight is computed; None: play it from its start
+    wanted_s : time to be shown once the flight is computed; None: play it from its start;  when_shown : called then
     sought : place of the slider while its frame is not shown yet
     index : of the frame on the page;  started_s, from_s : time of the last start of playback, and in the flight there
     closed_scene, closed_overrides : last scene with a closed loop and its overrides, with which an opened loop is
         closed again
     """
 
-    def __init__(self, tab: Tab) -> None:
-        self.tab = tab
-        self.rows, self.log, self.times_s = list[FrameRow](), MotionLog(()), list[float]()
-        self.residuals = list[tuple[float, int, float]]()
+    def __init__(self, page: PageContext, contents: Contents, sensor: Sensor) -> None:
+        self.page = page
+        self.contents = contents
+        self.sensor = sensor
+        self.feedback: str | None = None
+        self.rows: list[FrameRow] = []
+        self.log = MotionLog(())
+        self.times_s: list[float] = []
+        self.residuals: list[tuple[float, int, float]] = []
         self.computing = self.stopping = self.playing = self.showing = False
         self.wanted_s: float | None = None
+        self.when_shown: Callable[[], None] | None = None
         self.sought: int | None = None
         self.plays_when_done = False
-        self.index, self.started_s, self.from_s, self.drawn_s = 0, 0.0, 0.0, 0.0
-        self.closed_scene, self.closed_overrides = "", dict[str, str]()
+        self.index = 0
+        self.started_s = 0.0
+        self.from_s = 0.0
+        self.drawn_s = 0.0
+        self.closed_scene = ""
+        self.closed_overrides: dict[str, str] = {}
         self.slot = ui.context.slot
         self.build()
         ui.on("moment", self.clicked)
@@ -68,13 +80,13 @@ class RunPanel:
             self.loop.props('aria-label="Feedback"').mark("feedback").on("popup-hide", js_handler=keys.BLUR_JS)
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props("instant-feedback")
         with ui.row().classes("w-full no-wrap items-center gap-3"):
-            self.seek = LiveInput(self.tab.contents, "range").props('min=0 step=1 aria-label="Frame of the flight"')
+            self.seek = LiveInput(self.contents, "range").props('min=0 step=1 aria-label="Frame of the flight"')
             self.seek.classes("lab-seek").on("input", self.slid, js_handler="event => emit(event.target.value)")
-            self.clock = LiveText(self.tab.contents).classes("mono flex-none").mark("clock")
+            self.clock = LiveText(self.contents).classes("mono flex-none").mark("clock")
         with ui.row().classes("w-full no-wrap items-center gap-3"):
             self.summary = ui.label().classes("quiet flex-grow").mark("flight")
             self.csv_button = ui.button("CSV", on_click=self.download).props("dense flat size=sm").mark("csv")
-        self.strips = StripChart(self.tab.contents)
+        self.strips = StripChart(self.contents)
         self.enable()
 
     def player_button(self, icon: str, label: str, action: Any) -> ui.button:
@@ -89,7 +101,7 @@ class RunPanel:
         self.seek.props["disabled"] = not self.rows or self.computing
         if self.rows or self.computing:
             return
-        info = self.tab.scene_info
+        info = self.page.scene_info
         self.clock.set_text("")
         self.summary.set_text(
             f"No flight yet. Simulate computes the motion of {info.duration_s:.4g} s and every frame of it."
@@ -97,20 +109,25 @@ class RunPanel:
             else ""
         )
 
-    def set_scene(self) -> None:
-        """Take over a new scene, which has no flight yet."""
+    def set_scene(self, feedback: str | None) -> None:
+        """Take over a new scene, which has no flight yet. feedback : of its controller; None without one"""
         self.pause()
         self.clear()
-        feedback = self.tab.feedback
+        self.feedback = feedback
+        state = self.page.state
         if feedback:
-            self.closed_scene, self.closed_overrides = self.tab.scene, dict(self.tab.overrides)
-        self.loop.set_options(
-            FEEDBACKS if self.closed_scene == self.tab.scene else {"": FEEDBACKS[""]}, value=feedback or ""
-        )
+            self.closed_scene = state.scene
+            self.closed_overrides = dict(state.overrides)
+        offered = FEEDBACKS if self.closed_scene == state.scene else {"": FEEDBACKS[""]}
+        self.loop.set_options(offered, value=feedback or "")
 
     def clear(self) -> None:
-        self.rows, self.log, self.times_s, self.index, self.from_s = [], MotionLog(()), [], 0, 0.0
+        self.rows = []
+        self.log = MotionLog(())
+        self.times_s = []
         self.residuals = []
+        self.index = 0
+        self.from_s = 0.0
         self.seek.set_value(0)
         self.bar.set_value(0)
         self.strips.draw([], 1.0, str)
@@ -118,17 +135,18 @@ class RunPanel:
 
     async def close_loop(self) -> None:
         """Reopen the scene with another feedback. An opened loop can be closed again with its old controller."""
-        current, feedback = self.tab.feedback or "", str(self.loop.value or "")
-        if self.closed_scene != self.tab.scene or feedback == current:
+        state = self.page.state
+        feedback = str(self.loop.value or "")
+        if self.closed_scene != state.scene or feedback == (self.feedback or ""):
             return
-        others = {key: value for key, value in self.tab.overrides.items() if not key.startswith(CONTROL_KEYS)}
+        others = {key: value for key, value in state.overrides.items() if not key.startswith(CONTROL_KEYS)}
         controls = {key: value for key, value in self.closed_overrides.items() if key.startswith(CONTROL_KEYS)}
         maneuver = {key: value for key, value in controls.items() if feedback and key.startswith("motion.maneuver")}
-        control = loop_overrides(self.tab.scene_path, others | controls, feedback)
+        control = loop_overrides(state.scene, others | controls, feedback)
         self.loop.disable()  # no second change while this one runs
-        await self.tab.open(self.tab.scene, others | maneuver | control)
-        if self.tab.is_open:
-            self.loop.set_value(self.tab.feedback or "")  # the old value, if the scene refused the change
+        await self.page.open(state.scene, others | maneuver | control)
+        if self.page.is_open:
+            self.loop.set_value(self.feedback or "")  # the old value, if the scene refused the change
             self.loop.enable()
 
     # Computing.
@@ -146,9 +164,9 @@ class RunPanel:
         self.computing = self.plays_when_done = True
         self.clear()
         self.simulate_button.set_text("Stop")
-        self.tab.show_message("")
+        self.page.show_message("")
         done = await self.compute()
-        if not self.tab.is_open:
+        if not self.page.is_open:
             return
         self.computing = False
         self.simulate_button.set_text("Simulate")
@@ -156,21 +174,22 @@ class RunPanel:
         self.draw()
         self.enable()
         if self.rows:
-            self.tab.log(f"flight of {Path(self.tab.scene).name}: {rms_line(self.rows)}{'' if done else '; stopped'}")
+            flown = f"flight of {Path(self.page.state.scene).name}: {rms_line(self.rows)}"
+            self.page.log(flown if done else f"{flown}; stopped")
         if self.wanted_s is not None:
             await self.show_moment(self.wanted_s)
             self.wanted_s = None
-            self.tab.history.adopt()
+            if self.when_shown:
+                self.when_shown()
         elif self.rows and self.plays_when_done and done:
             self.start()
 
     async def compute(self) -> bool:
         """Compute piece by piece, so that keys and other requests get their turn; return whether it was all."""
-        session = self.tab.session
-        step = await self.tab.await_result(session.run("begin_flight"))
+        step = await self.page.ask("begin_flight")
         while step is not None and step.phase != "done" and not self.stopping:
             self.take(step)
-            step = await self.tab.await_result(session.run("advance_flight", BUDGET_S))
+            step = await self.page.ask("advance_flight", BUDGET_S)
         if step is not None:
             self.take(step)
         self.stopping = False
@@ -195,25 +214,30 @@ class RunPanel:
         self.drawn_s = time.monotonic()
         ends = [*self.log.t_s[-1:], *self.times_s[-1:]]
         lights = () if self.computing else self.residuals  # which are many, and sent once
-        self.strips.draw(strips(self.rows, self.log, lights), max(ends, default=1.0), self.tab.sensor.name)
+        self.strips.draw(strips(self.rows, self.log, lights), max(ends, default=1.0), self.sensor.name)
         if self.rows:
             self.summary.set_text(rms_line(self.rows))
 
-    async def restore(self, t_s: float) -> None:
-        """Show a moment of the flight again; compute the flight first if it is not kept."""
+    async def restore(self, t_s: float, when_shown: Callable[[], None]) -> None:
+        """Show a moment of the flight again; compute the flight first if it is not kept.
+
+        when_shown : called after this computation
+        """
         if self.rows and not self.computing:
             await self.show_moment(t_s)
             return
         self.wanted_s = t_s
+        self.when_shown = when_shown
         if not self.computing:
-            self.tab.tabs.set_value("Run")
+            self.page.show_panel("Run")
             ui.timer(0, self.simulate, once=True)
 
     # Playing.
 
     def start(self) -> None:
-        self.tab.photo.stop()
-        self.playing, self.started_s = True, time.monotonic()
+        self.page.stop_playback()
+        self.playing = True
+        self.started_s = time.monotonic()
         self.play.props("icon=pause")
         with self.slot:  # not in that of a palette's row, which ends with the palette
             ui.timer(0, self.play_on, once=True)
@@ -227,7 +251,9 @@ class RunPanel:
             self.start()
 
     def pause(self) -> None:
-        self.from_s, self.playing, self.plays_when_done = self.now_s, False, False
+        self.from_s = self.now_s
+        self.playing = False
+        self.plays_when_done = False
         self.play.props("icon=play_arrow")
 
     @property
@@ -245,7 +271,8 @@ class RunPanel:
         if self.playing:
             before = SPEEDS[str(event.previous_value)]
             now = time.monotonic()
-            self.from_s, self.started_s = self.from_s + (now - self.started_s) * before, now
+            self.from_s += (now - self.started_s) * before
+            self.started_s = now
 
     async def step(self, frames: int) -> None:
         """Show the next or the previous frame."""
@@ -265,11 +292,13 @@ class RunPanel:
 
     async def slid(self, event: Any) -> None:
         """The slider is dragged: show the frame at its place, of several the newest."""
-        is_showing, self.sought = self.sought is not None, int(event.args)
+        is_showing = self.sought is not None
+        self.sought = int(event.args)
         while not is_showing and self.sought is not None:
             index = self.sought
             if 0 <= index < len(self.rows):
-                self.from_s, self.started_s = self.times_s[index], time.monotonic()
+                self.from_s = self.times_s[index]
+                self.started_s = time.monotonic()
                 await self.show_index(index)
             if self.sought == index:
                 self.sought = None
@@ -280,9 +309,9 @@ class RunPanel:
             return
         self.showing = True
         try:
-            while self.playing and self.rows and self.tab.is_open:
+            while self.playing and self.rows and self.page.is_open:
                 index = max(bisect.bisect_right(self.times_s, self.now_s) - 1, 0)
-                if index != self.index or self.tab.state.kind != "flight":
+                if index != self.index or self.page.state.kind != "flight":
                     await self.show_index(index)
                 if self.index >= len(self.rows) - 1:
                     self.pause()
@@ -298,15 +327,14 @@ class RunPanel:
     async def show_index(self, index: int) -> None:
         """Show a frame of the flight."""
         self.index = index
-        view = await self.tab.await_result(self.tab.session.run("flight_frame", index))
+        view = await self.page.ask("flight_frame", index)
         if view is None or index >= len(self.rows):
             return
         self.seek.set_value(index)
         self.clock.set_text(f"{view.t_s:.2f} s  {index + 1}/{len(self.rows)}")
         self.strips.set_moment(view.t_s)
-        self.tab.set_state(kind="flight", t_s=view.t_s)
-        self.tab.display_frame(view)
-        await self.tab.sensor.wait_drawn()
+        self.page.show_frame(view, kind="flight", t_s=view.t_s)
+        await self.sensor.wait_drawn()
 
     def download(self) -> None:
-        ui.download(csv_table(FrameRow._fields, self.rows), f"{Path(self.tab.scene).stem}_flight.csv")
+        ui.download(csv_table(FrameRow._fields, self.rows), f"{Path(self.page.state.scene).stem}_flight.csv")

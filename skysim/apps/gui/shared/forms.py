@@ -237,6 +237,11 @@ def yaml_line(value: Any) -> str:
     return text.strip().removesuffix("...").strip()
 
 
+def absolute_path(scene: str) -> str:
+    """Absolute path of a scene's file, by which a file in any folder can name it."""
+    return str(find(scene).resolve())
+
+
 def validated_scene(name: str, overrides: Mapping[str, str]) -> Scene:
     """Load the scene with the overrides. Raises InputError if it is invalid or names a file outside its folder."""
     scene = load(name, overrides)

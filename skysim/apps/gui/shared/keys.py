@@ -1,4 +1,4 @@
-"""Keyboard map; the keys of PTASE where it had one (Fialho & Saotome 2005, section 3.1)."""
+"""Keyboard map and its help; the keys of PTASE where it had one (Fialho & Saotome 2005, section 3.1)."""
 
 from __future__ import annotations
 
@@ -48,8 +48,6 @@ KEYS = (
     Key(("F1",), "F1", "help", "help", "show this help"),
     Key(("Escape",), "Esc", "close", "close", "close the help"),
 )
-PERFORMED = {"identify", "noise", "monte_carlo", "play", "live", "attitude", "sensor", "identifier", "runs", "log"}
-PERFORMED |= {"help"}
 ACTION_BY_KEY = {name: key.action for key in KEYS for name in key.keys}
 
 # A list or tab keeps the keyboard focus after a choice, so the focus is removed from it.
@@ -74,3 +72,19 @@ def focus(field: ui.element) -> None:
     list closes, and then takes the focus from the page, whose keys no longer act.
     """
     field.client.run_javascript(f"getElement({field.id}).$el.querySelector('input').focus()")
+
+
+def help_dialog() -> ui.dialog:
+    """A dialog that says what the page is for, and lists its keys."""
+    with ui.dialog() as dialog, ui.card().style("max-width: 600px; padding: 20px 24px; gap: 12px"):
+        ui.label("skysim gui").style("font-weight: 600; font-size: 15px")
+        ui.label(
+            "Point the star sensor, view its frame, and compare the tracker's attitude with the true one. Under a"
+            " dome the angles are the vehicle's (roll, pitch, yaw); under the stars the camera's (RA, Dec, roll)."
+        )
+        with ui.element("div").style("display: grid; grid-template-columns: 110px 1fr; gap: 4px 12px"):
+            for key in KEYS:
+                label = f'<span class="lab-keys" style="padding: 0; border: 0"><kbd>{key.label}</kbd></span>'
+                ui.html(label, sanitize=False)
+                ui.label(key.help)
+    return dialog

@@ -13,7 +13,10 @@ from skysim.apps.gui.messages import Lights, TrackerResult
 from skysim.core.types import Floats
 
 COLORS = {
-    **{"truth": "#7a8cff", "detected": "#dd5a60", "identified": "#6ff0d8", "false": "#e8b90f"},
+    "truth": "#7a8cff",
+    "detected": "#dd5a60",
+    "identified": "#6ff0d8",
+    "false": "#e8b90f",
     "windows": "#7f8a9a",
 }
 KINDS = tuple(COLORS)
@@ -45,7 +48,8 @@ def marks(
     near = near_x & near_y  # of each true light and each detection
     bright = bright_count(visible, ids, near[: len(visible)])
     is_false = ~near.any(axis=0) & bool(len(lights))  # without true lights it is not known
-    true, found = rounded(visible.xy_px), rounded(found_px)
+    true = rounded(visible.xy_px)
+    found = rounded(found_px)
     points: Mapping[str, Points] = {
         "windows": rounded(np.array(result.windows_px).reshape(-1, 2)) if result else [],
         "truth": true[:bright],

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from nicegui import ui
 
 from skysim.apps.gui.messages import Triple
+from skysim.apps.gui.shared.context import PageContext
+from skysim.apps.gui.views.sensor import Sensor
 from skysim.apps.gui.worker.scene.push import Grip
-
-if TYPE_CHECKING:
-    from skysim.apps.gui.page.tab import Tab
 
 COAST_S = 60.0  # after a drag, until the vehicle is held
 
@@ -19,12 +19,15 @@ COAST_S = 60.0  # after a drag, until the vehicle is held
 class PushControl:
     """The drag, and the label and the button that are shown while the vehicle moves.
 
+    moved  : called after each frame of the motion
     grip   : the newest one; None while the vehicle is not held;  held_s : when there was one last
     before : attitude before the push, deg;  motion : of which frames are being computed; None if there is none
     """
 
-    def __init__(self, tab: Tab, canvas: ui.element) -> None:
-        self.tab = tab
+    def __init__(self, page: PageContext, sensor: Sensor, canvas: ui.element, moved: Callable[[], None]) -> None:
+        self.page = page
+        self.sensor = sensor
+        self.moved = moved
         self.grip: Grip | None = None
         self.before: Triple | None = None
         self.motion: object | None = None
@@ -41,31 +44,40 @@ class PushControl:
 
     async def gripped(self, event: Any) -> None:
         """The user drags the vehicle."""
-        self.grip, self.held_s = Grip(tuple(event.args["held"]), tuple(event.args["wanted"])), time.monotonic()
-        if self.motion is None and self.tab.view:
-            grip = self.grip
-            self.tab.stop_playback()
-            self.grip, self.before = grip, self.tab.view.angles_deg
+        grip = Grip(tuple(event.args["held"]), tuple(event.args["wanted"]))
+        view = self.page.view
+        if self.motion is None and view:
+            self.page.stop_playback()  # forgets grip and attitude of an earlier push
+            self.before = view.angles_deg
+            self.hold(grip)
             await self.run()
+        else:
+            self.hold(grip)
+
+    def hold(self, grip: Grip) -> None:
+        self.grip = grip
+        self.held_s = time.monotonic()
 
     def released(self) -> None:
         self.grip = None
 
     async def run(self) -> None:
         """Show frames of the motion, as many as there is time for, until it is stopped."""
-        tab, now_s = self.tab, time.monotonic()
+        page = self.page
         motion = self.motion = object()
+        now_s = time.monotonic()
         while self.motion is motion and now_s - self.held_s < COAST_S:
-            last_s, now_s = now_s, time.monotonic()
-            pushed = await tab.await_result(tab.session.run("push", self.grip, now_s - last_s, tab.solving))
+            last_s = now_s
+            now_s = time.monotonic()
+            pushed = await page.ask("push", self.grip, now_s - last_s, page.solving)
             if pushed is None or self.motion is not motion:
                 break
-            tab.display_live(pushed.view)
-            tab.scene_3d.update()
+            page.show_frame(pushed.view, kind="live", angles_deg=pushed.view.angles_deg)
+            self.moved()
             self.label.set_text(f"{pushed.torque_nm:.3g} N m   {pushed.rate_deg_s:.3g} °/s")
             self.bar.set_visibility(True)
-            await tab.sensor.wait_drawn()
-        if tab.is_open and self.motion is motion:
+            await self.sensor.wait_drawn()
+        if page.is_open and self.motion is motion:
             self.stop()
 
     def stop(self) -> None:
@@ -78,4 +90,4 @@ class PushControl:
         before = self.before
         self.stop()
         if before:
-            await self.tab.show_live(self.tab.session.run("point", before, self.tab.solving))
+            await self.page.show_live("point", before, self.page.solving)

@@ -9,7 +9,7 @@ import math
 from collections.abc import Collection
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import parse_qsl
 
 import cv2
@@ -30,26 +30,26 @@ from skysim.apps.gui.messages import (
     TrackerResult,
 )
 from skysim.apps.gui.shared import keys
-from skysim.apps.gui.shared.live import LiveText
+from skysim.apps.gui.shared.live import Contents, LiveText
 from skysim.apps.gui.views import overlay
-from skysim.apps.gui.views.served import ServedFrame, TabFrames, display_of
+from skysim.apps.gui.views.served import FRAMES, ServedFrame, Source, TabFrames, display_of
 from skysim.apps.gui.views.star_names import NAMES
+from skysim.apps.gui.worker.photo import Photo
 from skysim.core.types import Floats
 from skysim.results import stretch
 from skysim.sources.solar_system.bodies import NAMES as BODIES
-
-if TYPE_CHECKING:
-    from skysim.apps.gui.page.tab import Tab
-    from skysim.apps.gui.worker.photo import Photo
 
 FIRST_START = "The first frame on a machine takes up to a minute, because the code is compiled."
 LABELS = NAMES | BODIES  # by number
 STRETCHES = list(stretch.CURVES)
 COLOR_MAPS = {
-    **{"gray": None, "gray, inverted": None, "viridis": cv2.COLORMAP_VIRIDIS, "cividis": cv2.COLORMAP_CIVIDIS},
-    **{"inferno": cv2.COLORMAP_INFERNO, "hot": cv2.COLORMAP_HOT},
+    "gray": None,
+    "gray, inverted": None,
+    "viridis": cv2.COLORMAP_VIRIDIS,
+    "cividis": cv2.COLORMAP_CIVIDIS,
+    "inferno": cv2.COLORMAP_INFERNO,
+    "hot": cv2.COLORMAP_HOT,
 }
-FRAMES: dict[str, TabFrames] = {}  # by tab
 AHEAD = 2  # frames that the browser fetches while it draws another one
 DRAW_TIMEOUT_S = 1.0  # for the browser to report a drawn frame
 
@@ -61,37 +61,42 @@ class Canvas(ui.element, component="js/frame.js", esm={"skysim-views": "js"}):  
 class Sensor:
     """The view and its controls. It shows a frame of the scene, or another image such as a user's.
 
+    id, contents : of the tab, and its live fields;  source : of pixels, set when the tab has got a worker
     hover_px : place of the light under the mouse, or None
     sent_number : of the last frame sent to the browser;  frames : the newest ones
     """
 
-    def __init__(self, tab: Tab) -> None:
-        self.tab = tab
+    source: Source
+
+    def __init__(self, id: str, contents: Contents) -> None:
+        self.id = id
+        self.contents = contents
         self.shown = {"truth", "identified", "false"}
         self.lights: Lights = NO_LIGHTS
         self.result: TrackerResult | None = None
-        self.size_px, self.prefix = (4, 3), "HIP"
+        self.size_px = (4, 3)
+        self.prefix = "HIP"
         self.lens: Lens | None = None
         self.pose: Pose | None = None
         self.statistics = ""  # numbers of the frame, shown while the mouse is on no light
         self.hover_px: tuple[float, float] | None = None
-        self.sent_number, self.frames = 0, TabFrames(self.announce)
+        self.sent_number = 0
+        self.frames = TabFrames(self.announce)
         self.frame_drawn = asyncio.Event()
         with ui.element("div").classes("lab-sensor"):
             self.build_controls()
             with Canvas().mark("sensor") as self.canvas:
-                self.hover = LiveText(tab.contents).classes("mono").mark("hover")
+                self.hover = LiveText(contents).classes("mono").mark("hover")
             with self.canvas.add_slot("wait"), ui.element("div").classes("lab-wait") as self.wait:
                 # No spinner: each takes a sixth of a core from the worker that it waits for, without a graphics card.
                 self.waited = ui.element("div").classes("lab-waited mono")
                 self.wait_label = ui.label().mark("wait")
-        tab.contents.send = lambda contents: self.canvas.run_method("setContents", contents)
+        contents.send = lambda changed: self.canvas.run_method("setContents", changed)
         self.canvas.on("hover", self.hover_changed)
         self.canvas.on("choose", self.light_chosen)
         self.canvas.on("manual", lambda: self.limits.set_value("manual"))
         self.canvas.on("drawn", self.drawn)
         self.update_display()
-        self.show_setting_up(tab.scene)
 
     def show_setting_up(self, scene: str) -> None:
         """Show that the first frame of a scene is being made."""
@@ -144,9 +149,9 @@ class Sensor:
         if not self.sent_number:
             self.wait.set_visibility(False)
         self.sent_number += 1  # so that each frame has its own address
-        fields = self.fields() | {"contents": self.tab.contents.take()}
-        FRAMES[self.tab.id] = self.frames
-        self.frames.add(self.sent_number, ServedFrame(pixels, fields, self.tab.session), alone)
+        fields = self.fields() | {"contents": self.contents.take()}
+        FRAMES[self.id] = self.frames
+        self.frames.add(self.sent_number, ServedFrame(pixels, fields, self.source), alone)
 
     def announce(self, number: int) -> None:
         """Let the browser request a frame."""
@@ -158,7 +163,7 @@ class Sensor:
         self.frame_drawn.set()
         display = display_of(dict(parse_qsl(str(event.args["display"]))))
         if display:
-            self.tab.session.display = display
+            self.source.display = display
 
     async def wait_drawn(self) -> None:
         """Wait until the browser has few frames to draw, so that they do not queue up there."""
@@ -169,8 +174,8 @@ class Sensor:
             except TimeoutError:
                 return
 
-    def show(self, view: FrameView) -> None:
-        info = self.tab.scene_info
+    def show(self, view: FrameView, info: SceneInfo | None) -> None:
+        """Show a frame of the scene."""
         self.prefix = info.prefix if info else "HIP"
         self.statistics = statistics_text(view.size_px, view.statistics, view.result, view, info)
         self.take(view, info.lens if info else None)
@@ -183,8 +188,10 @@ class Sensor:
 
     def take(self, view: FrameView | Photo, lens: Lens | None) -> None:
         """Take over lights, solution and pointing of a new image, and display it."""
-        self.lights, self.result = view.lights, view.result
-        self.size_px, self.pose = view.size_px, view.pose
+        self.lights = view.lights
+        self.result = view.result
+        self.size_px = view.size_px
+        self.pose = view.pose
         is_new_lens = lens is not self.lens
         if is_new_lens:
             self.lens = lens
@@ -198,7 +205,7 @@ class Sensor:
         self.hover.set_text(self.light_text(*self.nearest(*at)) if at else self.statistics)
 
     def address(self, number: int) -> str:
-        return f"/frame/{self.tab.id}/{number}"
+        return f"/frame/{self.id}/{number}"
 
     def fields(self) -> dict[str, Any]:
         """What frame.js needs beside the pixels: pointing and marks."""

@@ -19,6 +19,7 @@ from skysim.results.stretch import CURVES
 
 MAX_SCREEN_PX = 10**5
 KEPT_FRAMES = 5
+FRAMES: dict[str, TabFrames] = {}  # by tab
 IDLE_S = 2.0  # without a frame, after which a stream ends: a browser has six connections for all of its tabs
 
 
@@ -50,7 +51,8 @@ class ServedFrame:
 
         None if pixels are missing, and the worker has newer images.
         """
-        self.source.display, pixels = display, self.pixels
+        self.source.display = display
+        pixels = self.pixels
         needs_all = whole or not all(display.screen_px)
         if needs_all if pixels.fields["shaded"] else pixels.display.limits != display.limits:
             try:
@@ -85,7 +87,8 @@ class TabFrames:
 
     def add(self, number: int, frame: ServedFrame, alone: bool) -> None:
         """Keep a frame and send it, or its number. alone : not over the stream, because messages belong to it"""
-        self.newest[number], self.added_s = frame, time.monotonic()
+        self.newest[number] = frame
+        self.added_s = time.monotonic()
         self.newest.pop(min(self.newest) if len(self.newest) > KEPT_FRAMES else -1, None)
         self.alone = number if alone else self.alone
         if self.waiting is None or self.drawn < self.alone:
@@ -120,8 +123,10 @@ def display_of(query: Mapping[str, str]) -> Display | None:
     screen : width and height;  near : column and row;  limits : a name or two values in DN;  curve : a name
     """
     try:
-        screen_px, near_px = pair(query.get("screen", "0,0")), pair(query["near"]) if query.get("near") else None
-        limits, curve = limits_from(query.get("limits", LIMITS[0])), query.get("curve", next(iter(CURVES)))
+        screen_px = pair(query.get("screen", "0,0"))
+        near_px = pair(query["near"]) if query.get("near") else None
+        limits = limits_from(query.get("limits", LIMITS[0]))
+        curve = query.get("curve", next(iter(CURVES)))
     except ValueError:
         return None
     return Display(screen_px, limits, curve, near_px) if limits and curve in CURVES else None

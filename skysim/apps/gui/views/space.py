@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import nicegui.elements.scene  # registers three.js with the page  # noqa: F401
 import numpy as np
@@ -11,13 +11,12 @@ from nicegui import ui
 from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo
+from skysim.apps.gui.shared.context import PageContext
 from skysim.apps.gui.shared.style import DARK, color_scale
 from skysim.apps.gui.views.push import PushControl
+from skysim.apps.gui.views.sensor import Sensor
 from skysim.core.types import Floats
 from skysim.dynamics.multibody import Shape
-
-if TYPE_CHECKING:
-    from skysim.apps.gui.page.tab import Tab
 
 VIEWS = {
     "outside": "from beside the laboratory",
@@ -26,7 +25,8 @@ VIEWS = {
     "top": "from above",
 }
 UPDATE_S = 0.1
-AXIS, MOST_AXIS_M = 0.35, 1.2  # length of the axes over the distance from which the laboratory is seen
+AXIS = 0.35  # length of the axes over the distance from which the laboratory is seen
+MOST_AXIS_M = 1.2
 DIGITS = 5  # of meters
 
 
@@ -40,8 +40,9 @@ class Scene3D:
     newest_view : that is not sent yet;  waits : whether `send_newest` will be called
     """
 
-    def __init__(self, tab: Tab) -> None:
-        self.tab = tab
+    def __init__(self, page: PageContext, sensor: Sensor) -> None:
+        self.page = page
+        self.sensor = sensor
         self.newest_view: FrameView | None = None
         self.waits = False
         self.canvas = Space().classes("w-full h-full").mark("space")
@@ -52,7 +53,7 @@ class Scene3D:
                 button.props(f'title="look {text}"').mark(f"look-{name}")
         hint = ui.label("drag: rotate · drag the vehicle: push it · right drag: pan · wheel: zoom")
         hint.classes("lab-turn")
-        self.push = PushControl(tab, self.canvas)
+        self.push = PushControl(page, sensor, self.canvas, self.update)
 
     def look(self, name: str) -> None:
         """Look from a preset, also to undo how the user has turned the view."""
@@ -68,11 +69,9 @@ class Scene3D:
                 "shapes": [shape_fields(shape) for shape in lab.shapes],
                 "lights": light_fields(lab),
                 "views": {name: view._asdict() for name, view in lab.views.items()},
-                **{
-                    "background": DARK["ground"],
-                    "prefix": scene_info.prefix,
-                    "axis": min(AXIS * distance_m, MOST_AXIS_M),
-                },
+                "background": DARK["ground"],
+                "prefix": scene_info.prefix,
+                "axis": min(AXIS * distance_m, MOST_AXIS_M),
             },
         )
 
@@ -94,11 +93,12 @@ class Scene3D:
 
     def update(self) -> None:
         """Send the vehicle's attitude, and the lights that are on the frame and that are identified."""
-        view, self.newest_view = self.newest_view, None
-        if view is None or not self.tab.is_open:
+        view = self.newest_view
+        self.newest_view = None
+        if view is None or not self.page.is_open:
             return
         found = view.result.detections if view.result else ()
-        identified = {spot.id: self.tab.sensor.name(spot.id) for spot in found if spot.id >= 0}
+        identified = {spot.id: self.sensor.name(spot.id) for spot in found if spot.id >= 0}
         fields = {"wxyz": view.body_wxyz, "seen": view.lights.id.tolist()}
         self.canvas.run_method("show", fields | {"identified": list(identified.items())})
 
@@ -106,15 +106,23 @@ class Scene3D:
 def shape_fields(shape: Shape) -> dict[str, Any]:
     """A shape for space.js."""
     return {
-        **{"name": shape.name, "kind": shape.kind, "size": shape.size_m, "position": shape.position_m},
-        **{"wxyz": shape.parent_from_shape_wxyz, "rgba": shape.rgba, "on_vehicle": shape.on_vehicle},
-        **{"vertices": shape.vertices_m.round(DIGITS).ravel().tolist(), "faces": shape.faces.ravel().tolist()},
+        "name": shape.name,
+        "kind": shape.kind,
+        "size": shape.size_m,
+        "position": shape.position_m,
+        "wxyz": shape.parent_from_shape_wxyz,
+        "rgba": shape.rgba,
+        "on_vehicle": shape.on_vehicle,
+        "vertices": shape.vertices_m.round(DIGITS).ravel().tolist(),
+        "faces": shape.faces.ravel().tolist(),
     }
 
 
 def light_fields(lab: LabGeometry) -> dict[str, Any]:
     """The lights for space.js."""
     return {
-        **{"id": lab.ids.tolist(), "place": lab.lights_m.round(DIGITS).ravel().tolist()},
-        **{"radius": lab.radius_m.round(DIGITS).tolist(), "lit": lab.lit.tolist()},
+        "id": lab.ids.tolist(),
+        "place": lab.lights_m.round(DIGITS).ravel().tolist(),
+        "radius": lab.radius_m.round(DIGITS).tolist(),
+        "lit": lab.lit.tolist(),
     }
