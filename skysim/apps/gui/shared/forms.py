@@ -17,7 +17,7 @@ from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import read_yaml, set_key
 from skysim.core.paths import SCENES
 from skysim.core.quantities.units import SI_SUFFIX, si_unit
-from skysim.scene.keys import unused
+from skysim.scene import unused
 from skysim.scene.loader import file_names, find, load, read, with_overrides
 from skysim.scene.scene import NAME_ALIAS, Scene
 from skysim.scene.sections.motion import expand_control
