@@ -110,7 +110,9 @@ class KeyForm:
                 entry.on("keydown.enter", leave).on("blur", leave)
             entry.classes("flex-grow").style("width: 0; margin-bottom: 3px").mark(f"key-{field.key}")
             entry.props(f'hide-bottom-space aria-label="{field.key}"')
-        self.rows[field.key], self.inputs[field.key], self.labels[field.key] = box, entry, head
+        self.rows[field.key] = box
+        self.inputs[field.key] = entry
+        self.labels[field.key] = head
 
     def style_class(self, field: forms.Field) -> str:
         """Style class of a key: changed by the user, set in a file, or default."""

@@ -14,11 +14,14 @@ from skysim.apps.gui.shared.live import Contents
 from skysim.apps.gui.shared.style import CURVE_COLORS, TOOLTIP, chart_color
 
 BAND_COLOR = "#8b95a5"
-STRIP_PX, HEAD_PX, AXIS_PX = 118, 22, 24  # height of a strip, of its title and legend, of the time axis
+STRIP_PX = 118  # height of a strip
+HEAD_PX = 22  # of its title and legend
+AXIS_PX = 24  # of the time axis
 INNER_PX = STRIP_PX - HEAD_PX - 8  # height of a strip between its axes
 MAX_DOTS = 20_000  # of lights; of more, some frames are left out
 Points = list[list[float]]
-LEFT_PX, RIGHT_PX = 52, 12  # of a strip, to the edges of the chart
+LEFT_PX = 52  # from a strip to the left edge of the chart
+RIGHT_PX = 12
 # A click on a strip, and the line of the shown moment over all strips. The line is an element of its own, because the
 # chart would draw all curves again for it.
 CHART_JS = """() => {
@@ -182,7 +185,8 @@ def dot_fields(drawn: list[Strip], name: Callable[[int], str]) -> dict[str, Any]
 
 def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
     """ECharts options of stacked strips; each has a title with its unit and a legend."""
-    text, rule = {":color": chart_color("quiet"), "fontSize": 11}, {"lineStyle": {":color": chart_color("line")}}
+    text = {":color": chart_color("quiet"), "fontSize": 11}
+    rule = {"lineStyle": {":color": chart_color("line")}}
     title_text = {":color": chart_color("text"), "fontWeight": "normal", "fontSize": 12}
     title = {"padding": 0, "left": 0, "textStyle": title_text}
     legend = {"textStyle": text, "itemWidth": 14, "itemHeight": 7, "itemGap": 10, "right": 10, "padding": 0}
@@ -232,7 +236,8 @@ def round_up(value: float) -> float:
 def decades(values: list[float]) -> dict[str, float]:
     """Axis limits: whole decades that contain the values, the uppermost four at most."""
     positive = [value for value in values if value > 0] or [1.0]
-    low, high = math.floor(math.log10(min(positive))), math.ceil(math.log10(max(positive)))
+    low = math.floor(math.log10(min(positive)))
+    high = math.ceil(math.log10(max(positive)))
     return {"min": 10.0 ** max(low, high - 4), "max": 10.0 ** max(high, low + 1)}
 
 

@@ -25,9 +25,21 @@ from skysim.tracking import settings as tracker_settings
 
 # Units of bare numbers by suffix of a key.
 DISPLAY_UNITS = {
-    **{"deg": "deg", "arcsec": "arcsec", "px": "px", "hz": "Hz", "e": "e-", "e_s": "e-/s", "dn": "DN"},
-    **{"mag": "mag", "deg_s": "deg/s", "deg_s2": "deg/s²", "rpm": "rpm", "c": "°C", "e_dn": "e-/DN"},
-    **{"deg_h": "deg/h", "px_s": "px/s"},
+    "deg": "deg",
+    "arcsec": "arcsec",
+    "px": "px",
+    "hz": "Hz",
+    "e": "e-",
+    "e_s": "e-/s",
+    "dn": "DN",
+    "mag": "mag",
+    "deg_s": "deg/s",
+    "deg_s2": "deg/s²",
+    "rpm": "rpm",
+    "c": "°C",
+    "e_dn": "e-/DN",
+    "deg_h": "deg/h",
+    "px_s": "px/s",
 }
 UNIT_SUFFIX = re.compile(rf"_({'|'.join(sorted(DISPLAY_UNITS, key=len, reverse=True))})$")
 SECTIONS = ("vehicle", "motion", "site", "light", "background", "camera", "exposure", "filter", "tracker")
@@ -35,12 +47,30 @@ NO_SECTION = "none"  # the kind of a section that is left out
 # Values of the keys that a kind of section requires, when it is chosen. A kind without them, as of a file, is not
 # offered; nor is another kind of light, which requires another start of the motion.
 FIRST_VALUES: dict[str, Any] = {
-    **{"row_time": "10 us", "fwhm_px": 2, "radius_px": 3, "cutoff_deg": 40, "transmission": [1, 0.8]},
-    **{"angle_deg": [0, 40], "intensity": [1, 0.5]},
-    **{"apex": "1.5 m", "radius": "1.5 m", "semi_axes": ["1.5 m", "1.5 m", "1.3 m"], "axis": "x"},
-    **{"count": 800, "frequency": 16, "spacing": "40 mm", "pitch": "20 mm", "cap_deg": 60},
-    **{"temperature_c": 20, "start_c": 20, "rate_c_h": 1, "mean_c": 20, "amplitude_c": 2, "period": "1 h"},
-    **{"altitude": "500 km", "inclination_deg": 51.6},
+    "row_time": "10 us",
+    "fwhm_px": 2,
+    "radius_px": 3,
+    "cutoff_deg": 40,
+    "transmission": [1, 0.8],
+    "angle_deg": [0, 40],
+    "intensity": [1, 0.5],
+    "apex": "1.5 m",
+    "radius": "1.5 m",
+    "semi_axes": ["1.5 m", "1.5 m", "1.3 m"],
+    "axis": "x",
+    "count": 800,
+    "frequency": 16,
+    "spacing": "40 mm",
+    "pitch": "20 mm",
+    "cap_deg": 60,
+    "temperature_c": 20,
+    "start_c": 20,
+    "rate_c_h": 1,
+    "mean_c": 20,
+    "amplitude_c": 2,
+    "period": "1 h",
+    "altitude": "500 km",
+    "inclination_deg": 51.6,
 }
 ONE_KIND = ("light",)
 
@@ -78,7 +108,8 @@ def fields(name: str, overrides: Mapping[str, str]) -> list[Field]:
     """All keys that a scene has or could have, sections in the order of the README. Raises InputError."""
     scene = load(name, overrides)
     tree = with_overrides(read(find(name))[0], overrides)
-    stages, names = tracker_settings.assumed_settings(scene), tracker_settings.algorithm_names(scene)
+    stages = tracker_settings.assumed_settings(scene)
+    names = tracker_settings.algorithm_names(scene)
     meanings = {f"tracker.{stage}": getattr(stages, stage) for stage in names}
     choices = {f"tracker.{stage}": algorithms for stage, algorithms in names.items()}
     form_fields = [
@@ -102,7 +133,8 @@ def section_fields(model: BaseModel, tree: Any, prefix: str, kinds: tuple[str, .
     """
     for name, info in type(model).model_fields.items():
         file_key = info.alias or SI_SUFFIX.sub("", name)
-        key, value = f"{prefix}{file_key}", getattr(model, name)
+        key = f"{prefix}{file_key}"
+        value = getattr(model, name)
         is_set = isinstance(tree, dict) and file_key in tree
         subtree = tree[file_key] if is_set else None
         annotation: Any = info.annotation
@@ -193,7 +225,8 @@ def with_kind(name: str, overrides: Mapping[str, str], section: str, kind: str) 
         return rest
     if kind == NO_SECTION:
         return rest | {section: "null"}
-    model, now = models(info.annotation)[kind], section_at(load(name, overrides), section)[1]
+    model = models(info.annotation)[kind]
+    now = section_at(load(name, overrides), section)[1]
     kept = {
         info.alias or field: file_value(getattr(now, field), si_unit(field))
         for field, info in (type(now).model_fields.items() if isinstance(now, BaseModel) else ())
@@ -211,10 +244,13 @@ def same_field(model: type[BaseModel], name: str, annotation: Any) -> bool:
 
 def section_at(scene: Scene, key: str) -> tuple[Any, Any]:
     """The field of a dotted key in the schema, and its value in a scene."""
-    info, value = None, scene
+    info: Any = None
+    value: Any = scene
     for part in key.split("."):
-        names = unused.field_names(type(value))
-        info, value = type(value).model_fields[names[part]], getattr(value, names[part])
+        model: type[BaseModel] = type(value)
+        name = unused.field_names(model)[part]
+        info = model.model_fields[name]
+        value = getattr(value, name)
     return info, value
 
 
@@ -245,7 +281,8 @@ def absolute_path(scene: str) -> str:
 def validated_scene(name: str, overrides: Mapping[str, str]) -> Scene:
     """Load the scene with the overrides. Raises InputError if it is invalid or names a file outside its folder."""
     scene = load(name, overrides)
-    tree, folder = scene.model_dump(mode="json", by_alias=True), find(name).resolve().parent
+    tree = scene.model_dump(mode="json", by_alias=True)
+    folder = find(name).resolve().parent
     for key, name in file_names(tree):
         if not any((at / name).resolve().is_relative_to(at) for at in (folder, SCENES)):
             raise InputError(f"{key}: {name!r}: allowed: a file in the scene's own folder")

@@ -48,7 +48,9 @@ class LiveField(ui.element, component="js/live_field.js", esm={"skysim-live": "j
     def __init__(self, contents: Contents, tag: str, type: str = "") -> None:
         super().__init__()
         self.contents = contents
-        self.props["tag"], self.props["type"], self.props["number"] = tag, type, self.id
+        self.props["tag"] = tag
+        self.props["type"] = type
+        self.props["number"] = self.id
 
 
 class LiveText(LiveField):

@@ -69,13 +69,15 @@ class View:
             raise InputError(f"link: view {kind!r}: allowed: {', '.join(KINDS)}")
         try:
             angles = tuple(float(angle) for angle in one["at"].split(",")) if "at" in one else None
-            t_s, trial = float(one.get("t", 0)), int(one.get("trial", -1))
+            t_s = float(one.get("t", 0))
+            trial = int(one.get("trial", -1))
         except ValueError:
             raise InputError("link: at, t, trial: allowed: numbers") from None
         if not all(map(math.isfinite, (*(angles or ()), t_s))) or (angles and len(angles) != 3):
             raise InputError("link: at: allowed: three angles in degrees; t: seconds")
         overrides = dict(value.partition("=")[::2] for key, value in pairs if key == "set")
-        study, photo = one.get("study", ""), one.get("photo", "")
+        study = one.get("study", "")
+        photo = one.get("photo", "")
         return cls(one["scene"], overrides, kind, angles, t_s, study, trial, photo)  # type: ignore[arg-type]
 
     def same_step(self, other: View) -> bool:

@@ -9,12 +9,26 @@ from skysim.core.types import Floats
 
 # Color-blind people can distinguish the colors of states, marks and curves too: tests/apps/gui/test_shell.py.
 DARK = {
-    **{"ground": "#0d1015", "panel": "#141922", "line": "#252c38", "text": "#d7dce4", "quiet": "#8b95a5"},
-    **{"accent": "#5aa9ff", "good": "#4fdcc0", "warn": "#d9b400", "bad": "#e2567f"},
+    "ground": "#0d1015",
+    "panel": "#141922",
+    "line": "#252c38",
+    "text": "#d7dce4",
+    "quiet": "#8b95a5",
+    "accent": "#5aa9ff",
+    "good": "#4fdcc0",
+    "warn": "#d9b400",
+    "bad": "#e2567f",
 }
 LIGHT = {
-    **{"ground": "#f4f6f9", "panel": "#ffffff", "line": "#d3d9e2", "text": "#1b2330", "quiet": "#56606f"},
-    **{"accent": "#1463b8", "good": "#007f78", "warn": "#b05400", "bad": "#8a1040"},
+    "ground": "#f4f6f9",
+    "panel": "#ffffff",
+    "line": "#d3d9e2",
+    "text": "#1b2330",
+    "quiet": "#56606f",
+    "accent": "#1463b8",
+    "good": "#007f78",
+    "warn": "#b05400",
+    "bad": "#8a1040",
 }
 COLORS = {name: f"var(--lab-{name})" for name in DARK}  # in CSS: of the theme
 CURVE_COLORS = ["#3aa6f2", "#e0a82a", "#0d7b84", "#d02f28"]  # of both
@@ -30,8 +44,12 @@ def variables(colors: dict[str, str]) -> str:
 
 
 TOOLTIP = {
-    **{"trigger": "axis", "confine": True, ":backgroundColor": chart_color("panel"), "borderWidth": 1},
-    **{":borderColor": chart_color("line"), "textStyle": {":color": chart_color("text"), "fontSize": 11}},
+    "trigger": "axis",
+    "confine": True,
+    ":backgroundColor": chart_color("panel"),
+    "borderWidth": 1,
+    ":borderColor": chart_color("line"),
+    "textStyle": {":color": chart_color("text"), "fontSize": 11},
 }
 
 
