@@ -27,6 +27,7 @@ from skysim.apps.gui.panels.photo import LIMIT_BYTES
 from skysim.apps.gui.views.served import FRAMES, display_of
 from skysim.apps.gui.worker.session import Workers
 from skysim.apps.gui.worker.study_process import StudyProcess, is_shown
+from skysim.core.constants import DAY_S
 from skysim.scene.loader import find
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
@@ -45,7 +46,7 @@ FRAME_HEADERS = {"cache-control": "no-store", "content-encoding": "identity"}
 FILES = f"/_nicegui/{nicegui.__version__}"
 USER = "skysim_user"  # cookie with the number of a browser
 USER_BYTES = 8
-YEAR_S = 365 * 86400
+YEAR_S = 365 * int(DAY_S)
 QUEUED = "This page opens when another one has been closed."
 CONNECT_TIMEOUT_S = 50.0  # for a browser to load the page
 RECONNECT_S = 6.0  # for a lost browser to reconnect, before its work ends
