@@ -83,5 +83,5 @@ MOST = {
         "skysim/sources": 10,
         "skysim/scene/sections": 10,
     },
-    **{"skysim/experiments/study": 10, "skysim/apps/cli/commands": 11},
+    **{"skysim/experiments/study/execution": 10, "skysim/apps/cli/commands": 11},
 }

@@ -28,8 +28,8 @@ from skysim.core.errors import InputError
 from skysim.core.io import files
 from skysim.core.paths import STUDIES, title_of
 from skysim.experiments.study import loader, unused_options
+from skysim.experiments.study.execution.store import STORE
 from skysim.experiments.study.plan import Plan, TrialSection
-from skysim.experiments.study.store import STORE
 from skysim.scene.loader import load
 
 POLL_S = 0.5
