@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera import thermal
 from skysim.core.types import Floats, Mounting, Telemetry
-from skysim.dynamics.flight_computer import CmgActuator, FlightComputer
+from skysim.dynamics.flight_computer import FlightComputer
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import Simulation
+from skysim.dynamics.multibody.actuators.cmgs import CmgActuator
 from skysim.simulation.lab import StarCamera
 from skysim.tracking.navigation import Navigation
 
