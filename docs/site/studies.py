@@ -14,15 +14,15 @@ import numpy as np
 from skysim.apps.cli.study_summary import trial_count
 from skysim.core.paths import STUDIES
 from skysim.core.types import Floats
-from skysim.experiments.study import store
 from skysim.experiments.study.analysis import answer, axes, search, sensitivity, table
 from skysim.experiments.study.analysis.table import PointRow
+from skysim.experiments.study.execution import store
+from skysim.experiments.study.execution.store import STORE, Store
 from skysim.experiments.study.loader import load
 from skysim.experiments.study.plan import Curve, Heat, Map, Plan
 from skysim.experiments.study.report import figures as study_figures
 from skysim.experiments.study.report import layout, maps, overview
 from skysim.experiments.study.report import page as study_page
-from skysim.experiments.study.store import STORE, Store
 
 PAGES = Path(__file__).parents[1] / "findings" / "studies"
 BESIDE = {"dome_for_the_money": "dome_without_codes"}  # a search whose front is drawn in another one's figure

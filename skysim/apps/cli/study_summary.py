@@ -10,8 +10,8 @@ from skysim.core.errors import printable
 
 if TYPE_CHECKING:
     from skysim.experiments.study.analysis.worst import WorstTrial
+    from skysim.experiments.study.execution.store import Store
     from skysim.experiments.study.plan import Plan
-    from skysim.experiments.study.store import Store
 
 COLUMN_GAP = 2  # characters between two columns of a table
 MAX_ROWS = 60  # printed rows of a table; the report has all

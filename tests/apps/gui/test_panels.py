@@ -22,12 +22,12 @@ from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui import memory
 from skysim.apps.gui.messages import Detection, Lights, TrackerResult
-from skysim.apps.gui.page import forms, keys
-from skysim.apps.gui.page.frame import overlay
-from skysim.apps.gui.page.frame.sensor import FRAMES, Sensor
-from skysim.apps.gui.page.frame.served import TabFrames
-from skysim.apps.gui.page.frame.star_names import NAMES
 from skysim.apps.gui.server import FILES, Guard, KeptFiles, host_of, report_path, user_of
+from skysim.apps.gui.shared import forms, keys
+from skysim.apps.gui.views import overlay
+from skysim.apps.gui.views.sensor import Sensor
+from skysim.apps.gui.views.served import FRAMES, TabFrames
+from skysim.apps.gui.views.star_names import NAMES
 from skysim.apps.gui.worker import export, photo, pixels, playback, study_process, tasks, workbench
 from skysim.apps.gui.worker.photo import SUFFIXES
 from skysim.apps.gui.worker.scene import lens as lenses

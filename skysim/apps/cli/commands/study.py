@@ -37,8 +37,8 @@ from skysim.core.errors import InputError, printable, unknown_name
 if TYPE_CHECKING:
     from skysim.experiments.study.analysis.search import SearchResult
     from skysim.experiments.study.execution.engines import Engine
+    from skysim.experiments.study.execution.store import Store
     from skysim.experiments.study.plan import Plan
-    from skysim.experiments.study.store import Store
 
 app = typer.Typer(invoke_without_command=True, help="Run Monte Carlo studies: many trials of a scene with varied keys.")
 
@@ -274,9 +274,8 @@ def run_and_report(
     resumed       : the store may hold trials already
     repeat_failed : repeat the failed trials too
     """
-    from skysim.experiments.study import store
     from skysim.experiments.study.analysis import search
-    from skysim.experiments.study.execution import runner
+    from skysim.experiments.study.execution import runner, store
 
     path, total = folder_of(study, out) / store.STORE, trial_count(plan)
     resume_command = command(study, out, "resume")
@@ -353,7 +352,7 @@ def analysis(plan: Plan, stored: Store, result: SearchResult | None) -> dict[str
 
 def located(study: str, out: Path | None) -> tuple[str, Path | None]:
     """The study's file and its output folder, where `study` may be the folder with its store. Raises InputError."""
-    from skysim.experiments.study import store
+    from skysim.experiments.study.execution import store
 
     if out is not None or not (Path(study) / store.STORE).is_file():
         return study, out
@@ -417,7 +416,7 @@ def folder_of(study: str, out: Path | None) -> Path:
 
 def open_store(study: str, out: Path | None) -> AbstractContextManager[Store]:
     """The study's store, opened for reading. Raises InputError if there is none."""
-    from skysim.experiments.study import store
+    from skysim.experiments.study.execution import store
 
     return store.open_store(folder_of(study, out) / store.STORE)
 

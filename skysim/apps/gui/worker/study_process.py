@@ -14,8 +14,8 @@ import numpy as np
 import yaml
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import store
-from skysim.experiments.study.store import STORE
+from skysim.experiments.study.execution import store
+from skysim.experiments.study.execution.store import STORE
 from skysim.results import metrics
 
 RESPONSES = {  # label on the page by response

@@ -11,10 +11,10 @@ from skysim.core.io.files import write_text
 from skysim.experiments.study.analysis.axes import axis
 from skysim.experiments.study.analysis.table import PointRow, cells, format_summary
 from skysim.experiments.study.analysis.worst import ColumnsOf
+from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Map, Study
 from skysim.experiments.study.report import figures, layout, maps
 from skysim.experiments.study.report.maps import DirectionMap
-from skysim.experiments.study.store import Store
 from skysim.results.report import embed, render_page
 
 if TYPE_CHECKING:
