@@ -131,14 +131,14 @@ class FlightRecorder:
         return self.of(self.flight.lab.camera).rows
 
     def finish(
-        self, command: str, draw: Callable[[Run, Path], Sequence[Path]] | None, plan: Check
+        self, command: str, plan: Check, draw: Callable[[Lab, Telemetry, Path], Sequence[Path]] | None = None
     ) -> list[dict[str, Any]]:
         """Write tables, images and reports; return the statistics of each camera.
 
         draw : makes pictures of the laboratory for the main camera's report
         """
         main = run_of(self.flight, [() for _ in self.recorders])
-        pictures = draw(main, self.folders[0]) if draw else ()
+        pictures = draw(main.lab, main.telemetry, self.folders[0]) if draw else ()
         statistics = []
         for run, recorder in zip((main, *main.heads.values()), self.recorders.values(), strict=True):
             is_main = run is main

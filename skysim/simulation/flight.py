@@ -8,8 +8,9 @@ controller may use in the next period.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -24,7 +25,6 @@ from skysim.core.types import Floats, Frame, Telemetry, Trajectory, Truth
 from skysim.dynamics import imu
 from skysim.scene.scene import Scene
 from skysim.simulation import timing
-from skysim.simulation.compilation import warm_up
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
 from skysim.simulation.motion import Motion, history_s
@@ -124,9 +124,9 @@ class Flight:
             for number, camera in enumerate(lab.cameras)
         ]
         self.trackers: dict[int, factory.Estimator] = {}
-        self.warmed: set[int] = set()
         self.observations = 0
         self.is_in_shots = False
+        self.reached_s = 0.0  # up to which exposures are taken; the motion may be ahead
         self.flown: Trajectory | None = None
 
     def __enter__(self) -> Self:
@@ -205,10 +205,10 @@ class Flight:
             if first == simulation.step:
                 self.motion.advance(period_steps)
             first = min(first + period_steps, simulation.step)
-            now_s = first * simulation.step_s
-            yield now_s
+            self.reached_s = first * simulation.step_s
+            yield self.reached_s
             if progress:
-                progress(now_s, self.duration_s)
+                progress(self.reached_s, self.duration_s)
 
     @property
     def filter_schedules(self) -> list[Schedule]:
@@ -238,23 +238,45 @@ class Flight:
     # The exposures
 
     def shots(
-        self, *, solves: bool = True, selects: FrameSelector | None = None, progress: Progress | None = None
+        self,
+        *,
+        cameras: Sequence[int] | None = None,
+        solves: bool = True,
+        selects: FrameSelector | None = None,
+        progress: Progress | None = None,
     ) -> Iterator[Shot]:
         """Simulate the rest of the motion; yield every exposure as it becomes due.
 
+        cameras  : numbers of the cameras whose exposures are yielded; all if left out
         solves   : solve the frames; with a filter they are solved in any case
         selects(index, close_s) : whether to render a frame of the main camera. Skipping one does not change the others,
             except that exposure control and filter do not see it
         progress : called as progress(t_s, duration_s) after every control period
         """
+        for shot in self.events(cameras=cameras, solves=solves, selects=selects, progress=progress):
+            if shot is not None:
+                yield shot
+
+    def events(
+        self,
+        *,
+        cameras: Sequence[int] | None = None,
+        solves: bool = True,
+        selects: FrameSelector | None = None,
+        progress: Progress | None = None,
+    ) -> Iterator[Shot | None]:
+        """`shots` that also yields None after every control period, for a caller that has other work to do."""
         self.is_in_shots = True
+        wanted = [n for n in range(len(self.schedules)) if cameras is None or n in cameras]
+        schedules = self.filter_schedules or [self.schedules[n] for n in wanted]
         try:
-            for now_s in self.periods(progress):
-                for schedule in self.schedules:
-                    yield from self.capture_due(schedule, now_s, solves, selects)
-            for schedule in self.schedules:
-                # What would be ready only after the end of the motion no longer updates the filter.
-                yield from self.capture_due(schedule, math.inf, solves, selects)
+            for now_s in itertools.chain(self.periods(progress), [math.inf]):
+                # What would be ready only after the end of the motion, at infinity, no longer updates the filter.
+                for schedule in schedules:
+                    for shot in self.capture_due(schedule, now_s, solves, selects):
+                        if schedule.number in wanted:
+                            yield shot
+                yield None
         finally:
             self.is_in_shots = False
 
@@ -286,7 +308,7 @@ class Flight:
         rate = self.measured_rate(camera, window)
         report = None
         if solves:
-            tracker = self.tracker_of(schedule)
+            tracker = self.tracker_of(schedule, frame)
             report = factory.solve_frame(tracker, frame, rate=rate)
         update_status = ""
         if updates_filter and report and self.motion.navigation:
@@ -294,17 +316,18 @@ class Flight:
             update_status = self.motion.navigation.update_filter(frame.t_mid_s, report.attitude, schedule.number)
         return Shot(camera, frame, truth, report, rate, update_status, clock.seconds)
 
-    def tracker_of(self, schedule: Schedule) -> factory.Estimator:
-        """The tracker of a camera, compiled; external trackers get no other frames than those of the flight."""
+    def tracker_of(self, schedule: Schedule, frame: Frame) -> factory.Estimator:
+        """The tracker of a camera, compiled by a first solution of the frame, so that times are those of solving.
+
+        External trackers are not: each frame must reach them once, in order.
+        """
         number = schedule.number
         if number not in self.trackers:
             own = self.parts.tracker if number == 0 else None
             self.trackers[number] = own or build_tracker(schedule.camera, self.parts.programs)
-        tracker = self.trackers[number]
-        if number not in self.warmed:
-            self.warmed.add(number)
-            warm_up(schedule.camera, self.lab.start, tracker)
-        return tracker
+            if not isinstance(self.trackers[number], factory.UserTracker):
+                factory.solve_frame(self.trackers[number], frame)
+        return self.trackers[number]
 
     def measured_rate(self, camera: StarCamera, window: Window) -> RateEstimate | None:
         """The gyro's rate during an exposure as the tracker gets it; None without `tracker.gyro`."""

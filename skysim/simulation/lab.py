@@ -133,8 +133,8 @@ class Lab:
         camera = self.cameras[number]
         return replace(self, scene=camera.scene, cameras=(camera,))
 
-    def with_tracker(self, scene: Scene) -> Lab:
-        """The same hardware for a scene that differs from this one in trackers only."""
+    def with_scene(self, scene: Scene) -> Lab:
+        """The same hardware for another scene, of which it would be built alike: other trackers, exposures or times."""
         scenes = [scene, *(scene.of_head(n) for n in range(len(scene.heads)))]
         cameras = tuple(replace(camera, scene=own) for camera, own in zip(self.cameras, scenes, strict=True))
         return replace(self, scene=scene, cameras=cameras)

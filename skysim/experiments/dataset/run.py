@@ -77,7 +77,7 @@ class ShardQueue:
 
 
 def labelled_frames(plan: DatasetPlan, shard: int) -> Iterator[tuple[int, dict[str, Any], Setup, LabelledFrame]]:
-    """The frames of a shard: number, level of each factor, test bed, frame with labels."""
+    """The frames of a shard: number, level of each factor, lab, frame with labels."""
     known = None  # settings of the frame before
     for frame in plan.frames_of(shard):
         levels, settings = plan.draw(shard, frame)

@@ -20,7 +20,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Frame, Truth
 from skysim.experiments.dome_survey.stops import STREAM_KEYS, stop_attitudes
 from skysim.scene.scene import Scene
-from skysim.simulation import exposure
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab
 from skysim.tracking import onboard_model
 from skysim.tracking import settings as tracker_settings
@@ -48,7 +48,7 @@ def render_stops(lab: Lab, lab_from_body: Rotation, first: int = 0) -> Iterator[
     """Render a frame at each attitude with the vehicle at rest. `first` is the index of the first frame, which also
     selects its noise."""
     for n, attitude in enumerate(lab_from_body):
-        yield exposure.render_frame(lab.at_rest(attitude, first + n), first + n)
+        yield render_at_rest(lab.camera, attitude, first + n)
 
 
 def take_frames(lab: Lab, lab_from_body: Rotation) -> Iterator[tuple[Frame, Truth, Centroids]]:

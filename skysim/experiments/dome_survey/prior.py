@@ -106,7 +106,7 @@ def survey_uncertainty(
 
 
 def calibration_prior(lab: Lab) -> CalibrationPrior:
-    """The onboard model of the tracker of a test bed. Raises InputError for a scene without a dome."""
+    """The onboard model of the tracker of a lab. Raises InputError for a scene without a dome."""
     light = require_dome(lab.scene)
     leds = onboard_model.assumed_dome(lab.scene, light, lab.camera.sources)
     return prior_of(lab, onboard_model.assumed_camera(lab.scene), leds)

@@ -70,7 +70,7 @@ class Plan:
 def plan_survey(
     scene: Scene, uncertainty: SurveyUncertainty, count: int, tilt_deg: float, kind: str = PLANNED
 ) -> tuple[Lab, CalibrationPrior, Plan]:
-    """The test bed with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
+    """The lab with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
     lab = build_lab(with_survey_errors(scene, uncertainty))
     before = calibration_prior(lab)
     return lab, before, make_plan(lab, before, uncertainty, count, tilt_deg, kind)
@@ -172,7 +172,7 @@ def repeat_survey(lab: Lab, uncertainty: SurveyUncertainty, plan: Plan, repeats:
 
 
 def in_survey(lab: Lab, n: int) -> Lab:
-    """The test bed in another survey: other noise, and other errors of the list, the lever and the IMU."""
+    """The lab in another survey: other noise, and other errors of the list, the lever and the IMU."""
     scene = lab.scene
     again = lab.in_run(scene.seed + n)
     return replace(again, scene=with_config(again.scene, "tracker.survey", seed=scene.tracker.survey.seed + n))

@@ -90,9 +90,10 @@ def check(scene: SceneArg, program: Programs = None, set_: Overrides = None, jso
     """
     from skysim.simulation.checks import check as check_plan
     from skysim.simulation.lab import build_lab
+    from skysim.simulation.user_parts import UserParts
 
     loaded = load(scene, None, None, set_)
-    result = check_plan(build_lab(loaded, used_programs(program, scene_names(loaded))))
+    result = check_plan(build_lab(loaded, UserParts(used_programs(program, scene_names(loaded)))))
     findings = [with_location(finding) for finding in result.findings]
     if json:
         print_json(result._replace(findings=findings).as_dict())
@@ -170,11 +171,12 @@ def check_scene(path: Path, programs: Mapping[str, str]) -> tuple[str, tuple[str
     from skysim.scene import loader
     from skysim.simulation.checks import check as check_plan
     from skysim.simulation.lab import build_lab, build_tracker
+    from skysim.simulation.user_parts import UserParts
 
     scene = loader.load(path)
     try:
-        lab = build_lab(scene, programs)
-        build_tracker(lab.camera)
+        lab = build_lab(scene, UserParts(programs))
+        build_tracker(lab.camera, programs)
         findings = check_plan(lab).findings
     except InputError as error:
         raise InputError(loader.with_location(str(error), str(path), {})) from None

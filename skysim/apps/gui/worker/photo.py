@@ -33,7 +33,6 @@ from skysim.experiments.study.execution.setups import prepared_setup
 from skysim.experiments.study.execution.trials import run_trial
 from skysim.experiments.study.store import STORE
 from skysim.results import scoring, stretch
-from skysim.simulation.run import FrameResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +96,7 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     row = run_trial(plan.spec, segment, trial, segment.replicates[0])
     setup = prepared_setup(plan.spec, segment.settings)
     frame, truth, report = next(replay.replayed_frames(setup, row.seed))
-    result = tracker_result(setup.lab, setup.estimator, FrameResult(frame, truth, report, {}))
+    result = tracker_result(setup.lab, setup.estimator, frame, truth, report)
     if row.error:
         result = TrackerResult(row.error.strip().splitlines()[-1], result.detections, result.ms)
     scene, (height, width) = setup.lab.scene, frame.image_dn.shape

@@ -49,7 +49,7 @@ class Worker:
     display: Display | None = None
     shown: dict[int, tuple[pixels.Levels, float]] = field(default_factory=dict)
     number: int = 0
-    flight: playback.Flight | None = None
+    flight: playback.Playback | None = None
     pushed: Push | None = None
     surveyed: survey.Survey | None = None
     other: photo.Photo | None = None
@@ -148,7 +148,7 @@ class Worker:
             self.pushed = Push(bench.lab, bench.lab_from_body)
         self.pushed.advance(grip, elapsed_s)
         bench.lab_from_body = self.pushed.lab_from_body
-        view = bench.render(self.pushed.seen(bench.next_run()), solve)
+        view = bench.render(bench.next_run().camera, self.pushed.seen(), solve)
         view = self.show_frame(view, self.levels)
         rate_rad_s = np.linalg.norm(self.pushed.simulation.rate_body_rad_s)
         return PushedView(view, float(np.linalg.norm(self.pushed.torque_nm)), math.degrees(rate_rad_s))
@@ -176,7 +176,7 @@ class Worker:
 
     def begin_flight(self) -> FlightStep:
         """Begin to compute the scene's flight; `advance_flight` does the work."""
-        self.flight = playback.Flight(self.workbench)
+        self.flight = playback.Playback(self.workbench)
         return self.flight.advance(0.0)
 
     def advance_flight(self, budget_s: float) -> FlightStep:

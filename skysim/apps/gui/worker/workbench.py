@@ -19,14 +19,15 @@ from skysim.apps.gui.messages import Detection, FrameView, LabGeometry, Lens, Li
 from skysim.apps.gui.worker.scene import geometry, lens
 from skysim.core import quaternion
 from skysim.core.quantities.units import ARCSEC_RAD
-from skysim.core.types import Floats, Frame, Truth
+from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.results import scoring, stretch
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation import exposure
-from skysim.simulation.lab import Lab, build_lab, build_tracker
-from skysim.simulation.run import FrameResult, warm_up_tracker
+from skysim.simulation.compilation import warm_up
+from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
+from skysim.simulation.timing import frame_end_s
 from skysim.tracking import factory
 from skysim.tracking import settings as tracker_settings
 
@@ -65,7 +66,7 @@ class Workbench:
         if before and before.scene == scene:
             return before
         if before and before.scene.model_copy(update={"tracker": scene.tracker}) == scene:
-            lab = replace(before.lab, scene=scene)
+            lab = before.lab.with_scene(scene)
             return replace(before, scene=scene, lab=lab, estimator=warm_tracker(lab))
         lab = build_lab(scene)
         same = before and before.scene.model_copy(update={"tracker": scene.tracker, "camera": scene.camera}) == scene
@@ -100,7 +101,8 @@ class Workbench:
 
     def render_at_rest(self, solve: bool = False) -> FrameView:
         """Render a frame at the current attitude at rest, with independent noise; solve it if `solve`."""
-        return self.render(self.next_run().at_rest(self.lab_from_body), solve)
+        camera = self.next_run().camera
+        return self.render(camera, Trajectory.at_rest(self.lab_from_body, frame_end_s(self.scene, 0)), solve)
 
     def next_run(self) -> Lab:
         """The test bed in a run with its own noise."""
@@ -112,12 +114,12 @@ class Workbench:
         """The tracker's solution of the newest frame; None if it was not solved."""
         if self.frame is None or self.truth is None or self.report is None:
             return None
-        return tracker_result(self.lab, self.estimator, FrameResult(self.frame, self.truth, self.report, {}))
+        return tracker_result(self.lab, self.estimator, self.frame, self.truth, self.report)
 
-    def render(self, lab: Lab, solve: bool) -> FrameView:
-        """Render frame 0 of a lab, solve it if `solve`, and return the view for the page."""
+    def render(self, camera: StarCamera, trajectory: Trajectory, solve: bool) -> FrameView:
+        """Render frame 0 of a camera in motion, solve it if `solve`, and return the view for the page."""
         clock = Clock()
-        self.frame, self.truth = exposure.render_frame(lab, 0)
+        self.frame, self.truth = exposure.render_frame(camera, trajectory, 0)
         self.report = factory.solve_frame(self.estimator, self.frame) if solve else None
         clock.lap("all")
         return self.frame_view(self.frame, self.truth, self.result, clock.seconds["all"])
@@ -142,7 +144,7 @@ class Workbench:
 def warm_tracker(lab: Lab) -> factory.Estimator:
     """The scene's tracker, compiled, so that its first frame's time is that of solving it."""
     tracker = build_tracker(lab.camera)
-    warm_up_tracker(lab, tracker)
+    warm_up(lab.camera, lab.start, tracker)
     return tracker
 
 
@@ -166,9 +168,9 @@ def magnitude_by_id(lab: Lab) -> dict[int, float]:
     return dict(zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True))
 
 
-def tracker_result(lab: Lab, estimator: factory.Estimator, result: FrameResult) -> TrackerResult:
+def tracker_result(lab: Lab, estimator: factory.Estimator, frame: Frame, truth: Truth, report: Report) -> TrackerResult:
     """The tracker's report with its errors relative to the truth."""
-    row, report = scoring.row(result, lab.scene, lab.camera.mount), result.report
+    row = scoring.row(lab.camera, frame, truth, report)
     return TrackerResult(
         row.status,
         detection_views(report, matches_by_row(estimator, report.attitude, report.centroids.xy_px)),

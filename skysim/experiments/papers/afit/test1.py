@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -79,7 +78,7 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
         for stage, lab in enumerate(stands):
             # The same board with nine other LEDs, by another hardware seed.
             scene = with_config(lab.scene, "light.layout", hardware_seed=hardware_seed)
-            other_leds = replace(lab, scene=scene, sources=light_sources(scene, lab.camera.band))
+            other_leds = lab.with_scene(scene).with_camera(sources=light_sources(scene, lab.camera.band))
             rng = random_stream(options.seed, stage, n)
             runs[stage].append(take_board(other_leds, images, rng))
     found_arcsec = lattice_angles(stands[0], options.trials(20, 2), random_stream(options.seed, 2))

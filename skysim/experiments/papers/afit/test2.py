@@ -86,7 +86,7 @@ def place_pair(lab: Lab, place: Place) -> Lab:
     meridian = np.cross(normal, [0.0, 1.0, 0.0])
     positions_m = center_m + np.outer([-PAIR_M / 2, PAIR_M / 2], meridian / np.linalg.norm(meridian))
     pair, homogeneous = lab.camera.sources.take(np.arange(2)), np.column_stack([positions_m, np.ones(2)])
-    return replace(lab, sources=replace(pair, place=homogeneous, normal=np.tile(normal, (2, 1))))
+    return lab.with_camera(sources=replace(pair, place=homogeneous, normal=np.tile(normal, (2, 1))))
 
 
 def point_at(place: Place) -> Rotation:
@@ -241,7 +241,7 @@ def geometric_angle_arcsec(lab: Lab, place: Place) -> float:
     """The pair's angle by eqs 43-45 from its LEDs' projected positions, without rendering."""
     lever = onboard_model.assumed_lever(lab.scene, lab.camera.mount)
     camera = onboard_model.assumed_camera(lab.scene)
-    xy_px = project(point_at(place).inv(), place_pair(lab, place).sources.place[:, :3], lever, camera)
+    xy_px = project(point_at(place).inv(), place_pair(lab, place).camera.sources.place[:, :3], lever, camera)
     return float(separations_arcsec(xy_px, lab)[0])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -20,7 +20,7 @@ from skysim.experiments.papers.afit.test_stand import light_positions_m, pair_an
 from skysim.experiments.papers.published import experiments
 from skysim.scene import loader
 from skysim.scene.sections.motion import AttitudeConfig
-from skysim.simulation import exposure
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import onboard_model
 from skysim.tracking import settings as tracker_settings
@@ -56,7 +56,7 @@ def build_test3(overrides: Mapping[str, str] | None = None) -> Lab:
     """Test 3's lab, with the camera turned so that all five positions are on the detector."""
     lab = build_lab(loader.load("afit_test3_ideal", STATED_IMAGING | dict(overrides or {})))
     cam_from_body = Rotation.from_euler("z", CAMERA_ROTATION_DEG, degrees=True) * lab.camera.mount.cam_from_body
-    return replace(lab, mount=Mount(lab.camera.mount.camera_body_m, cam_from_body))
+    return lab.with_camera(mount=Mount(lab.camera.mount.camera_body_m, cam_from_body))
 
 
 def lab_from_body(angles_deg: Sequence[float]) -> Rotation:
@@ -81,7 +81,7 @@ def photograph(
     settings = tracker_settings.assumed_settings(lab.scene)
     sightings = []
     for seed in rng.integers(2**62, size=images):  # each image in a run of its own, for a random phase of the LEDs
-        frame, truth = exposure.render_frame(lab.in_run(int(seed)).at_rest(lab_from_body), 0)
+        frame, truth = render_at_rest(lab.in_run(int(seed)).camera, lab_from_body)
         priors = FramePriors(None, frame.saturation_dn)
         blobs = DETECTORS["thesis"](frame.image_dn, priors=priors)
         lights = CENTROIDERS["cog"](frame.image_dn, blobs, settings.gain_e_dn, priors)

@@ -22,7 +22,7 @@ from skysim.core.types import Floats, Frame, Truth
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation import exposure
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab, build_obstacles, light_sources
 from skysim.sources.dome.led import Emitter
 from skysim.sources.dome.timing.clocks import build_clocks
@@ -42,19 +42,17 @@ class MeasuredLights(NamedTuple):
 
 
 @cache
-def base_testbed() -> Lab:
+def base_lab() -> Lab:
     """Lab of Test 1, whose vehicle and detector all AFIT scenes share."""
     return build_lab(load("afit_test1_ideal"))
 
 
 def build_test_stand(scene: Scene) -> Lab:
     """Lab of a scene with other lights, lens or electronics; the detector's fixed pattern is computed only once."""
-    lab = base_testbed()
+    lab = base_lab()
     assert isinstance(scene.light, DomeConfig)
     sources = light_sources(scene, lab.camera.band)
-    return replace(
-        lab,
-        scene=scene,
+    return lab.with_scene(scene).with_camera(
         sources=sources,
         clocks=build_clocks(scene.light, sources, scene.seed),
         emitter=Emitter.from_config(scene.light.led),
@@ -66,7 +64,7 @@ def build_test_stand(scene: Scene) -> Lab:
 
 def render_at_attitude(lab: Lab, lab_from_body: Rotation, rng: np.random.Generator) -> tuple[Frame, Truth]:
     """Render a frame at a fixed attitude, in a run of its own: the phase of the LEDs' cycle is random."""
-    return exposure.render_frame(lab.in_run(int(rng.integers(2**62))).at_rest(lab_from_body), 0)
+    return render_at_rest(lab.in_run(int(rng.integers(2**62))).camera, lab_from_body)
 
 
 def gray_levels(frame: Frame, lab: Lab) -> NDArray[np.uint8]:

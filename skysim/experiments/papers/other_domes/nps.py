@@ -30,7 +30,7 @@ from skysim.results.metrics import Summary, proportion
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
 from skysim.scene.sections.light import DomeConfig, FlatSurfaceConfig
-from skysim.simulation import exposure
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import onboard_model, settings
 
@@ -80,7 +80,7 @@ def build_model(camera_m: Floats | None, seed: int, frames: int) -> OnboardModel
         position = lab.camera.sources.place + np.append(shift_m, 0.0)
         height_m += shift_m[2]
         sources, mount = replace(lab.camera.sources, place=position), replace(lab.camera.mount, camera_body_m=camera_m)
-        lab = replace(lab, sources=sources, mount=mount)
+        lab = lab.with_camera(sources=sources, mount=mount)
     no_leds = np.empty(0, np.int64), np.empty((0, 3))
     panel = LedMap(*no_leds, np.zeros(3), np.array([np.inf, np.inf, height_m]))
     rays_of_frames = [rays_body(lab, seed + n) for n in range(frames)]
@@ -93,7 +93,7 @@ def build_model(camera_m: Floats | None, seed: int, frames: int) -> OnboardModel
 
 def rays_body(lab: Lab, seed: int) -> Floats:
     """(N, 3) unit vectors in body axes to the stars of one frame from the level vehicle, brightest first."""
-    frame, _ = exposure.render_frame(lab.in_run(seed), 0)
+    frame, _ = render_at_rest(lab.in_run(seed).camera, lab.start)
     camera = onboard_model.assumed_camera(lab.scene)
     lights = detect_lights(settings.assumed_settings(lab.scene), camera, frame.image_dn)
     return lab.camera.mount.cam_from_body.inv().apply(camera.rays(lights.xy_px))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,7 +68,7 @@ def with_surveyed_map(setup: Setup, sigmas: dict[str, str], seed: int) -> Setup:
     """The same dome with a tracker whose map comes from a survey with position errors and slightly rotated axes."""
     rotation_deg = random_stream(seed, 2).normal(0, LEVEL_SIGMA_DEG, 3)
     survey_errors = SurveyErrorsConfig.model_validate(sigmas | {"rotation_deg": rotation_deg.tolist(), "seed": seed})
-    lab = replace(setup.lab, scene=with_config(setup.lab.scene, "tracker", survey=survey_errors))
+    lab = setup.lab.with_scene(with_config(setup.lab.scene, "tracker", survey=survey_errors))
     return setup._replace(lab=lab, estimator=build_tracker(lab.camera))
 
 

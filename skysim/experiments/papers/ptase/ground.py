@@ -8,7 +8,6 @@ uncalibrated decentering distortion and vibration as the cause of the paper's la
 from __future__ import annotations
 
 import datetime
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import erfa
@@ -17,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.types import ra_dec_roll_rad
 from skysim.core.random_streams import JITTER, random_stream
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.jitter import Vibration
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import bootstrap_interval, sample_std, symmetric_interval
@@ -26,7 +25,7 @@ from skysim.experiments.study.execution.trials import constant_rate
 from skysim.results.metrics import WRONG_RAD, extremum, proportion, rms
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
-from skysim.simulation import exposure
+from skysim.simulation.exposure import render_frame
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.sources import stars
 from skysim.tracking import factory
@@ -113,8 +112,8 @@ def photograph_and_solve(overrides: dict[str, str], local: list[datetime.datetim
     error_rad = np.full(len(local), np.nan)
     for n, time in enumerate(local):
         cam_from_icrs = tripod * itrs_from_icrs(time)
-        testbed_at_time = earth_fixed(at_time(lab.in_run(seed + n), time), cam_from_icrs)
-        frame, _ = exposure.render_frame(testbed_at_time, 0)
+        lab_then = at_time(lab.in_run(seed + n), time)
+        frame, _ = render_frame(lab_then.camera, earth_fixed(lab_then, cam_from_icrs), 0)
         solution = factory.solve_frame(tracker, frame).attitude
         true_deg[n] = paper_angles_deg(cam_from_icrs)
         if solution.cam_from_ref is not None:
@@ -124,19 +123,19 @@ def photograph_and_solve(overrides: dict[str, str], local: list[datetime.datetim
 
 
 def at_time(lab: Lab, local: datetime.datetime) -> Lab:
-    """The test bed under the air and the Moon of a local time."""
-    return replace(lab, scene=lab.scene.model_copy(update={"start_time": local + UTC_LESS_LOCAL}))
+    """The lab under the air and the Moon of a local time."""
+    return lab.with_scene(lab.scene.model_copy(update={"start_time": local + UTC_LESS_LOCAL}))
 
 
-def earth_fixed(lab: Lab, cam_from_icrs: Rotation) -> Lab:
-    """Lab with a motion around the first frame's exposure: the given attitude at mid-exposure, rotation at the
+def earth_fixed(lab: Lab, cam_from_icrs: Rotation) -> Trajectory:
+    """A motion around the first frame's exposure: the given attitude at mid-exposure, rotation at the
     sidereal rate, and the scene's vibration."""
     body_at_middle = cam_from_icrs.inv() * lab.camera.mount.cam_from_body
     earth_rad_s = 2 * np.pi * 1.00273781191135448 / erfa.DAYSEC
     # The sky turns at the sidereal rate about the celestial pole, the z axis of ICRS (precession neglected).
     rate_body = earth_rad_s * body_at_middle.inv().apply([0.0, 0.0, 1.0])
     vibration = Vibration.draw(lab.scene.motion, random_stream(lab.scene.seed, JITTER, 0))
-    return replace(lab, trajectory=vibration.add_to(constant_rate(lab.scene, body_at_middle, rate_body)))
+    return vibration.add_to(constant_rate(lab.scene, body_at_middle, rate_body))
 
 
 def table_2(options: ExperimentOptions) -> ExperimentResult:

@@ -24,8 +24,9 @@ from skysim.results.metrics import Summary, exact, quantile
 from skysim.results.plots import INK, MARKS
 from skysim.scene.loader import load
 from skysim.scene.sections.light import UniformGlowConfig
-from skysim.simulation import exposure
-from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.exposure import render_frame
+from skysim.simulation.lab import StarCamera, build_lab
+from skysim.simulation.timing import exposure_window
 from skysim.tracking.exposure_control import ExposureController
 
 REPEATS = 15
@@ -118,7 +119,8 @@ class ExposureLoop:
         defaults = {"tracker.exposure_control": f"{{mean_dn: {MEAN_DN}}}", "tracker.detector": "sequential"}
         fixed = exposure_override(start_ms) | {"tracker.brightest": str(MAX_CENTROIDS)}
         scene = load("shefex2", defaults | overrides | fixed)
-        self.lab = replace(build_lab(scene), trajectory=Trajectory.at_rest(lab_from_body, 100.0))
+        self.lab = build_lab(scene)
+        self.rest = Trajectory.at_rest(lab_from_body, 100.0)
         self.controller, self.frames = ExposureController(scene), 0
 
     def take_frame(self, glare_e_s: float = 0.0, planets: int = 0) -> float:
@@ -126,23 +128,24 @@ class ExposureLoop:
         lab = self.lab
         if glare_e_s:
             glow = (*lab.scene.background, UniformGlowConfig(kind="uniform", e_s=glare_e_s))
-            lab = replace(lab, scene=lab.scene.model_copy(update={"background": glow}))
+            lab = lab.with_scene(lab.scene.model_copy(update={"background": glow}))
         if planets:
-            lab = replace(lab, sources=with_planets(lab, planets))
-        frame, _ = exposure.render_frame(lab, self.frames, exposure_s=self.controller.exposure_s)
+            lab = lab.with_camera(sources=with_planets(lab.camera, self.rest, planets))
+        window = exposure_window(lab.scene, self.frames, self.controller.exposure_s)
+        frame, _ = render_frame(lab.camera, self.rest, self.frames, window=window)
         self.frames += 1
         self.controller.update(frame)
         return 1e3 * self.controller.exposure_s
 
 
-def with_planets(lab: Lab, count: int) -> Sources:
+def with_planets(camera: StarCamera, rest: Trajectory, count: int) -> Sources:
     """The light sources, with the `count` brightest stars well inside the detector raised to a planet's magnitude."""
-    visible, size_px = exposure.render_frame(lab, 0)[1].sources, np.array(lab.camera.canvas.shape[::-1])
+    visible, size_px = render_frame(camera, rest, 0)[1].sources, np.array(camera.canvas.shape[::-1])
     inside = np.all((visible.xy_px > EDGE_PX) & (visible.xy_px < size_px - EDGE_PX), axis=1)
     chosen = visible.id[inside][np.argsort(-visible.electrons[inside])[:count]]
-    is_planet = np.isin(lab.camera.sources.id, chosen)
-    factor = np.where(is_planet, 10 ** (0.4 * (lab.camera.sources.magnitude - PLANET_MAG)), 1.0)
-    return replace(lab.camera.sources, strength=lab.camera.sources.strength * factor)
+    is_planet = np.isin(camera.sources.id, chosen)
+    factor = np.where(is_planet, 10 ** (0.4 * (camera.sources.magnitude - PLANET_MAG)), 1.0)
+    return replace(camera.sources, strength=camera.sources.strength * factor)
 
 
 def random_attitudes(count: int, seed: int) -> Rotation:

@@ -38,7 +38,7 @@ PRINTED_FIELD_RAD = np.radians(18.57)
 
 
 @cache
-def shefex_testbed() -> Lab:
+def shefex_lab() -> Lab:
     """The scene's lab under the stars of the paper's catalog."""
     return build_lab(load("shefex2", {"light.catalog": "hipparcos_hp6.5"}))
 
@@ -55,21 +55,21 @@ def paper_catalog(name: str) -> StarCatalog:
     return shefex.CATALOGS[name](stars())
 
 
-def testbed_with(star_catalog: StarCatalog) -> Lab:
+def lab_with(star_catalog: StarCatalog) -> Lab:
     """The scene's lab with the stars of a catalog only."""
-    lab = shefex_testbed()
-    return replace(lab, sources=lab.camera.sources.take(np.isin(lab.camera.sources.id, star_catalog.id)))
+    lab = shefex_lab()
+    return lab.with_camera(sources=lab.camera.sources.take(np.isin(lab.camera.sources.id, star_catalog.id)))
 
 
 def apparent(star_catalog: StarCatalog) -> Floats:
     """(N, 3) apparent directions at the scene's start time."""
-    return catalog.apparent(star_catalog, catalog.on_earth(shefex_testbed().scene.start_time))
+    return catalog.apparent(star_catalog, catalog.on_earth(shefex_lab().scene.start_time))
 
 
 @cache
 def pairs() -> PairIndex:
     """Pair index of the chosen catalog, up to the field's diagonal."""
-    camera = onboard_model.calibration(shefex_testbed().scene.camera)
+    camera = onboard_model.calibration(shefex_lab().scene.camera)
     return pair_index.build(apparent(paper_catalog("chosen")), camera.diagonal_rad)
 
 
@@ -88,7 +88,7 @@ class ProcessingChain:
     """
 
     def __init__(self, name: str, threshold_sigma: float, focal_px: float) -> None:
-        scene = shefex_testbed().scene
+        scene = shefex_lab().scene
         self.camera = replace(onboard_model.calibration(scene.camera), focal_px=focal_px)
         self.index = pair_index.build(apparent(paper_catalog(name)), self.camera.diagonal_rad)
         self.settings = Settings(
@@ -141,7 +141,7 @@ class Field(NamedTuple):
 
 def random_fields(count: int, seed: int) -> list[Field]:
     """Random attitudes over the whole sky, with the projected stars of the chosen catalog."""
-    lab = testbed_with(paper_catalog("chosen"))
+    lab = lab_with(paper_catalog("chosen"))
     result = []
     for lab_from_body in Rotation.random(count, rng=random_stream(seed, 0)):
         xy_px, electrons = detections.visible_sources(lab, lab_from_body)

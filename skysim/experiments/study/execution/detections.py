@@ -47,8 +47,8 @@ def visible_sources(lab: Lab, lab_from_body: Rotation) -> tuple[Floats, Floats]:
     return view.xy_px, view.electrons
 
 
-def visible_rows(lab: Lab, lab_from_body: Rotation, t_s: float = 0.0) -> list[View]:
-    """The view at each of B attitudes, all at one time. The sources near all fields are projected at once."""
+def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[View]:
+    """The view at each of B attitudes, all at the scene's start. The sources near all fields are projected at once."""
     R_cam_from_body, camera_body_m = lab.camera.mount.cam_from_body.as_matrix(), lab.camera.mount.camera_body_m
     R_lab_from_body = lab_from_body.as_matrix()
     poses = Poses(
@@ -58,7 +58,7 @@ def visible_rows(lab: Lab, lab_from_body: Rotation, t_s: float = 0.0) -> list[Vi
     each_pose = (Poses(*(part[n : n + 1] for part in poses)) for n in range(len(R_lab_from_body)))
     rows = [in_view(lab.camera.sources, lab.camera.optics, pose, reach=0.0) for pose in each_pose]
     ends = np.cumsum([0, *map(len, rows)])
-    near, sky = lab.camera.sources.take(np.concatenate(rows)), sky_during(lab.camera, t_s)
+    near, sky = lab.camera.sources.take(np.concatenate(rows)), sky_during(lab.camera, 0.0)
     if sky:
         near = sky.stars_seen(near)
     xy_px, distance_m, cos_out, cos_in = project_each(near, lab.camera.optics, poses, ends)

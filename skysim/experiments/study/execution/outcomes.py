@@ -255,12 +255,11 @@ def angles_arcsec(lab_from_other: Rotation | None, log: Telemetry, settle_s: flo
     return np.empty(0) if error_deg is None else 3600 * error_deg[log.t_s >= settle_s]
 
 
-def summarize_flight(lab: Lab, outcomes: list[Outcome], settle_s: float) -> Outcome:
+def summarize_flight(log: Telemetry, outcomes: list[Outcome], settle_s: float) -> Outcome:
     """Outcome of a flight trial from the outcomes of its frames and, with a filter, from its error at every tick."""
     solved = [outcome for outcome in outcomes if outcome.solved]
     x, y, roll = (rms([getattr(one, name) for one in solved]) for name in ("x_arcsec", "y_arcsec", "roll_arcsec"))
     good = [bool(one.solved and not one.wrong) for one in outcomes]
-    log = lab.log
     error = angles_arcsec(log.lab_from_filter, log, settle_s)
     pointing = angles_arcsec(log.lab_from_ref, log, settle_s)
     quarter = len(error) // 4

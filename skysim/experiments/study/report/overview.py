@@ -24,6 +24,7 @@ from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation import checks
 from skysim.simulation.checks.facts import TRACKER_KNOWS, Fact
 from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.user_parts import UserParts
 
 NUMBER = re.compile(r"\d[\d.]*")
 RATE = "trial.rate_deg_s"
@@ -56,7 +57,7 @@ def overview(plan: Plan) -> Overview:
             break
         try:
             scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(point.settings, 0))
-            lab = build_lab(scene, plan.spec.programs)
+            lab = build_lab(scene, UserParts(plan.spec.programs))
             found_here = checks.check(lab, greatest_tilt_deg(scene, trial), trial_rate_rad_s(trial, lab))
         except InputError:
             continue
@@ -136,7 +137,7 @@ def options(factor: Factor) -> list[tuple[object, dict[str, object]]]:
 
 
 def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> list[tuple[str, str]]:
-    """The scene of a test bed, with what the check's facts say of its tracker; how the study varies and repeats it."""
+    """The scene of a lab, with what the check's facts say of its tracker; how the study varies and repeats it."""
     study, scene = plan.study, lab.scene
     changed = "; ".join(f"{key}: {format_setting(value)}" for key, value in study.set.items())
     points = f"at each of {len(plan.points)} points" if plan.points else "a candidate"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -63,10 +62,10 @@ class Push:
             simulation.advance(control)
         self.lab_from_body = Rotation.from_quat(simulation.lab_from_body_wxyz, scalar_first=True)
 
-    def seen(self, lab: Lab) -> Lab:
-        """A test bed of the same scene whose frame 0 sees the motion until now; before it the vehicle was at rest."""
-        window = exposure_window(lab.scene, 0)
-        end_s = window.close_s(lab.scene.camera.height_px) + MARGIN_S
+    def seen(self) -> Trajectory:
+        """A motion of which frame 0 sees what happened until now; before it the vehicle was at rest."""
+        window = exposure_window(self.lab.scene, 0)
+        end_s = window.close_s(self.lab.scene.camera.height_px) + MARGIN_S
         begin = self.simulation.step - math.ceil(self.exposure_s / self.simulation.step_s)
         motion = self.simulation.trajectory(max(begin, self.simulation.first_step))
         t_s, attitudes, rates = motion.t_s + end_s - self.simulation.now_s, motion.lab_from_body, motion.rate_body_rad_s
@@ -74,7 +73,7 @@ class Push:
         if t_s[0] > start_s:
             t_s, rates = np.append(start_s, t_s), np.concatenate([np.zeros((1, 3)), rates])
             attitudes = Rotation.concatenate([attitudes[:1], attitudes])
-        return replace(lab, trajectory=Trajectory(t_s, attitudes, rates))
+        return Trajectory(t_s, attitudes, rates)
 
 
 def pull_torque_nm(grip: Grip | None, lab_from_body: Rotation, inertia_kg_m2: Floats) -> Floats:
