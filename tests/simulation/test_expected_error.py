@@ -269,7 +269,7 @@ def normalized_errors(name: str, count: int, rate_deg_s: float, surveys: bool) -
     for n in range(count):
         if surveys:
             seeded = loader.load(name, {"tracker.survey.seed": str(n)})
-            tracker = build_tracker(lab.with_tracker(seeded).camera)
+            tracker = build_tracker(lab.with_scene(seeded).camera)
         lab_from_body = random_attitude(lab, frames, rng)
         rate = lab.camera.mount.cam_from_body.inv().apply(np.radians(rate_deg_s) * np.array([0.6, 0.8, 0.0]))
         frame, truth = render_moving(lab.in_run(n), lab_from_body, rate)

@@ -238,7 +238,7 @@ def test_a_rolling_shutter_s_truth_is_that_of_its_middle_row() -> None:
     lab = flight.lab
     blind = lab.scene.tracker.model_copy(update={"assumed_row_time_s": 0.0})
     errors = []
-    for one in lab, lab.with_tracker(lab.scene.model_copy(update={"tracker": blind})):
+    for one in lab, lab.with_scene(lab.scene.model_copy(update={"tracker": blind})):
         report = build_tracker(one.camera).solve(frame.image_dn, exposure_s=frame.exposure_s)
         answer = report.attitude
         assert answer.cam_from_ref is not None
