@@ -7,7 +7,7 @@ import pytest
 import scipy
 from scipy.spatial.transform import Rotation
 
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.results import metrics
 from skysim.results.simulate import render_at

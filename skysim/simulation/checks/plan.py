@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.camera import wcs
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
 from skysim.scene.sections.light import DomeConfig, StarsConfig
@@ -44,7 +44,7 @@ class Check(NamedTuple):
 
 
 def check(lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | None = None) -> Check:
-    """Check the plan of a test bed whose motion need not be simulated.
+    """Check the plan of a lab whose motion need not be simulated.
 
     tilt_deg : greatest tilt under a dome, if it is not that of the scene's motion (random attitudes of a study)
     rate_body_rad_s : (3,) rate of all frames in body axes, in place of the motion's, for trials of single frames

@@ -18,7 +18,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui.messages import Detection, FrameView, LabGeometry, Lens, Lights, SceneInfo, TrackerResult
 from skysim.apps.gui.worker.scene import geometry, lens
 from skysim.core import quaternion
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.results import scoring, stretch
 from skysim.scene.loader import load
@@ -105,7 +105,7 @@ class Workbench:
         return self.render(camera, Trajectory.at_rest(self.lab_from_body, frame_end_s(self.scene, 0)), solve)
 
     def next_run(self) -> Lab:
-        """The test bed in a run with its own noise."""
+        """The lab in a run with its own noise."""
         self.rendered_count += 1
         return self.lab.in_run(self.scene.seed + self.rendered_count)
 
