@@ -112,19 +112,20 @@ def test_a_survey_takes_the_last_frame_of_a_hold_if_the_vehicle_rests(pixels: fl
     start_s, exposure_s = guidance.plan(scene.motion).start_s, 0.1
     rate_rad_s = pixels / exposure_s / scene.camera.focal_px
     t_s = [0.0, start_s[1] - 0.01, start_s[1], start_s[2] - 0.11, start_s[2] - 0.09, start_s[3], start_s[4] - 0.2]
-    flight = SimpleNamespace(
+    motion = SimpleNamespace(rate_at=lambda _: np.array([0.0, rate_rad_s, 0.0]))
+    playback = SimpleNamespace(
         bench=SimpleNamespace(scene=scene),
-        moved=SimpleNamespace(trajectory=SimpleNamespace(rate_at=lambda _: np.array([0.0, rate_rad_s, 0.0]))),
+        flight=SimpleNamespace(is_over=True, trajectory=lambda: motion),
         frames=[SimpleNamespace(view=SimpleNamespace(t_s=begin, exposure_s=exposure_s)) for begin in t_s],
     )
-    assert survey.frames_at_rest(flight) == (taken, 2)  # type: ignore[arg-type]
+    assert survey.frames_at_rest(playback) == (taken, 2)  # type: ignore[arg-type]
 
 
 def flight_of(worker: Worker, overrides: dict[str, str]) -> None:
     """Open the scene and compute its flight."""
     worker.open("afit_simsat", overrides, False)
     worker.begin_flight()
-    while worker.advance_flight(10.0).phase != "done":
+    while not worker.advance_flight(10.0).is_done:
         pass
 
 
