@@ -13,7 +13,7 @@ import time
 
 import psutil
 
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.results import metrics
 from skysim.scene.loader import load
 from skysim.simulation import run

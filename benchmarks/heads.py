@@ -18,7 +18,7 @@ from skysim.simulation.run import simulate_motion
 
 from estimator.core.types import Attitude
 from estimator.filter.mekf import AttitudeFilter, GyroModel
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.results.metrics import normalized_error_squared
 from skysim.scene.loader import load_scene
 from skysim.simulation.exposure import render_frame

@@ -19,7 +19,7 @@ from benchmarks.dome_identify import TILT_DEG, Case, trial
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core.camera import Camera
 from estimator.identification.leds.index import build_dome_index
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.scene.sections import layouts

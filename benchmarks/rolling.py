@@ -25,7 +25,7 @@ from estimator.core.types import Attitude, RateEstimate
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Truth
 from skysim.experiments.study.execution.trials import constant_rate
 from skysim.results import metrics

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude, RateEstimate, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, FrameRow, Mount, Truth
 from skysim.results import metrics, report, stretch
 from skysim.results.report import annotate, visible

@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.detector.detector import Detector
 from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.time import tt_jd
 from skysim.core.types import Floats, Mount, Sources, StarSources
 from skysim.dynamics import guidance, multibody
 from skysim.dynamics.multibody.view import mjcf_export
@@ -42,7 +43,7 @@ from skysim.sources.orbit.elements import Elements, read_elements
 from skysim.sources.orbit.satellites import MovingLight, View, known_satellites, random_satellites
 from skysim.sources.photometry import Band
 from skysim.sources.solar_system.bodies import BodyLight, bodies_from
-from skysim.sources.solar_system.observer import GcrsState, Observer, observe_at, site_in_gcrs, tt_jd
+from skysim.sources.solar_system.observer import GcrsState, Observer, observe_at, site_in_gcrs
 from skysim.tracking import factory, settings
 from skysim.tracking.external.interface import TRACKERS
 

@@ -9,18 +9,17 @@ from scipy import integrate
 from skysim.camera.glow import baffle as stray
 from skysim.camera.glow import earth_glow
 from skysim.camera.glow.baffle import stray_of_bodies_e_s_m2, stray_of_earth_e_s_m2
+from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.scene.sections.camera import BaffleConfig
 from skysim.scene.sections.orbit import EarthConfig
 from skysim.simulation.exposure import render_frame, stray_light_e_s
 from skysim.simulation.lab import Lab, bodies_during, build_lab
-from skysim.sources.orbit.earth import RADIUS_M
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
-from skysim.sources.solar_system.magnitudes import SUN_MAG
 
 BAND = Band.from_efficiency(0.5)  # flat from 400 to 1000 nm
-IRRADIANCE = float(star_flux_e_s_m2(SUN_MAG, *SUN, BAND))
+IRRADIANCE = float(star_flux_e_s_m2(SUN_V_MAG, *SUN, BAND))
 EVEN = BaffleConfig(angle_deg=(0, 180), pst=(1e-4, 1e-4))
 STEEP = BaffleConfig(angle_deg=(20, 50, 90, 120), pst=(1e-3, 1e-7, 1e-9, 1e-12))
 DARK_EARTH = EarthConfig(albedo=0.3, airglow_mag_arcsec2=30.0)
@@ -31,7 +30,7 @@ ORBIT = "{kind: circular, altitude: 500 km, inclination_deg: 97, raan_deg: 90, e
 @pytest.fixture
 def sphere(monkeypatch: pytest.MonkeyPatch) -> None:
     """A round Earth without air."""
-    monkeypatch.setattr(earth_glow, "TO_SPHERE", np.full(3, 1 / RADIUS_M))
+    monkeypatch.setattr(earth_glow, "TO_SPHERE", np.full(3, 1 / EARTH_RADIUS_M))
     monkeypatch.setattr(earth_glow, "AIR_M", 1.0)
 
 
@@ -70,7 +69,7 @@ def test_a_far_earth_lights_the_chip_as_lambert_s_sphere(sphere: None, phase_deg
     """E PST (2/3) a (R / d)^2 (sin p + (pi - p) cos p) / pi; the airglow is negligible."""
     phase, far = np.radians(phase_deg), 1000.0
     sun_m = 1.5e11 * np.array([np.sin(phase), 0.0, np.cos(phase)])
-    place_m = np.array([0.0, 0.0, far * RADIUS_M])
+    place_m = np.array([0.0, 0.0, far * EARTH_RADIUS_M])
     light = stray_of_earth_e_s_m2(EVEN, DARK_EARTH, place_m, sun_m, np.array([1.0, 0.0, 0.0]), BAND)
     law = (np.sin(phase) + (np.pi - phase) * np.cos(phase)) / np.pi
     assert light == pytest.approx(IRRADIANCE * 1e-4 * 0.3 * 2 / 3 / far**2 * law, rel=0.004)
@@ -82,16 +81,16 @@ def test_a_near_earth_lights_the_chip_as_its_ground_does(sphere: None, sun_deg: 
 
     sun_deg : from the zenith;  boresight_deg : above the horizontal plane
     """
-    place_m, sun, up = np.array([0.0, 0.0, RADIUS_M + 700e3]), np.radians(sun_deg), np.radians(boresight_deg)
+    place_m, sun, up = np.array([0.0, 0.0, EARTH_RADIUS_M + 700e3]), np.radians(sun_deg), np.radians(boresight_deg)
     sun_m = 1.5e11 * np.array([np.sin(sun), 0.0, np.cos(sun)])
     boresight = np.array([0.0, np.cos(up), np.sin(up)])
-    edge = np.arccos(RADIUS_M / place_m[2])
+    edge = np.arccos(EARTH_RADIUS_M / place_m[2])
     colatitude, longitude = (part.ravel() for part in np.meshgrid((np.arange(600) + 0.5) * edge / 600, steps(600)))
     normal = np.column_stack(
         [*(np.sin(colatitude) * np.array([np.cos(longitude), np.sin(longitude)])), np.cos(colatitude)]
     )
-    area_m2 = RADIUS_M**2 * np.sin(colatitude) * (edge / 600) * (2 * np.pi / 600)
-    toward = RADIUS_M * normal - place_m
+    area_m2 = EARTH_RADIUS_M**2 * np.sin(colatitude) * (edge / 600) * (2 * np.pi / 600)
+    toward = EARTH_RADIUS_M * normal - place_m
     d_m = np.linalg.norm(toward, axis=1)
     emission = -np.sum(toward * normal, axis=1) / d_m
     through = 10 ** np.interp(np.degrees(np.arccos(toward @ boresight / d_m)), STEEP.angle_deg, np.log10(STEEP.pst))

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics
 from skysim.camera.thermal import Hardware, at_time, temperature_c
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Mount, Sources
 from skysim.scene import loader
 from skysim.scene.sections.thermal import ThermalConfig

@@ -19,7 +19,7 @@ from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.quantities.tolerance import ErrorSchema, ToleranceConfig
 from skysim.core.quantities.units import SI_SUFFIX, ConfigModel
-from skysim.dynamics.actuators import STEERING
+from skysim.dynamics.multibody.actuators.cmgs import STEERING
 from skysim.dynamics.guidance import LEGS
 from skysim.dynamics.jitter import SPECTRA
 from skysim.scene import loader, scene

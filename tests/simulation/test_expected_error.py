@@ -9,7 +9,7 @@ import pytest
 import scipy
 from scipy.spatial.transform import Rotation
 
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Trajectory
 from skysim.results import metrics
 from skysim.scene import loader

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.heads import gain, measured_pairs
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.results import run as results
 from skysim.scene.loader import load_scene
 from skysim.simulation import run

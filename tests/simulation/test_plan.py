@@ -12,8 +12,8 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.dynamics import multibody
 from skysim.scene import loader
 from skysim.simulation import exposure, run

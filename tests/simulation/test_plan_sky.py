@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.simulation import exposure, run

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude
 from estimator.filter.mekf import Update
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Sources
 from skysim.scene import loader
 from skysim.scene.sections.leds import ClockConfig

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration.mass_properties.record import BearingRecord
+from skysim.core.constants import RPM_RAD_S
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import RPM_RAD_S
 from skysim.core.random_streams import BALANCE, random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody

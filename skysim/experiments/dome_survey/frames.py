@@ -15,6 +15,7 @@ from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
+from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Frame, Truth
@@ -27,7 +28,6 @@ from skysim.tracking import settings as tracker_settings
 
 NOISE_FRAMES = 4  # by which the noise of a centroid is determined
 MIN_LIGHTS = 10
-NORMAL_MEDIAN = 0.6745  # median of the absolute value of a standard normal number
 LEAST_NOISE_PX = 1e-4
 SAME_LIGHT_PX = 2.0  # greatest distance of a centroid from the true image
 
@@ -76,7 +76,7 @@ def centroid_noise_px(lab: Lab, tilt_deg: float) -> float:
             f"survey: {len(error_px)} lights in {NOISE_FRAMES} frames; allowed: {MIN_LIGHTS} or more: brighter LEDs,"
             " more of them, or a longer exposure"
         )
-    return max(float(np.median(np.abs(error_px))) / NORMAL_MEDIAN, LEAST_NOISE_PX)
+    return max(float(np.median(np.abs(error_px))) / MAD_PER_SIGMA, LEAST_NOISE_PX)
 
 
 def imu_attitudes(scene: Scene, lab_from_body: Rotation, sigma_rad: float) -> Rotation:

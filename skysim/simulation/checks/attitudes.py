@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount
 from skysim.dynamics import guidance, multibody
@@ -22,7 +23,6 @@ from skysim.simulation.lab import Lab
 MAX_FRAMES = 400  # frames at which the reference is evaluated to find the fastest and the most tilted one
 FRAMES = 16  # frames that are checked
 DIRECTIONS = 48  # attitudes that the motion could reach
-GOLDEN_RAD = math.pi * (3 - math.sqrt(5))  # between successive azimuths of a Fibonacci spiral
 GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
 
 
@@ -113,13 +113,13 @@ def within_reach(scene: Scene, mount: Mount, frames: Attitudes, tilt_deg: float 
     turn_rad = 2 * np.pi * np.mod(n / GOLDEN_RATIO, 1.0)
     if isinstance(scene.light, StarsConfig):
         zenith_rad = np.arccos(1 - 2 * (n + 0.5) / DIRECTIONS)
-        lab_from_cam = Rotation.from_euler("ZYZ", np.column_stack([n * GOLDEN_RAD, zenith_rad, turn_rad]))
+        lab_from_cam = Rotation.from_euler("ZYZ", np.column_stack([n * GOLDEN_ANGLE_RAD, zenith_rad, turn_rad]))
         lab_from_body = lab_from_cam * mount.cam_from_body
     else:
         greatest_rad = greatest_tilt_rad(scene, frames) if tilt_deg is None else math.radians(tilt_deg)
         cosine = math.cos(greatest_rad)
         tilt_rad = np.arccos(1 - n / (DIRECTIONS - 1) * (1 - cosine))  # the last one is the greatest tilt
-        azimuth_rad = n * GOLDEN_RAD
+        azimuth_rad = n * GOLDEN_ANGLE_RAD
         # With a yaw of minus the azimuth, the tilt is about a horizontal axis.
         angles = np.column_stack([azimuth_rad, tilt_rad, turn_rad - azimuth_rad])
         lab_from_body = Rotation.from_euler("ZYZ", angles)

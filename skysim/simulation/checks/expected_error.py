@@ -43,7 +43,7 @@ from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
 from estimator.identification.stars.search import WRONG_FOCAL
 from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY
 from skysim.camera.optics import Optics
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import RollingShutterConfig
 from skysim.scene.sections.light import StarsConfig

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.psf.otf import blur_radius_px
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, beliefs

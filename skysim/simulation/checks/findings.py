@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.camera import thermal
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig, TwoStopsConfig

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.camera import wcs
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
 from skysim.scene.sections.light import DomeConfig, StarsConfig

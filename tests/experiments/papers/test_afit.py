@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from skysim.core.quantities.units import INCH_M
+from skysim.core.constants import INCH_M
 from skysim.experiments.configs import with_config
 from skysim.experiments.papers.afit import led_tests, surface, test1, test2
 from skysim.experiments.papers.afit.test2 import PAIR_M, Place, geometric_angle_arcsec

@@ -18,7 +18,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui.messages import Detection, FrameView, LabGeometry, Lens, Lights, SceneInfo, TrackerResult
 from skysim.apps.gui.worker.scene import geometry, lens
 from skysim.core import quaternion
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.results import scoring, stretch
 from skysim.scene.loader import load

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import Lever, on_surface
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.core.camera import Camera
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Mount, Truth
 from skysim.experiments.dome_survey.adjust import lens_sigma
 from skysim.experiments.dome_survey.prior import CalibrationPrior

@@ -19,7 +19,7 @@ from estimator.catalog.catalog import unit
 from estimator.catalog.pair_buckets import PairCatalog, build_pair_catalog, candidates
 from estimator.core.arrays import Ints
 from estimator.identification.published.saa_search import Gates, SearchInput, build_primary, gate_rad, match_assumptions
-from skysim.core.quantities.units import ARCSEC_RAD, INCH_M
+from skysim.core.constants import ARCSEC_RAD, INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, imu

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from skysim.core.quantities.units import INCH_M
+from skysim.core.constants import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.configs import with_config

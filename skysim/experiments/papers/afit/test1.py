@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration.home_position import pooled
+from skysim.core.constants import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
@@ -185,7 +186,7 @@ def draw_angles(fig: Any, angles_arcsec: Floats) -> None:
     axes = fig.subplots()
     axes.hist(angles_arcsec.ravel(), np.arange(1200, 4000, 20), color=INK[0], label="ours")
     # Angles about the bearing of two LEDs of the lattice, in a board at 48 in.
-    for n, angle_rad in enumerate(2 * np.arctan(PITCH_M * np.sqrt(SQUARED_DISTANCES) / 2 / (48 * 0.0254))):
+    for n, angle_rad in enumerate(2 * np.arctan(PITCH_M * np.sqrt(SQUARED_DISTANCES) / 2 / (48 * INCH_M))):
         label = "8 mm lattice" if n == 0 else None
         axes.axvline(np.degrees(angle_rad) * 3600, ls="--", color=INK[1], label=label)
     axes.set(xlabel="angle of a pair (arcsec)", ylabel="pairs in all images")

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import project
-from skysim.core.quantities.units import INCH_M
+from skysim.core.constants import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.configs import with_config

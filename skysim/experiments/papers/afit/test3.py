@@ -18,7 +18,7 @@ from estimator.attitude.dome_map import project
 from estimator.calibration.home_position import Sighting
 from estimator.catalog.catalog import unit
 from estimator.catalog.pair_buckets import bucket_of, build_pair_catalog
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.afit.test3_images import (

@@ -17,7 +17,7 @@ from estimator.core.errors import ImageError
 from estimator.core.types import FramePriors
 from estimator.detection import detect
 from skysim.camera.optics import Optics
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Truth
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.render import Poses, in_view, project
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
 from skysim.experiments.configs import with_config

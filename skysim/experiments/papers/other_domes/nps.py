@@ -20,7 +20,7 @@ from estimator.attitude.solvers import quest
 from estimator.catalog import pair_index
 from estimator.catalog.pair_index import PairIndex
 from estimator.identification.published.master_star import master_star
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey.frames import detect_lights

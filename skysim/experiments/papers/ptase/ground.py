@@ -15,7 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import ra_dec_roll_rad
+from skysim.core.constants import DAY_S, EARTH_RATE_RAD_S
 from skysim.core.random_streams import JITTER, random_stream
+from skysim.core.time import J2000_JD, tt_days, utc_days
 from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.jitter import Vibration
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
@@ -32,7 +34,7 @@ from skysim.tracking import factory
 
 SITE_DEG = (-23.2, -45.9)  # latitude, longitude of Sao Jose dos Campos
 UTC_LESS_LOCAL = datetime.timedelta(hours=3)
-TT_LESS_UTC_S, UT1_LESS_UTC_S = 64.184, -0.36  # in October 2003
+UT1_LESS_UTC_S = -0.36  # in October 2003 (IERS)
 LOCAL_TIMES = [datetime.datetime(2003, 10, 2, *at) for at in ((19, 55, 22), (20, 1, 56), (20, 7, 0), (20, 11, 30))]
 ROWS, ANGLES = ("1", "2", "3", "4"), ("ra", "dec", "roll")
 ATTEMPTS = 18
@@ -50,9 +52,9 @@ FITTED_JITTER = "[{kind: line, frequency_hz: 1, rms_arcsec: [22, 22, 22]}]"  # a
 
 def itrs_from_icrs(local: datetime.datetime) -> Rotation:
     """The Earth's attitude: precession, nutation and rotation (SOFA's c2t06a); polar motion is neglected."""
-    days = (local + UTC_LESS_LOCAL - datetime.datetime(2000, 1, 1, 12)) / datetime.timedelta(1)
-    tt, ut1 = days + TT_LESS_UTC_S / erfa.DAYSEC, days + UT1_LESS_UTC_S / erfa.DAYSEC
-    return Rotation.from_matrix(erfa.c2t06a(erfa.DJ00, tt, erfa.DJ00, ut1, 0.0, 0.0))
+    utc = local + UTC_LESS_LOCAL
+    ut1_days = utc_days(utc) + UT1_LESS_UTC_S / DAY_S
+    return Rotation.from_matrix(erfa.c2t06a(J2000_JD, tt_days(utc), J2000_JD, ut1_days, 0.0, 0.0))
 
 
 def cam_from_itrs() -> Rotation:
@@ -131,9 +133,8 @@ def earth_fixed(lab: Lab, cam_from_icrs: Rotation) -> Trajectory:
     """A motion around the first frame's exposure: the given attitude at mid-exposure, rotation at the
     sidereal rate, and the scene's vibration."""
     body_at_middle = cam_from_icrs.inv() * lab.camera.mount.cam_from_body
-    earth_rad_s = 2 * np.pi * 1.00273781191135448 / erfa.DAYSEC
     # The sky turns at the sidereal rate about the celestial pole, the z axis of ICRS (precession neglected).
-    rate_body = earth_rad_s * body_at_middle.inv().apply([0.0, 0.0, 1.0])
+    rate_body = EARTH_RATE_RAD_S * body_at_middle.inv().apply([0.0, 0.0, 1.0])
     vibration = Vibration.draw(lab.scene.motion, random_stream(lab.scene.seed, JITTER, 0))
     return vibration.add_to(constant_rate(lab.scene, body_at_middle, rate_body))
 

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.detection.detect import DETECTORS
 from estimator.detection.shefex import maximum_scan, sequential_scan
+from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources, Trajectory
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
@@ -55,7 +56,7 @@ def scan_times(options: ExperimentOptions) -> ExperimentResult:
 def scan_time_s(scan: Callable[..., Any], image: NDArray[Any]) -> float:
     """Minimum run time of REPEATS repeats in seconds; other load on the machine can only lengthen a repeat."""
     # Background noise from the median absolute deviation, 1.4826 MAD = sigma for a normal distribution.
-    level, noise = float(np.median(image)), 1.4826 * float(np.median(np.abs(image - np.median(image))))
+    level, noise = float(np.median(image)), SIGMA_PER_MAD * float(np.median(np.abs(image - np.median(image))))
     times_s = []
     for _ in range(REPEATS + 1):  # the first one compiles
         begin = time.perf_counter()

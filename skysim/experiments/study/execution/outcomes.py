@@ -15,8 +15,8 @@ from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core import quaternion
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.jit import jit
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats, Telemetry, Truth
 from skysim.results import metrics
 from skysim.results.telemetry_report import attitude_error_deg

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.experiments.study.analysis.table import format_level
 from skysim.experiments.study.designs import Point, make_point

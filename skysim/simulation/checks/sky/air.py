@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context
 from skysim.simulation.checks.facts import Samples, short
