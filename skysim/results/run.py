@@ -20,8 +20,9 @@ from skysim.core.errors import InputError
 from skysim.core.io.files import make_folder, write_image, write_table
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Frame, FrameRow, Telemetry, Truth
-from skysim.results import report, scoring, stretch, telemetry_report
+from skysim.results import annotate, run_report, scoring, stretch, telemetry_report
 from skysim.results.files.frames import remove_results, write_frame
+from skysim.results.report.as_html import embed
 from skysim.scene.scene import Scene
 from skysim.simulation import exposure
 from skysim.simulation import run as simulation
@@ -186,7 +187,7 @@ class Recorder:
         write_frame(self.folder, frame, truth, self.testbed.scene)
         path = self.folder / f"frame_{frame.index:04d}.fits"
         if preview:
-            write_image(path.with_suffix(".preview.png"), report.annotate_truth(frame.image_dn, truth.sources))
+            write_image(path.with_suffix(".preview.png"), annotate.annotate_truth(frame.image_dn, truth.sources))
         return path
 
     def finish(self, command: str, pictures: Sequence[Path] = ()) -> dict[str, Any]:
@@ -204,23 +205,25 @@ class Recorder:
         flight = telemetry_report.figure(log) if len(self.rows) > 1 or log.t_s[-1] > SHORT_S else b""
         plan = self.plan or check(self.testbed)
         facts = [(name, [text]) for name, text in scene.summary] + [(fact.name, fact.lines) for fact in plan.facts]
-        report.write_page(
-            page,
+        motion = telemetry_report.summary(log)
+        report = run_report.run_report(
             scene.title,
             command,
             names,
             self.rows,
-            stages_ms,
-            annotated,
-            flight,
-            pictures,
-            facts,
-            plan.findings,
+            stages_ms=stages_ms,
+            annotated=annotated,
+            motion=motion,
+            motion_figure=flight,
+            views=pictures,
+            facts=facts,
+            findings=plan.findings,
         )
-        return report.summary(self.rows) | {
+        report.save(page)
+        return run_report.summary(self.rows) | {
             "stages_ms": stages_ms,
             "report": str(page),
-            "flight": telemetry_report.summary(log),
+            "flight": motion,
             "pictures": [str(path) for path in pictures],
             "exposures_ms": [1e3 * row.exposure_s for row in self.rows],
             "findings": plan.findings,
@@ -291,4 +294,4 @@ def _with_own_image(frame: ScoredFrame) -> ScoredFrame:
 def _image_tag(image: NDArray[np.uint8]) -> str:
     """An HTML <img> element of an image, reduced to at most 800 pixels in width."""
     data = cv2.imencode(".jpg", stretch.reduce_width(image, 800))[1].tobytes()
-    return f'<img src="{report.embed(data, "jpeg")}">'
+    return f'<img src="{embed(data, "jpeg")}">'

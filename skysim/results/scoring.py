@@ -13,7 +13,7 @@ from estimator.trackers.pipeline import Report
 from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Frame, FrameRow, Mount, Truth
 from skysim.results import metrics
-from skysim.results.report import annotate, visible
+from skysim.results.annotate import annotate, visible
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.run import FrameResult

@@ -9,6 +9,7 @@ from skysim.apps.cli import terminal
 from skysim.core.types import FrameRow
 from skysim.experiments.tracker_comparison import TrackerScore
 from skysim.results.metrics import Summary
+from skysim.results.report import as_text
 
 TRIPLE = ("roll", "pitch", "yaw")
 
@@ -44,11 +45,11 @@ def score(name: str) -> TrackerScore:
 def test_a_scoreboard_fits_the_terminal_and_keeps_what_counts(
     width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(terminal, "terminal_width", lambda: width)
+    monkeypatch.setattr(as_text, "terminal_width", lambda: width)
     terminal.print_scores([score("own"), score("somebody_else")], Path("out/scoreboard"))
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= width
-    kept = next(line for line in lines if line.startswith("what"))
+    kept = next(line for line in lines if line.startswith("tracker"))
     assert re.search(r"frames +right % .*wrong +refused +failed +cross ″ .*roll ″", kept)
     assert ("95 % ms" in kept) == (width == 240)
     assert not any("…" in line for line in lines)
@@ -57,7 +58,7 @@ def test_a_scoreboard_fits_the_terminal_and_keeps_what_counts(
 def test_the_summary_of_a_run_fits_the_terminal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(terminal, "terminal_width", lambda: 80)
+    monkeypatch.setattr(as_text, "terminal_width", lambda: 80)
     errors = {f"{angle}_arcsec_{what}": 1234.5 for angle in ("cross", "roll") for what in ("median", "worst")}
     stages = dict.fromkeys(["render", "detector", "detect", "centroid", "identify", "solve"], 12.34)
     motion = {"pointing_deg_worst": 0.0687, "pointing_deg_end": 0.069, "torque_nm_worst": 0.0757, "imu_deg_worst": 1.0}
@@ -73,8 +74,8 @@ def test_the_summary_of_a_run_fits_the_terminal(
 def test_the_rows_of_a_run_fit_the_terminal(
     width: int, left_out: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(terminal, "terminal_width", lambda: width)
-    terminal.print_rows([row(0), row(1)], TRIPLE, [10.0, 10.0])
+    monkeypatch.setattr(as_text, "terminal_width", lambda: width)
+    terminal.print_rows([row(0), row(1)], TRIPLE)
     out = capsys.readouterr().out
     lines, named = out.splitlines(), " ".join(out.split()).partition("in a wider terminal: ")[2]
     assert len(named.split(", ") if named else []) == left_out

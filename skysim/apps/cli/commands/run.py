@@ -33,6 +33,8 @@ from skysim.apps.cli.options import (
     used_programs,
     with_location,
 )
+from skysim.results.report.as_text import print_facts
+from skysim.results.report.blocks import Facts
 
 if TYPE_CHECKING:
     from skysim.core.types import FrameRow
@@ -88,13 +90,12 @@ def run(
         rows = {"rows": [asdict(row) for row in recorder.rows]}
         terminal.print_json({"scene": loaded.name, **statistics, **rows, **({"heads": heads} if heads else {})})
     else:
-        terminal.print_rows(recorder.rows, scoring.angle_names(loaded), statistics["exposures_ms"])
+        terminal.print_rows(recorder.rows, scoring.angle_names(loaded))
         terminal.print_summary(statistics)
         for name, head in heads.items():
             terminal.print_head(name, head)
-        for fact in plan.facts:
-            if fact.name == "tracker knows":
-                terminal.print_fact(fact)
+        known = [(fact.name, fact.lines) for fact in plan.facts if fact.name == "tracker knows"]
+        print_facts(Facts(known))
     if open_:
         typer.launch(statistics["report"])
 
