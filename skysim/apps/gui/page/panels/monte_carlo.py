@@ -151,8 +151,7 @@ class MonteCarloPanel:
         if unused:
             self.tab.show_message(f"trials of {self.kind.value} do not use {', '.join(unused)}", "quiet")
         self.tab.set_state(study=self.process.folder.name)
-        resumable = (self.process.folder / STORE).is_file()
-        await self.process.start(path, "resume" if resumable else "run")
+        await self.process.start(path)
         if not self.tab.is_open:  # closed meanwhile, when there was no process to end
             self.process.stop(signal.SIGTERM)
         return True
