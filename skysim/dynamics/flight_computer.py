@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from skysim.core.quantities.units import RPM_RAD_S
+from skysim.core.constants import RPM_RAD_S
 from skysim.core.types import Floats
 from skysim.dynamics.actuators import CmgSet, Desaturator, FanSet, WheelSet
 from skysim.dynamics.attitude_control import Pid, build_controller
@@ -216,6 +216,7 @@ class FlightComputer:
         self.nu = vehicle.model.nu
         self.control_torque_nm = np.zeros(3)
         self.momentum_dump: MomentumDump | None = None
+        self.actuator: Actuators = IdealTorque(vehicle)
         if self.config is None:
             return
         self.actuator = controlling_actuator(self.config, self.actuator_sets, vehicle)
@@ -259,20 +260,33 @@ class FlightComputer:
             stored += actuator_set.momentum_nms(angles_rad, speeds_rad_s)
         return stored
 
-    def compute_controls(self, inputs: ControlInput, lab_from_body_wxyz: Floats, momentum_nms: Floats) -> Floats:
-        """(nu,) controls for this period from the measured attitude (4,) and the stored momentum (3,)."""
+    def compute_controls(
+        self,
+        inputs: ControlInput,
+        lab_from_body_wxyz: Floats,
+        momentum_nms: Floats,
+        torque_nm: Floats | None = None,
+    ) -> Floats:
+        """(nu,) controls for this period from the measured attitude (4,) and the stored momentum (3,).
+
+        torque_nm : (3,) in body axes, in place of the control law's
+        """
         control = np.zeros(self.nu)
-        if self.config is None:
+        if self.config is None and torque_nm is None:
             return control
-        self.control_torque_nm = self.law.torque_nm(
-            inputs.t_s, lab_from_body_wxyz, inputs.rate_body_rad_s, momentum_nms
-        )
+        if torque_nm is None:
+            self.control_torque_nm = self.law.torque_nm(
+                inputs.t_s, lab_from_body_wxyz, inputs.rate_body_rad_s, momentum_nms
+            )
+        else:
+            self.control_torque_nm = torque_nm
         actuator_torque_nm = self.control_torque_nm
         if self.momentum_dump:
             # The other actuators give the commanded torque minus the fans', which removes their momentum.
             actuator_torque_nm = actuator_torque_nm - self.momentum_dump.allocate(control, momentum_nms, inputs)
         achieved_nm = self.actuator.allocate(control, actuator_torque_nm, inputs)
-        self.law.integrate(actuator_torque_nm, achieved_nm, self.period_s)
+        if torque_nm is None:
+            self.law.integrate(actuator_torque_nm, achieved_nm, self.period_s)
         return control
 
 

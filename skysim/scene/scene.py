@@ -13,10 +13,11 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
+from skysim.core.constants import DAY_S
 from skysim.core.quantities.tolerance import TimeError
 from skysim.core.quantities.units import ConfigModel, Length, Number, Spin, Time
-from skysim.core.quantities.utc import check_year
 from skysim.core.random_streams import HEAD_SEED, derived_seed
+from skysim.core.time import check_year
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, Glow, Light, StarsConfig
@@ -30,7 +31,7 @@ NAME_ALIAS = "(the file's name)"  # alias of Scene.name, not a valid key in a fi
 
 EPHEMERIS_KEYS = "bodies", "satellites"  # of a light, whose places need the ephemeris
 BODIES_YEARS = 1972, 2100  # UTC has leap seconds from 1972; the ephemeris ends with 2100
-MAX_FRAMES, MAX_DURATION_S = 1_000_000, 86_400.0  # of a run, limited by memory
+MAX_FRAMES, MAX_DURATION_S = 1_000_000, DAY_S  # of a run, limited by memory
 
 
 class ExposureConfig(ConfigModel):

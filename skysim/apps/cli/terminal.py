@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from rich.progress import ProgressColumn
 
-    from skysim.core.types import FrameRow
+    from skysim.core.types import Telemetry
     from skysim.experiments.study.execution.runner import Progress
     from skysim.experiments.tracker_comparison import TrackerScore
     from skysim.simulation.checks.facts import Fact
-    from skysim.simulation.testbed import Testbed
+    from skysim.simulation.lab import Lab
 
 T = TypeVar("T")
 ANIMATION_FRAMES = 60
@@ -51,13 +51,6 @@ def bar(*columns: ProgressColumn, quiet: bool = False) -> Bar:
     what = TextColumn("{task.description}", markup=False)  # a title may contain brackets
     columns = columns or (BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     return Progress(what, *columns, console=console, transient=True, disable=quiet or not console.is_terminal)
-
-
-def print_rows(rows: Sequence[FrameRow], names: tuple[str, str, str]) -> None:
-    """Print one line per frame of a run. names : of the three angles"""
-    from skysim.results.run_report import frame_table
-
-    print_table(frame_table(names, rows))
 
 
 @contextmanager
@@ -93,31 +86,6 @@ def trial_progress(what: str, total: int, unit: str = "trials") -> Iterator[Call
                 print(line, file=sys.stderr, flush=True)
 
         yield update
-
-
-def print_summary(run: dict[str, Any]) -> None:
-    from skysim.results.run_report import motion_lines
-
-    print()
-    print_wrapped(
-        f"{run['solved']} of {run['frames']} frames solved, {run['wrong']} wrong; "
-        f"cross-boresight median {run['cross_arcsec_median']:.3g}″ worst {run['cross_arcsec_worst']:.3g}″, "
-        f"roll median {run['roll_arcsec_median']:.3g}″ worst {run['roll_arcsec_worst']:.3g}″"
-    )
-    stages = ", ".join(f"{name} {ms:.2f}" for name, ms in run["stages_ms"].items())
-    print_wrapped(f"median ms per frame: {stages}")
-    for line in motion_lines(run["flight"]):
-        print_wrapped(f"motion: {line}", others=" " * 8)
-    print(f"report: {run['report']}")
-
-
-def print_head(name: str, run: dict[str, Any]) -> None:
-    """Print the result of a further star camera."""
-    print_wrapped(
-        f"{name}: {run['solved']} of {run['frames']} frames solved, {run['wrong']} wrong; "
-        f"cross-boresight median {run['cross_arcsec_median']:.3g}″, roll median {run['roll_arcsec_median']:.3g}″; "
-        f"report: {run['report']}"
-    )
 
 
 def print_check(facts: Sequence[Fact], findings: Sequence[str]) -> None:
@@ -231,23 +199,22 @@ def print_error(message: str, code: int = 2) -> int:
     return code
 
 
-def write_3d_views(testbed: Testbed, folder: Path) -> list[Path]:
+def write_3d_views(lab: Lab, log: Telemetry, folder: Path) -> list[Path]:
     """Write a still and an animation of the laboratory in 3-D; return their paths.
 
     Without OpenGL print a message and return an empty list, so that the run continues.
     """
     from skysim.core.io import files
     from skysim.dynamics.multibody.view import picture
-    from skysim.simulation.testbed import export_mjcf
 
-    mjcf, joints = export_mjcf(testbed), testbed.log.joints
+    mjcf, joints = lab.export_mjcf(), log.joints
     image_path, animation_path = folder / "scene_3d.png", folder / "scene_3d.gif"
     steps = max(len(joints) // ANIMATION_FRAMES, 1)
     states = joints[::steps]
     try:
         files.write_image(image_path, picture.picture(mjcf, joints[len(joints) // 2])[:, :, ::-1])
         shown = progress(picture.film(mjcf, states), len(states), "rendering the animation")
-        picture.write_film(shown, animation_path, len(states) / float(testbed.log.t_s[-1] + 1e-9))
+        picture.write_film(shown, animation_path, len(states) / float(log.t_s[-1] + 1e-9))
     except picture.NoPicture as error:
         print_error(str(error))
         return []

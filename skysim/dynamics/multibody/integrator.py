@@ -13,8 +13,8 @@ import numpy as np
 from mujoco.rollout import Rollout
 from scipy.spatial.transform import Rotation
 
+from skysim.core.constants import RPM_RAD_S
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import RPM_RAD_S
 from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.multibody.mjcf import mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Mount
@@ -46,7 +47,6 @@ from skysim.dynamics.multibody.mass import (
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings, one_line
 from skysim.scene.sections.vehicle import VehicleConfig
 
-GRAVITY_M_S2 = 9.80665
 STEP_S = 1e-3
 IMU = "imu"
 REQUIRED = f"body bus and camera {CAMERA}"
@@ -201,7 +201,7 @@ def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:
         stiffness=[cable.stiffness_nm_rad if cable else 0.0, 0.0, 0.0],
     )
     on_bearing = vehicle.mount == "air_bearing"
-    spec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2 if on_bearing else 0.0]
+    spec.option.gravity = [0.0, 0.0, -STANDARD_GRAVITY_M_S2 if on_bearing else 0.0]
     spec.option.timestep = STEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     # In units of the mean inertia: MuJoCo's 1e-8 would hide a small wheel's friction in a heavy vehicle. No cost.

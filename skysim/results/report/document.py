@@ -10,7 +10,7 @@ from typing import Any
 from skysim import __version__
 from skysim.core.errors import InputError, unknown_name
 from skysim.results.report import as_html, as_markdown, as_text
-from skysim.results.report.blocks import Block, Cell, Column, Section, figure_files, filled
+from skysim.results.report.blocks import Block, Cell, Column, Section, Verdict, figure_files, filled
 
 SUFFIXES = (".html", ".md", ".json")
 LOOKS = ("folded", "id", "image", "kind", "name", "on_terminal", "optional")  # fields that JSON leaves out
@@ -31,6 +31,11 @@ class Report:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "blocks", filled(self.blocks))
+
+    @property
+    def verdict(self) -> str:
+        """The sentence that answers; empty without one."""
+        return next((one.text for one in self.blocks if isinstance(one, Verdict)), "")
 
     def html(self) -> str:
         """One self-contained page, its images embedded."""
