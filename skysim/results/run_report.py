@@ -151,7 +151,7 @@ def frame_table(angles: tuple[str, str, str], rows: Sequence[FrameRow]) -> Table
         ]
         for row in rows
     ]
-    return Table(columns, lines, optional=(7, 8, 9, 2, 14, 3, 12))
+    return Table(columns, lines, optional=((7, 8, 9), (2,), (14,), (3,), (12,), (4, 5, 6)))
 
 
 def error_figure(rows: Sequence[FrameRow]) -> bytes:

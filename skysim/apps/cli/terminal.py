@@ -114,7 +114,9 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
         ]
         for line in lines
     ]
-    print_table(Table(columns, rows, optional=(12, 11, 3, 10, 8)))  # the times, the interval, the worst errors
+    print_table(
+        Table(columns, rows, optional=((12,), (11,), (3,), (10,), (8,)))
+    )  # the times, the interval, the worst errors
     for line in lines:
         for status, count in line.refusals.items():
             print(f"{line.tracker}: {count} × {status}")

@@ -80,9 +80,9 @@ def fitting_columns(table: Table, rows: Sequence[Sequence[Cell]]) -> list[int]:
     shown = [n for n, column in enumerate(table.columns) if column.kind != "aside"]
     texts = [[column.head for column in table.columns], *([one.text for one in row] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
-    for column in table.optional:
+    for group in table.optional:
         if sum(widths[n] for n in shown) + 2 * (len(shown) - 1) > terminal_width():
-            shown.remove(column)
+            shown = [n for n in shown if n not in group]
     return shown
 
 

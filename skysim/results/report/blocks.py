@@ -98,12 +98,12 @@ class Facts(Block):
 class Table(Block):
     """Rows of values under columns: cells, texts, numbers, or None for what is missing.
 
-    optional : columns that are left out on a narrow terminal, the first of them first
+    optional : groups of columns that are left out on a narrow terminal, the first group first
     """
 
     columns: Sequence[Column]
     rows: Sequence[Sequence[Any]]
-    optional: Sequence[int] = ()
+    optional: Sequence[Sequence[int]] = ()
 
     def cells(self) -> list[list[Cell]]:
         """The rows as cells."""

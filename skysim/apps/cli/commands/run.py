@@ -83,12 +83,12 @@ def run(
         head_results = {name: head for name, (head, _) in heads.items()}
         terminal.print_json(result | {"heads": head_results} if heads else result)
     else:
+        known = [(fact.name, fact.lines) for fact in plan.facts if fact.name == TRACKER_KNOWS]
+        terminal.print_blocks([Facts(known)])
         report.print()
         print(f"report: {statistics['report']}")
         for name, (head, head_report) in heads.items():
             terminal.print_wrapped(f"{name}: {head_report.verdict}; report: {head['report']}")
-        known = [(fact.name, fact.lines) for fact in plan.facts if fact.name == TRACKER_KNOWS]
-        terminal.print_blocks([Facts(known)])
     if open_:
         typer.launch(statistics["report"])
 

@@ -222,8 +222,7 @@ def points_section(
         rows = [[*row, costs.get(line.point)] for row, line in zip(rows, lines, strict=False)]
     more = f"And {len(lines) - ROWS} points more: `skysim study export` writes them all." if len(lines) > ROWS else ""
     note = "In brackets intervals of 95 %." + (" Tinted: the front." if front else "")
-    optional = range(len(columns) - 1, len(axes), -1)
-    table = Table(columns, rows, optional=tuple(optional))
+    table = Table(columns, rows, from_the_last(len(axes) + 1, len(columns)))
     return Section(POINTS, [table, Text(f"{note} {more}")], folded=len(lines) > OPEN_ROWS)
 
 
@@ -250,8 +249,13 @@ def front_table(study: Study, result: SearchResult | None) -> list[Block]:
     feasible = sum(one.feasible for one in result.candidates)
     text = f"{len(result.candidates)} candidates, {feasible} of them feasible" + ("; the front:" if feasible else ".")
     heads, rows = search.front_cells(study, result)
-    optional = tuple(range(len(heads) - 1, len(study.factors), -1))
-    return [Text(text), *([Table([Column(head) for head in heads], rows, optional)] if rows else [])]
+    table = Table([Column(head) for head in heads], rows, from_the_last(len(study.factors) + 1, len(heads)))
+    return [Text(text), *([table] if rows else [])]
+
+
+def from_the_last(kept: int, count: int) -> list[tuple[int]]:
+    """The columns that a narrow terminal leaves out: the last first, none of the first `kept`."""
+    return [(column,) for column in range(count - 1, kept - 1, -1)]
 
 
 def runs_section(store: Store) -> Section:
