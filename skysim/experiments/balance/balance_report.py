@@ -16,7 +16,7 @@ from skysim.experiments.balance.assumptions import Assumptions
 from skysim.experiments.balance.flight import BalanceFlight
 from skysim.experiments.balance.observability import largest_tilt_deg
 from skysim.experiments.balance.procedure import Iteration, Plan, filtered
-from skysim.results.report import Cell, Column, Facts, Figure, Report, Section, Table, Text, Verdict
+from skysim.results.report import Block, Cell, Column, Facts, Figure, Report, Section, Table, Text, Verdict
 
 INERTIA_NAMES = ("Jxx", "Jyy", "Jzz", "Jxy", "Jxz", "Jyz")
 MOMENT_NAMES = ("x", "y", "z")
@@ -125,16 +125,11 @@ def balance_report(statistics: dict[str, Any], picture: bytes, command: str) -> 
     """The report of a balance. picture : see `balance_figure`, PNG"""
     blocks = [
         verdict(statistics),
+        Facts([("every number of this page", [Cell("balance.json", link="balance.json")])], on_terminal=False),
         Section("Balance", [Figure(picture, CAPTION)]),
         Section("Flights", [Text(FLIGHTS), flight_table(statistics["flights"])], on_terminal=False),
-        Section("With the trim masses at zero, from all flights", [mass_table(statistics["estimates"])]),
-    ]
-    if "in_flight" in statistics:
-        title = "By the filter in flight, from the last flight"
-        blocks.append(Section(title, [mass_table(statistics["in_flight"])]))
-    blocks += [
-        Text("J in kg m², of the vehicle with its trim masses at zero."),
-        Facts([("every number of this page", [Cell("balance.json", link="balance.json")])], on_terminal=False),
+        Section("With the trim masses at zero, from all flights", mass_blocks(statistics["estimates"])),
+        Section("By the filter in flight, from the last flight", mass_blocks(statistics.get("in_flight", []))),
     ]
     return Report(f"Balance of {statistics['scene']}", blocks, command)
 
@@ -193,7 +188,7 @@ def offset_text(flight: dict[str, Any]) -> str:
     return ", ".join(f"{value:.3g} ± {sigma:.2g}" for value, sigma in found)
 
 
-def mass_table(rows: Sequence[dict[str, Any]]) -> Table:
+def mass_blocks(rows: Sequence[dict[str, Any]]) -> list[Block]:
     """Estimates of the mass properties beside the simulated vehicle's."""
     heads = ("estimate", "1σ", "simulated vehicle")
     columns = [Column("what", kind="text"), *(Column(head, format=".5g") for head in heads)]
@@ -201,7 +196,8 @@ def mass_table(rows: Sequence[dict[str, Any]]) -> Table:
         [row["what"], row["estimate"], row["sigma"], row["truth"], (row["estimate"] - row["truth"]) / row["sigma"]]
         for row in rows
     ]
-    return Table([*columns, Column("error over 1σ", format=".1f")], values)
+    table = Table([*columns, Column("error over 1σ", format=".1f")], values)
+    return [table, Text("J in kg m², of the vehicle with its trim masses at zero.")] if rows else []
 
 
 def write_all(folder: Path, statistics: dict[str, Any], iterations: Sequence[Iteration], command: str) -> Report:

@@ -68,7 +68,8 @@ def print_table(table: Table, title: str = "") -> None:
     for row in rows[:MAX_ROWS]:
         for column, one in zip(table.columns, row, strict=True):
             if column.kind == "aside" and one.text:
-                print_wrapped(f"{row[0].text}: {one.text}", first="  ", others="    ")
+                name = "" if one.text.startswith(row[0].text) else f"{row[0].text}: "
+                print_wrapped(name + one.text, first="  ", others="    ")
     if left_out := [column.head for n, column in enumerate(table.columns) if n not in shown and column.kind != "aside"]:
         print_wrapped(f"in the report, or in a wider terminal: {', '.join(left_out)}")
     if len(rows) > MAX_ROWS:

@@ -168,7 +168,7 @@ def test_the_report_has_the_numbers_and_the_faults_with_places(result: dict[str,
     assert f"({place_mm}) mm" in page
     assert page.count(">exchanged</td>") == 2
     assert page.count('src="data:image/png;base64,') == 2
-    coverage = page[page.index("<h2>Coverage") : page.index("<h2>Faults")]
+    coverage = page[page.index("<h2>Coverage and next attitudes") : page.index("<h2>Faults")]
     assert coverage.count("<tr><td") == len(result["next"])
 
 

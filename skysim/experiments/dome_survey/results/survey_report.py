@@ -44,7 +44,7 @@ def survey_report(statistics: dict[str, Any], run: SurveyRun, command: str) -> R
         Section("Camera and lever", [value_table(statistics)]),
         Section("Truth and survey", truth_blocks(statistics)),
         Section("Predicted and reached", [accuracy_table(statistics, reached)]),
-        Section("Coverage", coverage_blocks(statistics)),
+        Section("Coverage and next attitudes", coverage_blocks(statistics)),
         Section("Faults", fault_blocks(statistics["faults"])),
     ]
     return Report(f"Survey of {statistics['scene']}", blocks, command)
