@@ -13,12 +13,12 @@ import numpy as np
 
 from skysim.core.paths import STUDIES
 from skysim.core.types import Floats
-from skysim.experiments.study import store
 from skysim.experiments.study.analysis import search
+from skysim.experiments.study.execution import store
+from skysim.experiments.study.execution.store import STORE, Store
 from skysim.experiments.study.loader import load
 from skysim.experiments.study.plan import Plan
 from skysim.experiments.study.report.study_report import POINTS, STUDY_FILE, analyze, commands, compose
-from skysim.experiments.study.store import STORE, Store
 from skysim.results.report import Report, Section, Text
 
 PAGES = Path(__file__).parents[1] / "findings" / "studies"

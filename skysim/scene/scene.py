@@ -230,10 +230,11 @@ class Scene(ConfigModel):
             raise ValueError("tracker.gyro: requires the section vehicle.imu")
         if control is None:
             return self
-        present = {"ideal": True} | {kind: getattr(self.vehicle, kind) for kind in ("wheels", "fans", "cmgs")}
-        if not present[control.actuators]:
+        commanded = getattr(self.vehicle, control.actuators, None)
+        if commanded is None and control.actuators != "ideal":
             raise ValueError(f"motion.control.actuators: requires the section vehicle.{control.actuators}")
-        if control.desaturation and (not self.vehicle.fans or control.actuators not in ("wheels", "cmgs")):
+        stores_momentum = commanded is not None and commanded.stores_momentum
+        if control.desaturation and not (self.vehicle.fans and stores_momentum):
             raise ValueError("motion.control.desaturation: requires vehicle.fans, and actuators wheels or cmgs")
         if {"truth": False, "imu": not imu, "filter": not self.filter}[control.feedback]:
             section = "vehicle.imu" if control.feedback == "imu" else "filter"

@@ -8,7 +8,6 @@ controller may use in the next period.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -93,12 +92,12 @@ class Schedule:
         """Of the next frame."""
         return timing.exposure_window(self.camera.scene, self.index, self.exposure_control.exposure_s)
 
-    def is_due(self, window: Window, now_s: float) -> bool:
-        """Whether the exposure is over, the solution ready, and the time that it is given has come."""
+    def due_s(self, window: Window) -> float:
+        """When the next frame is due: exposed, its solution ready, and the time come that it is tagged with."""
         scene = self.camera.scene
         rows = scene.camera.height_px
         tagged_s = window.middle_s(rows) + timing.time_tag_error_s(scene, self.index)
-        return max(window.close_s(rows) + self.latency_s, tagged_s) <= now_s
+        return max(window.close_s(rows) + self.latency_s, tagged_s)
 
 
 class Flight:
@@ -126,7 +125,6 @@ class Flight:
         self.trackers: dict[int, factory.Estimator] = {}
         self.observations = 0
         self.is_in_shots = False
-        self.reached_s = 0.0  # up to which exposures are taken; the motion may be ahead
         self.flown: Trajectory | None = None
 
     def __enter__(self) -> Self:
@@ -136,7 +134,7 @@ class Flight:
         self.close()
 
     def close(self) -> None:
-        """End the processes of an external controller and of external trackers."""
+        """End the process of an external controller."""
         self.motion.close()
 
     # The motion
@@ -179,36 +177,26 @@ class Flight:
             raise InputError("step: a prescribed motion takes no torque; allowed: another motion.control.law")
         torque = None if torque_nm is None else np.asarray(torque_nm, dtype=np.float64).reshape(3)
         self.motion.advance(self.motion.period_steps, torque)
-        return [shot for schedule in self.filter_schedules for shot in self.capture_due(schedule, self.now_s)]
+        return [shot for schedule in self.filter_schedules for shot in self.capture_due(schedule)]
 
     def simulate_motion(self, progress: Progress | None = None) -> Self:
         """Simulate the rest of the motion. Only the frames that a filter needs are rendered.
 
-        progress : called as progress(t_s, duration_s) after every control period
+        progress : called as progress(t_s, duration_s) as the motion goes on
         """
-        for now_s in self.periods(progress):
-            for schedule in self.filter_schedules:
-                for _ in self.capture_due(schedule, now_s):
-                    pass
+        for _ in self.events(self.filter_schedules, progress=progress):
+            pass
         return self
 
-    def periods(self, progress: Progress | None = None) -> Iterator[float]:
-        """Simulate the rest of the motion; yield the time after every control period."""
-        simulation = self.motion.simulation
-        period_steps = self.motion.period_steps
-        keeps_history = self.motion.recorder is not None
-        first = simulation.step
-        if self.motion.is_free and keeps_history and first == 0:
-            # Nothing depends on the motion: one call integrates all of it.
-            self.motion.advance(simulation.steps_left)
-        while not self.is_over or first < simulation.step:
-            if first == simulation.step:
-                self.motion.advance(period_steps)
-            first = min(first + period_steps, simulation.step)
-            self.reached_s = first * simulation.step_s
-            yield self.reached_s
-            if progress:
-                progress(self.reached_s, self.duration_s)
+    def advance(self, schedules: Sequence[Schedule]) -> None:
+        """Simulate one control period; as many as the next exposure needs if nothing depends on the motion."""
+        motion = self.motion
+        periods = 1
+        if motion.is_free:
+            due_s = min((one.due_s(one.window) for one in schedules if one.index < one.frames), default=math.inf)
+            left_s = min(due_s, self.duration_s) - self.now_s
+            periods = max(math.ceil(left_s / motion.flight_computer.period_s), 1)
+        motion.advance(periods * motion.period_steps)
 
     @property
     def filter_schedules(self) -> list[Schedule]:
@@ -251,53 +239,66 @@ class Flight:
         solves   : solve the frames; with a filter they are solved in any case
         selects(index, close_s) : whether to render a frame of the main camera. Skipping one does not change the others,
             except that exposure control and filter do not see it
-        progress : called as progress(t_s, duration_s) after every control period
+        progress : called as progress(t_s, duration_s) as the motion goes on
         """
-        for shot in self.events(cameras=cameras, solves=solves, selects=selects, progress=progress):
-            if shot is not None:
+        wanted = [n for n in range(len(self.schedules)) if cameras is None or n in cameras]
+        schedules = self.filter_schedules or [self.schedules[n] for n in wanted]
+        for shot in self.events(schedules, solves, selects, progress):
+            if shot is not None and shot.camera in [self.schedules[n].camera for n in wanted]:
                 yield shot
 
     def events(
         self,
-        *,
-        cameras: Sequence[int] | None = None,
-        solves: bool = True,
+        schedules: Sequence[Schedule],
+        solves: bool = False,
         selects: FrameSelector | None = None,
         progress: Progress | None = None,
     ) -> Iterator[Shot | None]:
-        """`shots` that also yields None after every control period, for a caller that has other work to do."""
+        """The shots of some cameras as in `shots`, and None whenever the motion has gone on."""
         self.is_in_shots = True
-        wanted = [n for n in range(len(self.schedules)) if cameras is None or n in cameras]
-        schedules = self.filter_schedules or [self.schedules[n] for n in wanted]
         try:
-            for now_s in itertools.chain(self.periods(progress), [math.inf]):
-                # What would be ready only after the end of the motion, at infinity, no longer updates the filter.
+            while not self.is_over:
+                self.advance(schedules)
                 for schedule in schedules:
-                    for shot in self.capture_due(schedule, now_s, solves, selects):
-                        if schedule.number in wanted:
-                            yield shot
+                    yield from self.capture_due(schedule, solves, selects)
                 yield None
+                if progress:
+                    progress(self.now_s, self.duration_s)
+            for schedule in schedules:
+                yield from self.capture_late(schedule, solves, selects)
         finally:
             self.is_in_shots = False
 
     def capture_due(
-        self, schedule: Schedule, now_s: float, solves: bool = False, selects: FrameSelector | None = None
+        self, schedule: Schedule, solves: bool = False, selects: FrameSelector | None = None
     ) -> Iterator[Shot]:
-        """Yield the exposures of a camera that are due at that time and not yet rendered."""
+        """Yield the exposures of a camera that are due and not yet rendered; with a filter they update it."""
+        has_filter = bool(self.filter_schedules)
+        while schedule.index < schedule.frames and schedule.due_s(schedule.window) <= self.now_s:
+            yield from self.capture_next(schedule, solves or has_filter, selects, updates_filter=has_filter)
+
+    def capture_late(
+        self, schedule: Schedule, solves: bool = False, selects: FrameSelector | None = None
+    ) -> Iterator[Shot]:
+        """Yield the exposures that were over at the end of the motion, but due only later; no filter gets them."""
         rows = schedule.camera.scene.camera.height_px
-        while schedule.index < schedule.frames:
-            window = schedule.window
-            if not schedule.is_due(window, now_s):
-                return
-            index = schedule.index
-            schedule.index += 1
-            if selects and schedule.number == 0 and not selects(index, window.close_s(rows)):
-                continue
-            schedule.exposures_s[index] = window.exposure_s
-            updates_filter = bool(self.filter_schedules) and math.isfinite(now_s)
-            shot = self.capture(schedule, index, window, solves or bool(self.filter_schedules), updates_filter)
-            schedule.exposure_control.update(shot.frame)
-            yield shot
+        while schedule.index < schedule.frames and schedule.window.close_s(rows) <= self.now_s:
+            yield from self.capture_next(schedule, solves, selects, updates_filter=False)
+
+    def capture_next(
+        self, schedule: Schedule, solves: bool, selects: FrameSelector | None, updates_filter: bool
+    ) -> Iterator[Shot]:
+        """Yield the next exposure of a camera, unless it is not selected."""
+        index = schedule.index
+        window = schedule.window
+        schedule.index += 1
+        close_s = window.close_s(schedule.camera.scene.camera.height_px)
+        if selects and schedule.number == 0 and not selects(index, close_s):
+            return
+        schedule.exposures_s[index] = window.exposure_s
+        shot = self.capture(schedule, index, window, solves, updates_filter)
+        schedule.exposure_control.update(shot.frame)
+        yield shot
 
     def capture(self, schedule: Schedule, index: int, window: Window, solves: bool, updates_filter: bool) -> Shot:
         """Render an exposure, solve it, and update the filter with the solution."""
@@ -343,10 +344,14 @@ class Flight:
     def render(self, index: int, camera: int = 0) -> tuple[Frame, Truth]:
         """Render an exposure of the schedule from the motion so far; bit for bit that of `shots`.
 
-        With exposure control it must have been exposed before.
+        Raises InputError for a frame that automatic exposure has not exposed yet.
         """
         schedule = self.schedules[camera]
-        window = timing.exposure_window(schedule.camera.scene, index, schedule.exposures_s.get(index))
+        scene = schedule.camera.scene
+        exposure_s = schedule.exposures_s.get(index)
+        if exposure_s is None and scene.tracker.exposure_control:
+            raise InputError(f"render: frame {index} has no exposure time yet; allowed: after it came from shots")
+        window = timing.exposure_window(scene, index, exposure_s)
         return render_frame(schedule.camera, self.trajectory(), index, None, window)
 
     def observe(self, camera: int = 0, *, solves: bool = True) -> Shot:

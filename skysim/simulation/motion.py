@@ -11,8 +11,9 @@ from skysim.core.types import Floats, Trajectory
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.controllers.adapter import ControllerSource
 from skysim.dynamics.disturbances import DisturbanceModel
-from skysim.dynamics.flight_computer import ControlInput, FlightComputer
+from skysim.dynamics.flight_computer import FlightComputer
 from skysim.dynamics.jitter import Vibration
+from skysim.dynamics.multibody.actuators.kind import ControlInput
 from skysim.simulation import timing
 from skysim.simulation.lab import Lab
 from skysim.simulation.reference_limits import check_reference

@@ -9,7 +9,8 @@ import numpy as np
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
-from skysim.dynamics.flight_computer import build_actuators, controlling_actuator, usage
+from skysim.dynamics.flight_computer import controlling_actuator, usage
+from skysim.dynamics.multibody.actuators.registry import build_actuators
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import ControlConfig
 from skysim.scene.sections.vehicle import VehicleConfig
@@ -30,7 +31,7 @@ def check_reference(
     if motion.control is None:
         return
     check_tilt(reference, vehicle, duration_s)
-    actuators = build_actuators(scene, model)
+    actuators = build_actuators(scene.vehicle, model.model)
     legs = zip(reference.legs, reference.start_s, motion.maneuver, strict=False)
     for n, (leg, begin_s, element) in enumerate(legs):
         if element.kind not in ("profile", "chirp"):

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera import thermal
 from skysim.core.types import Floats, Mounting, Telemetry
-from skysim.dynamics.flight_computer import CmgActuator, FlightComputer
+from skysim.dynamics.flight_computer import FlightComputer
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import Simulation
+from skysim.dynamics.multibody.actuators.cmgs import CmgActuator
 from skysim.simulation.lab import StarCamera
 from skysim.tracking.navigation import Navigation
 
@@ -26,8 +27,9 @@ class TelemetryRecorder:
         self.simulation, self.flight_computer, self.navigation = simulation, flight_computer, navigation
         steps = round(flight_computer.period_s / simulation.step_s)
         self.at_step = np.arange(0, simulation.last_step, steps)
-        self.row = 0
+        self.steps_per_tick = steps
         rows = len(self.at_step)
+        self.recorded = np.zeros(rows, dtype=bool)
         self.torque_nm, self.disturbance_nm = np.zeros((rows, 3)), np.zeros((rows, 3))
         self.momentum_nms = np.zeros((rows, 3))
         self.imu_wxyz, self.filter_wxyz = np.zeros((rows, 4)), np.zeros((rows, 4))
@@ -37,6 +39,11 @@ class TelemetryRecorder:
         mounted = mounting_states(navigation)
         self.mountings = np.zeros((len(mounted), 2, rows, 3))  # filter: estimate and sigma of each mounting
 
+    @property
+    def row(self) -> int:
+        """Row of the control period that begins now."""
+        return self.simulation.step // self.steps_per_tick
+
     def record_disturbance(self, torque_nm: Floats) -> None:
         """Record the mean disturbance torque (3,) of this control period; call it before `record`."""
         self.disturbance_nm[self.row] = torque_nm
@@ -44,7 +51,7 @@ class TelemetryRecorder:
     def record(self, momentum_nms: Floats) -> None:
         """Record the rest of this control period, after the controls are set and before the vehicle moves."""
         k = self.row
-        self.row += 1
+        self.recorded[k] = True
         self.torque_nm[k], self.momentum_nms[k] = self.flight_computer.control_torque_nm, momentum_nms
         if self.navigation:
             self.record_estimates(k, self.navigation)
@@ -65,17 +72,12 @@ class TelemetryRecorder:
 
     def telemetry(self, reference: Reference | None, cameras: Sequence[StarCamera]) -> Telemetry:
         """All rows as Telemetry; reference is the commanded attitude profile, if there is one."""
-        simulation, vehicle, steps = self.simulation, self.simulation.vehicle, self.at_step[: self.row]
-        # Integrated in a single call, see `Motion.is_free`.
-        single_call = self.row == 1 and simulation.step == simulation.last_step
-        if single_call:
-            steps = self.at_step
+        simulation, vehicle = self.simulation, self.simulation.vehicle
+        steps = self.at_step[self.at_step < simulation.step]
         states, nq = simulation.states[steps], simulation.model.nq
-        if single_call:
-            angles, speeds = states[:, 1 : 1 + nq], states[:, 1 + nq :]
-            self.momentum_nms[: len(steps)] = [
-                self.flight_computer.momentum_nms(q, v) for q, v in zip(angles, speeds, strict=True)
-            ]
+        # Several control periods of a free motion are integrated at once, and only the first is recorded.
+        for k in np.flatnonzero(~self.recorded[: len(steps)]):
+            self.momentum_nms[k] = self.flight_computer.momentum_nms(states[k, 1 : 1 + nq], states[k, 1 + nq :])
         cmgs = self.flight_computer.actuator_sets.get("cmgs")
         gimbals, rotors = states[:, 1 + vehicle.gimbals.qpos], states[:, 1 + nq + vehicle.rotors.dof]
         t_s, navigation = steps * np.float64(simulation.step_s), self.navigation

@@ -11,8 +11,8 @@ from skysim.results.report.as_text import print_wrapped
 
 if TYPE_CHECKING:
     from skysim.experiments.study.analysis.worst import WorstTrial
+    from skysim.experiments.study.execution.store import Store
     from skysim.experiments.study.plan import Plan
-    from skysim.experiments.study.store import Store
 
 REPLAYED = (
     *("trial", "point", "replicate", "seed", "status", "x_arcsec", "y_arcsec", "roll_arcsec"),

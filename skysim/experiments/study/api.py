@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from skysim.core.io.yaml_reader import override_texts
-from skysim.experiments.study import loader, store
+from skysim.experiments.study import loader
 from skysim.experiments.study.analysis import table as tables
-from skysim.experiments.study.execution import runner
+from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.plan import Plan
 from skysim.experiments.study.report.study_report import study_report
 from skysim.results.report import Report

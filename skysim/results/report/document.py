@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from skysim import __version__
+from skysim.core import __version__
 from skysim.core.errors import InputError, unknown_name
 from skysim.results.report import as_html, as_markdown, as_text
 from skysim.results.report.blocks import Block, Cell, Column, Section, Verdict, figure_files, filled

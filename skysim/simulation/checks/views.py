@@ -119,7 +119,7 @@ class CameraModel(NamedTuple):
 
     @classmethod
     def of(cls, lab: Lab) -> CameraModel:
-        """The camera of a test bed, with the background at its initial attitude."""
+        """The camera of a lab, with the background at its initial attitude."""
         camera, detector = lab.scene.camera, lab.scene.camera.detector
         cam_from_lab = lab.camera.mount.cam_from_body * lab.start.inv()
         first_s, glows = lab.scene.exposure.first_s, lab.scene.background

@@ -10,9 +10,10 @@ import pytest
 import yaml
 from study_stores import done
 
-from skysim.experiments.study import loader, store
+from skysim.experiments.study import loader
 from skysim.experiments.study.analysis import answer
 from skysim.experiments.study.analysis.table import PointRow, format_summary
+from skysim.experiments.study.execution import store
 from skysim.experiments.study.plan import Study, resolve_point
 from skysim.experiments.study.report import overview, study_report
 from skysim.results import metrics

@@ -14,10 +14,10 @@ import pytest
 import yaml
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan, store
+from skysim.experiments.study import loader, plan
 from skysim.experiments.study.analysis import cost, search
 from skysim.experiments.study.designs import Point
-from skysim.experiments.study.execution import engines, runner
+from skysim.experiments.study.execution import engines, runner, store
 from skysim.experiments.study.execution.outcomes import FAILED, Outcome
 from skysim.experiments.study.execution.setups import code_version, seed_of
 from skysim.experiments.study.execution.trials import Row, TrialJob

@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import designs, store
+from skysim.experiments.study import designs
 from skysim.experiments.study.analysis import axes, search
 from skysim.experiments.study.analysis.sensitivity import Index
 from skysim.experiments.study.analysis.table import PointRow, cells, has_few_values, table
 from skysim.experiments.study.designs import Point
+from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.plan import Curve, Heat, Study

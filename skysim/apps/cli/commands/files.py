@@ -32,7 +32,7 @@ def scenes(context: typer.Context, json: Json = False) -> None:
 def scenes_show(scene: SceneArg, set_: Overrides = None, json: Json = False) -> None:
     """Print the effective scene: every key with its value and where it comes from (file and line, preset, default)."""
     from skysim.core.io.yaml_reader import parse_overrides
-    from skysim.scene.keys import provenance
+    from skysim.scene import provenance
 
     entries = provenance.effective(scene, parse_overrides(set_))
     if json:

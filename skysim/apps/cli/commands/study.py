@@ -31,8 +31,8 @@ from skysim.core.errors import InputError, printable, unknown_name
 
 if TYPE_CHECKING:
     from skysim.experiments.study.execution.engines import Engine
+    from skysim.experiments.study.execution.store import Store
     from skysim.experiments.study.plan import Plan
-    from skysim.experiments.study.store import Store
 
 app = typer.Typer(invoke_without_command=True, help="Run Monte Carlo studies: many trials of a scene with varied keys.")
 
@@ -268,9 +268,8 @@ def run_and_report(
     resumed       : the store may hold trials already
     repeat_failed : repeat the failed trials too
     """
-    from skysim.experiments.study import store
     from skysim.experiments.study.analysis import search
-    from skysim.experiments.study.execution import runner
+    from skysim.experiments.study.execution import runner, store
 
     path, total = folder_of(study, out) / store.STORE, plan.study.trial_count(len(plan.points))
     resume_command = command(study, out, "resume")
@@ -328,7 +327,7 @@ def write_report(plan: Plan, study: str, out: Path | None, json: bool, open_: bo
 
 def located(study: str, out: Path | None) -> tuple[str, Path | None]:
     """The study's file and its output folder, where `study` may be the folder with its store. Raises InputError."""
-    from skysim.experiments.study import store
+    from skysim.experiments.study.execution import store
 
     if out is not None or not (Path(study) / store.STORE).is_file():
         return study, out
@@ -392,7 +391,7 @@ def folder_of(study: str, out: Path | None) -> Path:
 
 def open_store(study: str, out: Path | None) -> AbstractContextManager[Store]:
     """The study's store, opened for reading. Raises InputError if there is none."""
-    from skysim.experiments.study import store
+    from skysim.experiments.study.execution import store
 
     return store.open_store(folder_of(study, out) / store.STORE)
 

@@ -54,7 +54,8 @@ class Playback:
         self.flight = Flight(bench.lab)
         self.shown: int | None = None
         self.reported = 0
-        self.events = self.flight.events(cameras=[0])
+        flight = self.flight
+        self.events = flight.events(flight.filter_schedules or flight.schedules[:1], solves=True)
 
     def advance(self, budget_s: float) -> FlightStep:
         """Compute for about a time, and report what is new."""
@@ -66,7 +67,7 @@ class Playback:
             except StopIteration:
                 is_done = True
             else:
-                if shot is not None:
+                if shot is not None and shot.camera is self.bench.lab.camera:
                     self.add(shot)
         log = self.flight.telemetry()
         new = self.frames[self.reported :]
@@ -76,7 +77,7 @@ class Playback:
         views = [frame.view for frame in new]
         return FlightStep(
             is_done,
-            self.flight.duration_s if is_done else self.flight.reached_s,
+            self.flight.now_s,
             self.flight.duration_s,
             tuple(map(frame_row, views)),
             curves(log) if is_done or views else None,

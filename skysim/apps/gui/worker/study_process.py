@@ -14,9 +14,9 @@ import numpy as np
 import yaml
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import store
 from skysim.experiments.study.api import run_study
-from skysim.experiments.study.store import STORE
+from skysim.experiments.study.execution import store
+from skysim.experiments.study.execution.store import STORE
 from skysim.results import metrics
 
 RESPONSES = {  # label on the page by response

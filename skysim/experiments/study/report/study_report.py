@@ -18,11 +18,11 @@ from skysim.experiments.study.analysis.search import SearchResult
 from skysim.experiments.study.analysis.sensitivity import Index
 from skysim.experiments.study.analysis.table import PointRow, format_response, format_summary
 from skysim.experiments.study.analysis.worst import ColumnsOf
+from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
 from skysim.experiments.study.report import figures, layout, maps
 from skysim.experiments.study.report.maps import DirectionMap
 from skysim.experiments.study.report.overview import Overview, overview
-from skysim.experiments.study.store import Store
 from skysim.results.report import (
     Block,
     Cell,

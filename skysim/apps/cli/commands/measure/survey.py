@@ -187,7 +187,7 @@ def survey_mode(
 
 
 def planned(request: Request) -> tuple[Lab, CalibrationPrior, Plan]:
-    """The test bed with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
+    """The lab with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
     from skysim.experiments.dome_survey import procedure
 
     return procedure.plan_survey(
