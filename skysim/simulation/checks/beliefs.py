@@ -70,7 +70,7 @@ class Beliefs:
 
 
 def of(lab: Lab, camera: CameraModel) -> Beliefs:
-    """The beliefs of a test bed's tracker. Raises InputError for a map or a catalog that cannot be read."""
+    """The beliefs of a lab's tracker. Raises InputError for a map or a catalog that cannot be read."""
     scene = lab.scene
     tracker, believed = scene.tracker, assumed_camera(scene)
     lights, direction_error, faintest_mag, epoch_jyear = known_lights(lab, camera)

@@ -29,7 +29,7 @@ MAX_PULSES = 500  # in an exposure; with more the mean time of the light does no
 
 
 class Context(NamedTuple):
-    """What all checks share: the test bed, the tracker's settings and beliefs, the camera, and the dome's surface.
+    """What all checks share: the lab, the tracker's settings and beliefs, the camera, and the dome's surface.
 
     known_id, known_row : (N,) ascending numbers of the lights that the tracker knows, and their rows in its beliefs
     timing_s : (N,) standard deviation of the mean time of each light that the tracker knows within an exposure
@@ -53,7 +53,7 @@ class Context(NamedTuple):
 
 
 def context_of(lab: Lab) -> Context:
-    """The context of a test bed. Raises InputError for a map or a catalog that cannot be read."""
+    """The context of a lab. Raises InputError for a map or a catalog that cannot be read."""
     camera = CameraModel.of(lab)
     believed = beliefs.of(lab, camera)
     light, lights = lab.scene.light, believed.lights

@@ -43,7 +43,7 @@ class Check(NamedTuple):
 
 
 def check(lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | None = None) -> Check:
-    """Check the plan of a test bed whose motion need not be simulated.
+    """Check the plan of a lab whose motion need not be simulated.
 
     tilt_deg : greatest tilt under a dome, if it is not that of the scene's motion (random attitudes of a study)
     rate_body_rad_s : (3,) rate of all frames in body axes, in place of the motion's, for trials of single frames

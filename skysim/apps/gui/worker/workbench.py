@@ -105,7 +105,7 @@ class Workbench:
         return self.render(camera, Trajectory.at_rest(self.lab_from_body, frame_end_s(self.scene, 0)), solve)
 
     def next_run(self) -> Lab:
-        """The test bed in a run with its own noise."""
+        """The lab in a run with its own noise."""
         self.rendered_count += 1
         return self.lab.in_run(self.scene.seed + self.rendered_count)
 

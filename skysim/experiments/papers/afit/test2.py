@@ -96,13 +96,13 @@ def point_at(place: Place) -> Rotation:
 
 def series(lab: Lab, place: Place, images: int, rng: np.random.Generator) -> Series:
     """Measure images of a place; those that do not show two lights are left out."""
-    testbed_at_place, attitude = place_pair(lab, place), point_at(place)
+    lab_at_place, attitude = place_pair(lab, place), point_at(place)
     magnitudes, angles = [], []
     for _ in range(images):
-        lights = measure_frame(testbed_at_place, attitude, rng)
+        lights = measure_frame(lab_at_place, attitude, rng)
         if len(lights.magnitude) == 2:
             magnitudes.append(lights.magnitude)
-            angles.append(separations_arcsec(lights.xy_px, testbed_at_place)[0])
+            angles.append(separations_arcsec(lights.xy_px, lab_at_place)[0])
     return Series(np.array(magnitudes), np.array(angles))
 
 

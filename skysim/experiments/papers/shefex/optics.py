@@ -34,7 +34,7 @@ EXPOSURE_S = 0.05
 def optics_results(options: ExperimentOptions) -> dict[str, RowResult]:
     """Answers that need no night-sky frames."""
     horizontal, vertical, diagonal = field_deg(onboard_model.calibration(shefex_lab().scene.camera))
-    absorbed = star_image(ground_testbed(), 0.05).sum() / star_image(shefex_lab(), 0.035).sum()
+    absorbed = star_image(ground_lab(), 0.05).sum() / star_image(shefex_lab(), 0.035).sum()
     results = {
         "field_h": RowResult(exact(horizontal)),
         "field_v": RowResult(exact(vertical)),
@@ -60,7 +60,7 @@ def field_deg(camera: Camera) -> tuple[float, float, float]:
 
 
 @cache
-def ground_testbed() -> Lab:
+def ground_lab() -> Lab:
     """The camera below an atmosphere that absorbs 30 %."""
     transmission = 0.7 * shefex_lab().scene.camera.gray_transmission
     return build_lab(load("shefex2", {"camera.transmission": str(transmission)}))
