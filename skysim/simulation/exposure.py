@@ -7,6 +7,7 @@ then its glare. Charge smear of the shutter and the detector follow (camera/dete
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -23,10 +24,12 @@ from skysim.camera.glow import background
 from skysim.camera.render import Window, in_view, project, render
 from skysim.camera.stray import ghosts, glare
 from skysim.core.random_streams import DETECTOR, random_stream
-from skysim.core.types import Frame, SourceTruth, Trajectory, Truth
+from skysim.core.types import Floats, Frame, SourceTruth, Trajectory, Truth
 from skysim.simulation.lab import StarCamera
 from skysim.simulation.lights.light import Beam, Exposure, Lit, Seeds, any_of, beam_of
-from skysim.simulation.timing import exposure_window, frame_end_s, time_tag_error_s
+from skysim.simulation.timing import MARGIN_S, exposure_window, frame_end_s, time_tag_error_s, window_from
+
+KNOTS = 5  # of the motion in an exposure of constant rate
 
 
 def render_frame(
@@ -82,6 +85,21 @@ def exposure_of(
         mount, optics = thermal.camera_at(scene.thermal, mount, optics, middle_s)
     lab_from_body = trajectory.attitude_at(middle_s)
     return Exposure(index, window, trajectory, lab_from_body, mount, optics, camera.band, camera.viewpoint, seeds)
+
+
+def expected_exposure(camera: StarCamera, lab_from_body: Rotation, rate_body_rad_s: Floats, t_s: float) -> Exposure:
+    """An exposure at an attitude and a constant rate, (3,) in body axes, in which nothing is drawn at random.
+
+    t_s : middle of the first row's exposure; NaN for that of the first frame
+    """
+    config = camera.scene.exposure
+    middle_s = config.first_s + config.time_s / 2 if math.isnan(t_s) else t_s
+    window = window_from(camera.scene, middle_s - config.time_s / 2)
+    rows = camera.scene.camera.height_px
+    after_s = np.linspace(-1, 1, KNOTS) * (window.close_s(rows) - window.open_s + MARGIN_S)
+    attitudes = lab_from_body * Rotation.from_rotvec(np.outer(after_s, rate_body_rad_s))
+    trajectory = Trajectory(window.middle_s(rows) + after_s, attitudes, np.tile(rate_body_rad_s, (KNOTS, 1)))
+    return exposure_of(camera, trajectory, 0, window, None)
 
 
 def draw_glow(image: NDArray[Any], beam: Beam, exposure_s: float) -> None:

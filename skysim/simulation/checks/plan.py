@@ -25,7 +25,7 @@ from skysim.simulation.lab import Lab
 from skysim.simulation.reference_limits import check_reference
 from skysim.sources.dome.placement.ambiguity import Ambiguity
 
-OWN_KEYS = ("camera.", "tracker.", "exposure.")  # of a head; a finding about any other key is one about the scene
+OWN_KEYS = ("camera.", "tracker.", "exposure.", "rotation_deg:")  # of a head; other findings are about the scene
 LEAST_ALIKE, MAP_WORK = 0.3, 60_000  # of an ambiguity map: least fraction sought, fields times LEDs in a field
 SKY_FINDINGS = (depth.sky_too_shallow, depth.tracker_too_shallow, claims.floor_too_small, air.refraction)
 
@@ -163,4 +163,6 @@ def errors_text(cross: float, roll: float) -> str:
 
 def head_findings(n: int, own: Sequence[str], main: Sequence[str]) -> list[str]:
     """The warnings of head n that are not those of the main camera, with the key of the head."""
-    return [f"heads.{n}.{line}" for line in own if line.startswith(OWN_KEYS) and line not in main]
+    # A head is pointed elsewhere by its mount.
+    lines = [line.replace("motion.start:", "rotation_deg:", 1) if line not in main else line for line in own]
+    return [f"heads.{n}.{line}" for line in lines if line.startswith(OWN_KEYS) and line not in main]

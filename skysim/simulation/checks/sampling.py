@@ -16,7 +16,8 @@ from skysim.core.types import Floats
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, usable
 from skysim.simulation.checks.expected_error import Expected, expected
-from skysim.simulation.checks.views import VISIBLE, View, expected_exposure, view
+from skysim.simulation.checks.views import VISIBLE, View, view
+from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lights.light import Beam, Exposure, beam_of
 
 

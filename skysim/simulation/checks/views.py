@@ -24,22 +24,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
-from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics
 from skysim.camera.psf.kernel import build_kernel
 from skysim.camera.psf.otf import blur_radius_px, chromatic_sigma_px, field_sigma_px
 from skysim.camera.render import in_view, project, rates_e_s
-from skysim.core.types import Floats, Trajectory
-from skysim.simulation.exposure import exposure_of
-from skysim.simulation.lab import Lab, StarCamera
+from skysim.core.types import Floats
+from skysim.simulation.exposure import expected_exposure
+from skysim.simulation.lab import Lab
 from skysim.simulation.lights.lens import STRAY_LIGHT
 from skysim.simulation.lights.light import Beam, Exposure, Lit, Occluder, beam_of
-from skysim.simulation.timing import MARGIN_S, window_from
 
 STEP = 1e-6  # relative displacement of a light, for the numerical derivative of its image
 NO_ACCELERATION = np.zeros(3)
-KNOTS = 5  # of the motion in an exposure, at a constant rate
 VISIBLE = -1
 
 
@@ -154,21 +151,6 @@ def before_lights_e_s(lit: Lit) -> float:
     """Electrons s^-1 px^-1 of light with edges behind which lights are seen: none of what hides them."""
     glow = lit.edged.e_s() if lit.edged and lit.hides is None else None
     return 0.0 if glow is None or lit.edged is None else lit.edged.share * float(np.median(glow))
-
-
-def expected_exposure(camera: StarCamera, lab_from_body: Rotation, rate_body_rad_s: Floats, t_s: float) -> Exposure:
-    """An exposure at an attitude and a constant rate, (3,) in body axes, in which nothing is drawn at random.
-
-    t_s : middle of the first row's exposure; NaN for that of the first frame
-    """
-    config = camera.scene.exposure
-    middle_s = config.first_s + config.time_s / 2 if math.isnan(t_s) else t_s
-    window = window_from(camera.scene, middle_s - config.time_s / 2)
-    rows = camera.scene.camera.height_px
-    after_s = np.linspace(-1, 1, KNOTS) * (window.close_s(rows) - window.open_s + MARGIN_S)
-    attitudes = lab_from_body * Rotation.from_rotvec(np.outer(after_s, rate_body_rad_s))
-    trajectory = Trajectory(window.middle_s(rows) + after_s, attitudes, np.tile(rate_body_rad_s, (KNOTS, 1)))
-    return exposure_of(camera, trajectory, 0, window, None)
 
 
 def view(
