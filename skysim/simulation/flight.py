@@ -234,10 +234,15 @@ class Flight:
         return self.flown
 
     def telemetry(self) -> Telemetry:
-        """True and estimated states at the ticks of the flight computer. Raises InputError without history."""
+        """True and estimated states at the ticks of the flight computer.
+
+        Raises InputError without history, and before the first step.
+        """
         recorder = self.motion.recorder
         if recorder is None:
             raise InputError("telemetry: this flight keeps no history; allowed: keeps_history=True")
+        if not self.now_s:
+            raise InputError("telemetry: the motion has not begun; allowed: after a step")
         reference = self.motion.reference if self.lab.scene.motion.control else None
         return recorder.telemetry(reference, self.lab.cameras)
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.scene import loader
-from skysim.scene.keys import unused
+from skysim.scene import loader, unused
 from skysim.simulation.flight import simulate_motion
 from skysim.simulation.lab import build_tracker
 from skysim.tracking.factory import solve_frame

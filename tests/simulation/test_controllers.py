@@ -19,8 +19,7 @@ from skysim.core.types import Telemetry
 from skysim.dynamics.controllers.interface import ControllerInput, ControllerSetup, check_torque, torque_of_reply
 from skysim.dynamics.guidance import plan
 from skysim.experiments.study import loader as study_loader
-from skysim.experiments.study import store
-from skysim.experiments.study.execution import runner, setups
+from skysim.experiments.study.execution import runner, setups, store
 from skysim.experiments.study.execution.engines import Serial
 from skysim.scene import loader
 from skysim.simulation.checks import check

@@ -27,8 +27,7 @@ from skysim.core.paths import ROOT
 from skysim.core.plugins.program import ProgramError
 from skysim.experiments import tracker_comparison
 from skysim.experiments.study import loader as study_loader
-from skysim.experiments.study import store
-from skysim.experiments.study.execution import runner, setups
+from skysim.experiments.study.execution import runner, setups, store
 from skysim.experiments.study.execution.engines import Serial
 from skysim.results import metrics
 from skysim.scene import loader

@@ -76,7 +76,7 @@ def load(
         for one of them
     """
     from skysim.core.io.yaml_reader import parse_overrides
-    from skysim.scene.keys import unused
+    from skysim.scene import unused
     from skysim.scene.loader import load as load_scene
 
     values = parse_overrides(overrides)

@@ -20,7 +20,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from skysim import __version__
+from skysim.core import __version__
 from skysim.core.errors import InputError, printable, unknown_name
 
 Files = list[tuple[Path, str]]  # paths and texts
