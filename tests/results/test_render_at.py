@@ -51,6 +51,7 @@ def test_the_truth_is_what_the_plant_says_at_mid_exposure(lab: Lab, attitude: Ro
     np.testing.assert_allclose(truth.sources.streak_px[middle], wanted, rtol=0, atol=0.15)
 
 
+@pytest.mark.slow
 def test_a_frame_at_rest_is_that_of_the_scene_at_rest() -> None:
     """The number selects the noise as it does in the scene: all pixels are equal, but for roundings of the time."""
     scene = skysim.load_scene("shefex2", FULL_SKY)
@@ -61,6 +62,7 @@ def test_a_frame_at_rest_is_that_of_the_scene_at_rest() -> None:
         assert np.mean(outside.image_dn != frame.image_dn) < 1e-4
 
 
+@pytest.mark.slow
 def test_a_moving_frame_is_that_of_a_scene_that_moves_so() -> None:
     """Without noise, and to the integration: a sphere keeps its rate."""
     keys = {"motion.rate_deg_s": np.degrees(RATE).tolist(), "camera.detector.noise": False}
