@@ -40,10 +40,10 @@ def unit_columns(axes: Floats, name: str) -> Floats:
     """(3, n) floats; raises InputError unless they are unit vectors."""
     columns = np.ascontiguousarray(axes, dtype=float)  # one layout, or numba compiles for each
     if columns.ndim != 2 or len(columns) != 3 or not columns.size:
-        raise InputError(f"{name}: shape {columns.shape}; allowed: (3, n), one column each")
+        raise InputError(name, f"shape {columns.shape}", "(3, n), one column each")
     norm = np.linalg.norm(columns, axis=0)
     if not np.all(np.abs(norm - 1) < 1e-6):
-        raise InputError(f"{name}: lengths {np.round(norm, 6).tolist()}; allowed: unit vectors")
+        raise InputError(name, f"lengths {np.round(norm, 6).tolist()}", "unit vectors")
     return columns
 
 
@@ -51,7 +51,7 @@ def positive_values(value: Floats, n: int, name: str) -> Floats:
     """(n,) positive floats; raises InputError otherwise."""
     values = np.asarray(value, dtype=float)
     if values.shape != (n,) or not np.all(values > 0):
-        raise InputError(f"{name}: {values.tolist()}; allowed: {n} positive numbers")
+        raise InputError(name, values.tolist(), f"{n} positive numbers")
     return values
 
 
@@ -117,7 +117,7 @@ class FanSet:
     def __post_init__(self) -> None:
         axes, positions = unit_columns(self.force_axes, "fan axes"), np.asarray(self.positions_m, dtype=float)
         if positions.shape != axes.shape:
-            raise InputError(f"fan positions_m: shape {positions.shape}; allowed: {axes.shape}, as the axes")
+            raise InputError("fan positions_m", f"shape {positions.shape}", f"{axes.shape}, as the axes")
         arms = np.cross(positions, axes, axis=0)
         object.__setattr__(self, "torque_per_thrust_m", arms)
         object.__setattr__(self, "thrust_from_torque", np.linalg.pinv(arms, rcond=RANK_TOLERANCE))
@@ -251,9 +251,9 @@ class CmgSet:
         spin = unit_columns(self.spin_axes, "rotor axes")
         inertia = positive_values(self.rotor_inertia_kg_m2, gimbal.shape[1], "rotor_inertia_kg_m2")
         if spin.shape != gimbal.shape or np.abs((gimbal * spin).sum(axis=0)).max() > 1e-6:
-            raise InputError("rotor axes: allowed: one for each gimbal, at right angles to its axis")
+            raise InputError("rotor axes", "", "one for each gimbal, at right angles to its axis")
         if self.steering not in STEERING:
-            raise InputError(f"cmgs.steering: {unknown_name('steering law', self.steering, STEERING)}")
+            raise InputError("cmgs.steering", *unknown_name("steering law", self.steering, STEERING))
         arrays = {"gimbal_axes": gimbal, "spin_axes": spin, "rotor_inertia_kg_m2": inertia}
         for name, value in arrays.items():
             object.__setattr__(self, name, value)

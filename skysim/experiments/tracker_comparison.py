@@ -53,7 +53,7 @@ def build_trackers(testbed: Testbed, names: Sequence[str]) -> dict[str, factory.
     """Set up the trackers by name, all with the scene's tracker options and onboard model. Raises InputError."""
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
-        raise InputError(f"--tracker {repeated[0]}: given twice; allowed: once")
+        raise InputError("trackers", f"{repeated[0]} is given twice", "once")
     scenes = {name: with_config(testbed.scene, "tracker", name=name) for name in names}
     return {name: build_tracker(replace(testbed, scene=scene)) for name, scene in scenes.items()}
 

@@ -274,7 +274,7 @@ def render(scene: Scene, index: int = 0) -> tuple[Frame, Truth]:
     """
     frames = scene.exposure.frames
     if not 0 <= index < frames:
-        raise InputError(f"index: {index} is outside of the scene's frames; allowed: 0 to {frames - 1}")
+        raise InputError("index", f"{index} is outside of the scene's frames", f"0 to {frames - 1}")
     testbed = simulation.prepare(scene)
     if scene.tracker.exposure_control is None and index not in testbed.exposures_s:
         return exposure.render_frame(testbed, index)

@@ -260,7 +260,7 @@ def build_head(testbed: Testbed, n: int, stars: catalog.Catalog | None) -> Testb
             band = Band.from_camera(scene.camera)
             sources = light_sources(scene, band, testbed.orbit, stars)
     except InputError as error:
-        raise InputError(f"heads.{n}.{error}") from None
+        raise InputError("", f"heads.{n}.{error}") from None
     main_from_head = Rotation.from_rotvec(head.rotation_deg, degrees=True)
     mount = Mount(np.array(head.position_m), main_from_head.inv() * testbed.mount.cam_from_body)
     dtype = np.float32 if scene.camera.detector.noise else np.float64
@@ -309,7 +309,7 @@ def export_leds(testbed: Testbed) -> tuple[str, int]:
     """The LEDs of the test bed's dome as `led_list` returns them. Raises InputError without a dome."""
     scene = testbed.scene
     if not isinstance(scene.light, DomeConfig):
-        raise InputError(f"light.kind: {scene.light.kind} has no list of LEDs; allowed: dome")
+        raise InputError("light.kind", f"{scene.light.kind} has no list of LEDs", "dome")
     return led_list(scene.light, testbed.band, scene.name)
 
 
@@ -343,7 +343,7 @@ def light_sources(
         return display.display_sources(scene.light, stars, scene.start_time, band)
     if scene.light.variability_seed is not None:
         if not stars.scatter_mag.any():
-            raise InputError(f"light.variability_seed: {scene.light.catalog} has no variable stars; allowed: gaia_v8.0")
+            raise InputError("light.variability_seed", f"{scene.light.catalog} has no variable stars", "gaia_v8.0")
         stars = star_sources.varied(stars, scene.light.variability_seed)
     velocity_m_s: Floats | tuple[float, ...] = star_sources.AT_REST
     if scene.light.bodies or scene.light.satellites or scene.light.air or orbit:

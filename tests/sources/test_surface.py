@@ -485,7 +485,7 @@ def complaint(more: str) -> str:
 @pytest.mark.parametrize(
     ("told", "says"),
     [
-        ("{kind: torus}", "light.surface.kind: 'torus' is not allowed; it should be 'sphere', 'ellipsoid', 'flat'"),
+        ("{kind: torus}", "light.surface.kind: 'torus' is not allowed; allowed: 'sphere', 'ellipsoid', 'flat'"),
         ("{kind: [flat]}", r"light.surface.kind: \['flat'\] is not allowed"),
         ("{apex: 1 m}", "light.surface: kind is missing"),
         ("{kind: sphere, apex: 1 m}", "light.surface.radius: missing"),

@@ -123,26 +123,28 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
                 for joint in hinges:
                     spec.delete(joint)
             elif not hinges:
-                raise InputError(f"{path}: no joint {prefix}*, which vehicle.{key} needs")
+                raise InputError(path, f"no joint {prefix}*, which vehicle.{key} needs")
             elif any(joint.type != JOINT_TYPE.get(prefix, mujoco.mjtJoint.mjJNT_HINGE) for joint in hinges):
-                raise InputError(f"{path}: joints {prefix}* must be {'slides' if prefix in JOINT_TYPE else 'hinges'}")
+                raise InputError(path, f"joints {prefix}* must be {'slides' if prefix in JOINT_TYPE else 'hinges'}")
             for joint in hinges if config else ():
                 check_bare(joint, path)
     if vehicle.cmgs:
         check_rotor_pairs(spec, path)
     if vehicle.fans and not fan_sites(spec):
-        raise InputError(f"{path}: no site {FAN}*, which vehicle.fans needs")
+        raise InputError(path, f"no site {FAN}*, which vehicle.fans needs")
     for actuator in spec.actuators:
         if actuator.name in TORQUES or actuator.name.startswith((WHEEL, GIMBAL, ROTOR, FAN, TRIM)):
             raise InputError(
-                f"{path}: actuator {actuator.name}: skysim adds an actuator of this name; remove it from the file"
+                path, f"actuator {actuator.name}: an actuator of this name is added; remove it from the file"
             )
     return locked
 
 
-def locked_joint_hint(message: str, locked: dict[str, str]) -> str:
-    """An addition to MuJoCo's message about an unknown joint, if that joint was deleted."""
-    names = [name for name in locked if f"'{name}'" in message]
+def locked_joint_hint(spec: Any, locked: dict[str, str]) -> str:
+    """An addition to the problem of a model that does not compile, if it refers to a joint that was deleted."""
+    named = {sensor.objname for sensor in spec.sensors} | {actuator.target for actuator in spec.actuators}
+    named |= {name for equality in spec.equalities for name in (equality.name1, equality.name2)}
+    names = [name for name in locked if name in named]
     return f"; {locked[names[0]]} is off, which locks joint {names[0]}" if names else ""
 
 
@@ -151,9 +153,7 @@ def check_names(spec: Any, path: Path) -> None:
     for element in (*spec.joints, *spec.sites):
         prefix = next((p for p in (WHEEL, GIMBAL, ROTOR, FAN, TRIM) if element.name.startswith(p[:-1])), None)
         if prefix and not element.name.startswith(prefix):
-            raise InputError(
-                f"{path}: {element.name}: allowed: {prefix}{element.name[len(prefix) - 1 :]}, or another word"
-            )
+            raise InputError(path, element.name, f"{prefix}{element.name[len(prefix) - 1 :]}, or another word")
 
 
 def check_bare(joint: Any, path: Path) -> None:
@@ -170,7 +170,7 @@ def check_bare(joint: Any, path: Path) -> None:
     }
     for name, value in attributes.items():
         if np.any(value):
-            raise InputError(f"{path}: joint {joint.name}: {name} is set by the scene; remove it from the file")
+            raise InputError(path, f"joint {joint.name}: {name} is set by the scene; remove it from the file")
 
 
 def check_rotor_pairs(spec: Any, path: Path) -> None:
@@ -179,9 +179,9 @@ def check_rotor_pairs(spec: Any, path: Path) -> None:
         suffix = gimbal.name.removeprefix(GIMBAL)
         rotor = spec.joint(ROTOR + suffix)
         if rotor is None or rotor.parent.parent != gimbal.parent:
-            raise InputError(f"{path}: joint {gimbal.name} has no joint {ROTOR}{suffix} on a child body of its own")
+            raise InputError(path, f"joint {gimbal.name} has no joint {ROTOR}{suffix} on a child body of its own")
     if len(joints(spec, ROTOR)) != len(joints(spec, GIMBAL)):
-        raise InputError(f"{path}: a joint {ROTOR}* has no joint {GIMBAL}* of the same suffix")
+        raise InputError(path, f"a joint {ROTOR}* has no joint {GIMBAL}* of the same suffix")
 
 
 def fan_sites(spec: Any) -> list[Any]:

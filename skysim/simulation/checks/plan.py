@@ -91,7 +91,7 @@ def ambiguity_map(testbed: Testbed) -> tuple[Ambiguity, float]:
     context = context_of(testbed)
     samples = samples_of(context, attitudes.of_frames(testbed), None)
     if reason := lookalike.why_not_compared(context, samples):
-        raise InputError(reason)
+        raise InputError("", reason)
     return lookalike.compared(context, samples, LEAST_ALIKE, MAP_WORK)
 
 

@@ -357,12 +357,12 @@ def test_exposures_are_told_frame_by_frame(skysim: Skysim, tmp_path: Path) -> No
         ),
         (
             ["shefex2", "--set", "exposure.time=-40 ms"],
-            "'-40 ms' is not allowed; it should be greater than or equal to 0.000001",
+            "'-40 ms' is not allowed; allowed: greater than or equal to 0.000001",
         ),
         (["shefex2", "--set", "exposure.time=nan s"], "nan is not a finite number"),
         (
             ["afit_simsat", "--set", "light.led.falloff=cubic"],
-            "light.led.falloff: 'cubic' is not allowed; it should be 'inverse_square'",
+            "light.led.falloff: 'cubic' is not allowed; allowed: 'inverse_square'",
         ),
         (
             ["afit_simsat", "--set", "motion.start={ra_deg: 3, dec_deg: 4}"],
@@ -432,7 +432,7 @@ def test_a_scene_file_s_slip_is_told_with_its_line(skysim: Skysim, tmp_path: Pat
     said = skysim("render", path).one_line()
     assert (
         said
-        == f"skysim: light.led.falloff: 'cubic' is not allowed; it should be 'inverse_square' ({path}, line {line})"
+        == f"skysim: light.led.falloff: 'cubic' is not allowed; allowed: 'inverse_square' ({path}, line {line})"
     )
 
 

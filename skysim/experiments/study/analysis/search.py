@@ -84,20 +84,18 @@ def check(study: Study) -> None:
         check_response(objective.response, f"optimize.objectives.{n}.response")
     first, *others = (one.response for one in config.objectives)
     if first in others:
-        raise InputError(f"optimize.objectives: {first} occurs twice; allowed: different responses")
+        raise InputError("optimize.objectives", f"{first} occurs twice", "different responses")
     for n, limit in enumerate(config.constraints):
         check_response(limit.response, f"optimize.constraints.{n}.response")
         if limit.at_least is None and limit.at_most is None:
-            raise InputError(f"optimize.constraints.{n}: no bound; allowed: at_least, at_most or both")
+            raise InputError(f"optimize.constraints.{n}", "no bound", "at_least, at_most or both")
     for name, factor in study.factors.items():
         if isinstance(factor, Distribution):
-            raise InputError(
-                f"factors.{name}: a distribution cannot be optimized; allowed: levels, values, from and to"
-            )
+            raise InputError(f"factors.{name}", "a distribution cannot be optimized", "levels, values, from and to")
     check_cost(study.factors, config.cost)
     trials, budget = config.candidates * study.replicates, study.budget.trials
     if budget is not None and trials > budget:
-        raise InputError(f"budget.trials: {budget}; allowed: at least {trials}, the trials of the search")
+        raise InputError("budget.trials", budget, f"at least {trials}, the trials of the search")
 
 
 def check_response(response: str, where: str) -> None:
@@ -107,10 +105,10 @@ def check_response(response: str, where: str) -> None:
     try:
         metrics.response(response, where)
     except InputError as error:
-        raise InputError(f"{error}, or {COST}") from None
+        raise InputError(where, error.problem, f"{error.allowed}, or {COST}") from None
     if response.startswith("time_ms"):
         allowed = "responses that a resumed search reproduces"
-        raise InputError(f"{where}: {response} is not reproducible; allowed: {allowed}")
+        raise InputError(where, f"{response} is not reproducible", allowed)
 
 
 # Evaluation of a candidate.
@@ -224,8 +222,9 @@ def search(plan: Plan, store: Store, engine: Engine, watch: Watch | None = None)
             store.set_points([point], first=n)
         elif key_of(stored[n]) != key_of(point):
             raise InputError(
-                f"{store.path}: candidate {n} is {stored[n].levels}, the sampler now proposes {point.levels};"
-                " allowed: the version of optuna that started the search, or another --out"
+                store.path,
+                f"candidate {n} is {stored[n].levels}, the sampler now proposes {point.levels}",
+                "the version of optuna that started the search, or another store",
             )
         refused = study.replicates * sum(one.refused for one in evaluated.values())
         if not run_candidate(plan, store, engine, n, point, total, refused, watch):
@@ -244,7 +243,7 @@ def create_sampler(study: Study) -> Any:
     try:
         import optuna
     except ImportError:
-        raise InputError("optimize: optuna is not installed; allowed: after pip install 'skysim[optuna]'") from None
+        raise InputError("optimize", "optuna is not installed", "after pip install 'skysim[optuna]'") from None
     assert study.optimize is not None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     seed = int(np.random.SeedSequence(study.seed).generate_state(1)[0])

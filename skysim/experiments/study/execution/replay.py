@@ -40,7 +40,7 @@ def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
     """The segment with this trial alone. Raises InputError if the study has no such trial."""
     points, each = store.points(), plan.study.replicates
     if not 0 <= trial < len(points) * each:
-        raise InputError(f"trial {trial}: not in the study; allowed: 0 to {len(points) * each - 1}")
+        raise InputError(f"trial {trial}", "not in the study", f"0 to {len(points) * each - 1}")
     point, replicate = divmod(trial, each)
     settings = plan.spec.trial_settings(points[point].settings, replicate)
     return Segment(point, settings, trial, range(replicate, replicate + 1))

@@ -13,6 +13,7 @@ from nicegui import run, ui
 from pydantic import ValidationError
 
 from skysim.apps.gui.page import forms, keys
+from skysim.apps.gui.page.shell.wording import for_page
 from skysim.apps.gui.page.style import CURVE_COLORS, TOOLTIP, chart_color, format_number
 from skysim.apps.gui.worker.study_process import (
     PAGE_STUDY,
@@ -102,7 +103,7 @@ class MonteCarloPanel:
                 forms.field_override, self.tab.scene_path, self.tab.overrides, float(self.field.value or 0)
             )
         except InputError as error:
-            self.tab.show_message(str(error))
+            self.tab.show_message(for_page(error))
             return
         await self.tab.apply_overrides(change)
 
@@ -136,9 +137,9 @@ class MonteCarloPanel:
             path = await run.io_bound(self.study_file)
             study = await run.io_bound(loader.load, path)
             if study.study.optimize is not None:
-                raise InputError(f"{path.stem}: has the key optimize; allowed: studies with a design")
+                raise InputError(path.stem, "has the key optimize", "studies with a design")
         except InputError as error:
-            self.tab.show_message(str(error))
+            self.tab.show_message(for_page(error))
             return False
         self.process = StudyProcess(path.parent if not self.study_select.value else self.tab.out / path.stem)
         self.process.total = study.trials
@@ -170,7 +171,7 @@ class MonteCarloPanel:
             trial |= {name: float(field.value or 0) * bool(self.with_noise.value) for name, field in noise.items()}
             trial |= {"false_lights": int(self.false_lights.value or 0)}
         if not (self.count.value and 1 <= self.count.value <= 100_000):
-            raise InputError("runs: allowed: 1 to 100000")
+            raise InputError("runs", "", "1 to 100000")
         settings = self.tab.scene_path, self.effective_overrides(trial), trial, int(self.count.value)
         # A stopped run with unchanged settings is resumed from its own file.
         before = self.process.folder / "monte_carlo.yaml"

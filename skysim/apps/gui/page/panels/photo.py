@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from skysim.apps.gui.page.shell.wording import for_page
 from skysim.apps.gui.worker.photo import SUFFIXES, Stages
 
 if TYPE_CHECKING:
@@ -111,8 +110,7 @@ class PhotoPanel:
 
     def show(self, name: str, photo: Photo | None) -> None:
         if photo is None:
-            message = self.tab.message_text
-            self.show_text(message if message.startswith(name) else f"{name}: {message}", "warn")
+            self.show_text(self.tab.message_text, "warn")
             return
         self.tab.display_photo(photo, kind="photo", photo=name)
         stages = "".join(f"; {stage} {algorithm}" for stage, algorithm in self.stages)
@@ -130,5 +128,5 @@ class PhotoPanel:
         self.show_text(f"{status_text}\n{pointing}\n{quality}", "good")
 
     def show_text(self, text: str, color: str) -> None:
-        self.result_text.set_text(for_page(text))
+        self.result_text.set_text(text)
         self.result_text.classes(remove="quiet good warn", add=color)

@@ -107,7 +107,7 @@ class KeyForm:
         try:
             after = await run.io_bound(forms.with_value, self.tab.scene, before, key, value)
         except InputError as error:
-            self.show_error(key, for_page(str(error)).removeprefix(f"{key}: "))
+            self.show_error(key, error.fault if error.key == key else for_page(error))
             return
         changed = {one: text for one, text in after.items() if before.get(one) != text}
         await self.tab.apply_overrides(changed, before.keys() - after.keys())

@@ -9,6 +9,7 @@ from nicegui import run, ui
 
 from skysim.apps.gui.page import forms
 from skysim.apps.gui.page.settings.key_form import KeyForm
+from skysim.apps.gui.page.shell.wording import for_page
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ class ScenePanel:
                 forms.save, self.tab.folder, name, self.tab.scene, dict(self.tab.overrides), title
             )
         except InputError as error:
-            self.tab.show_message(str(error))
+            self.tab.show_message(for_page(error))
             return
         self.tab.log(f"saved {path}")
         self.tab.picker.set_options(self.tab.scenes())
