@@ -519,8 +519,8 @@ def spoilt(folder: Path, right: str, wrong: str, **changes: object) -> multibody
 @pytest.mark.parametrize(
     ("right", "wrong", "says"),
     [
-        ('name="wheel_x" axis', 'name="wheelx" axis', "wheelx: allowed: wheel_x, or another word"),
-        ('name="fan_x_1"', 'name="fanx"', "fanx: allowed: fan_x, or another word"),
+        ('name="wheel_x" axis', 'name="wheelx" axis', "wheelx; allowed: wheel_x, or another word"),
+        ('name="fan_x_1"', 'name="fanx"', "fanx; allowed: fan_x, or another word"),
         (
             'name="wheel_x" axis',
             'range="0 90" name="wheel_x" axis',

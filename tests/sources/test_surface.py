@@ -499,7 +499,7 @@ def complaint(more: str) -> str:
         ),
         (
             "{kind: ellipsoid, apex: 1 m, semi_axes: [1 m, 1 m, 1 m], rim_height: 1 m}",
-            "light.surface: rim_height 1 m is not below the apex",
+            "light.surface.rim_height: 1 m is not below the apex",
         ),
         (
             "{kind: sphere, apex: 1 m, radius: 1 m, wall: {thickness_apex: 5 mm, thickness_base: 20 cm, base_deg: 40}}",
