@@ -26,7 +26,8 @@ from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import Testbed, build_testbed, exposure_window
+from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.timing import exposure_window
 from skysim.sources.dome.led import lit_moments_s
 from skysim.tracking.onboard_model import calibration
 from skysim.tracking.settings import assumed_settings
@@ -84,8 +85,8 @@ CASES = (
 )
 
 
-def testbed_of(case: Case, depth: float) -> Testbed:
-    return build_testbed(loader.load("coded_spiral", SETTINGS | case.settings | {"light.led.code.depth": str(depth)}))
+def testbed_of(case: Case, depth: float) -> Lab:
+    return build_lab(loader.load("coded_spiral", SETTINGS | case.settings | {"light.led.code.depth": str(depth)}))
 
 
 def measure(frames: int = FRAMES) -> list[dict[str, Any]]:
@@ -112,25 +113,25 @@ def measure(frames: int = FRAMES) -> list[dict[str, Any]]:
 def bit_error_rate(case: Case, frames: int) -> tuple[float, float]:
     """Measured and theoretical rate of a case."""
     _, _, full_e = read_lights(testbed_of(case, 0.5), 20)
-    testbed = testbed_of(case, case.depth or float(3 / np.sqrt(np.nanmedian(full_e))))
-    light, bits, full_e = read_lights(testbed, frames)
+    lab = testbed_of(case, case.depth or float(3 / np.sqrt(np.nanmedian(full_e))))
+    light, bits, full_e = read_lights(lab, frames)
     usable = np.isfinite(light).sum(axis=0) > 0.9 * frames
     light, bits, full_e = light[:, usable], bits[:, usable], np.nanmedian(full_e[:, usable], axis=0)
     levels = [np.nanmean(np.where(bits == bit, light, np.nan), axis=0) for bit in (False, True)]
     wrong = (light > np.mean(levels, axis=0)) != bits
     changes = float(np.mean(bits[1:] != bits[:-1]))
-    noise_e2 = window_noise_e2(testbed)
-    return float(wrong[np.isfinite(light)].mean()), theory(testbed, full_e, noise_e2, changes)
+    noise_e2 = window_noise_e2(lab)
+    return float(wrong[np.isfinite(light)].mean()), theory(lab, full_e, noise_e2, changes)
 
 
-def window_noise_e2(testbed: Testbed) -> float:
+def window_noise_e2(lab: Lab) -> float:
     """Variance of an LED's light by the chip: read and rounding noise of the pixels of a median window, and of its sky.
 
     The sky's level is that of SAMPLE_ROWS rows of a tile after the binomial filter [1 2 1], which leaves 6/16 of the
     variance, and is interpolated between tiles, which leaves 4/9 of it on average.
     """
-    frame, _ = render_frame(testbed.at_rest(testbed.trajectory.lab_from_body[0], 0), 0)
-    settings, detector = assumed_settings(testbed.scene), testbed.scene.camera.detector
+    frame, _ = render_frame(lab.at_rest(lab.start, 0), 0)
+    settings, detector = assumed_settings(lab.scene), lab.scene.camera.detector
     blobs = DETECTORS[settings.detector](
         frame.image_dn, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, NO_PRIORS
     )
@@ -140,23 +141,23 @@ def window_noise_e2(testbed: Testbed) -> float:
     return pixels * (1 + pixels * sky_share) * (detector.read_noise_e**2 + detector.gain_e_dn**2 / 12)
 
 
-def read_lights(testbed: Testbed, frames: int) -> tuple[Floats, NDArray[np.bool_], Floats]:
+def read_lights(lab: Lab, frames: int) -> tuple[Floats, NDArray[np.bool_], Floats]:
     """(F, N) light of each LED in each frame, NaN where it is not detected; the bit in the middle of the exposure; and
     the expected electrons of a 1."""
-    testbed = testbed.at_rest(testbed.trajectory.lab_from_body[0], frames)
-    camera, settings = calibration(testbed.scene.camera), assumed_settings(testbed.scene)
-    assert testbed.codes is not None
-    codes, rows = testbed.codes, []
+    lab = lab.at_rest(lab.start, frames)
+    camera, settings = calibration(lab.scene.camera), assumed_settings(lab.scene)
+    assert lab.camera.codes is not None
+    codes, rows = lab.camera.codes, []
     for number in range(frames):
-        frame, truth = render_frame(testbed, number)
+        frame, truth = render_frame(lab, number)
         centroids = detect_and_centroid(frame.image_dn, camera, settings, Clock())
-        light, full_e = np.full((2, len(testbed.sources)), np.nan)
-        row = np.searchsorted(testbed.sources.id, truth.sources.id)
+        light, full_e = np.full((2, len(lab.camera.sources)), np.nan)
+        row = np.searchsorted(lab.camera.sources.id, truth.sources.id)
         apart = np.linalg.norm(centroids.xy_px[:, None] - truth.sources.xy_px, axis=2)
         nearest = apart.argmin(axis=1)
         good = apart[np.arange(len(nearest)), nearest] < 2
         light[row[nearest[good]]] = centroids.flux[good]
-        window = exposure_window(testbed.scene, number)
+        window = exposure_window(lab.scene, number)
         level = codes.mean_level(window.open_s, window.exposure_s, number)
         full_e[row] = truth.sources.electrons / level[row]
         middle_s = window.open_s + window.exposure_s / 2
@@ -166,17 +167,17 @@ def read_lights(testbed: Testbed, frames: int) -> tuple[Floats, NDArray[np.bool_
     return light, bits, full_e
 
 
-def theory(testbed: Testbed, full_e: Floats, noise_e2: float, changes: float) -> float:
+def theory(lab: Lab, full_e: Floats, noise_e2: float, changes: float) -> float:
     """Mean probability of a bit's error: over both bits, (K,) LEDs, the drive's phases and a bit's edges.
 
     full_e   : (K,) median electrons of a 1
     noise_e2 : variance beside that of the photons
     changes  : part of the successive bits that differ
     """
-    assert isinstance(testbed.scene.light, DomeConfig)
-    assert testbed.codes is not None
-    exposure_s, code = testbed.scene.exposure.time_s, testbed.codes.config
-    period_s, on_s = float(testbed.sources.period_s[0]), float(testbed.sources.on_s[0])
+    assert isinstance(lab.scene.light, DomeConfig)
+    assert lab.camera.codes is not None
+    exposure_s, code = lab.scene.exposure.time_s, lab.camera.codes.config
+    period_s, on_s = float(lab.camera.sources.period_s[0]), float(lab.camera.sources.on_s[0])
     phase_s = (np.arange(400) + 0.5) / 400 * period_s
     lit_s = np.array([lit_moments_s(0.0, exposure_s, period_s, start_s, on_s)[0] for start_s in phase_s])
     light_e = (full_e[:, None] * lit_s / np.median(lit_s))[..., None]

@@ -27,7 +27,8 @@ from skysim.core.types import Trajectory
 from skysim.results import metrics
 from skysim.scene import loader
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import MARGIN_S, Testbed, build_testbed, build_tracker, exposure_window
+from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.sources.dome.led import irradiance_e_s_m2
 from skysim.tracking import factory
 
@@ -61,15 +62,15 @@ class Bench:
     """The scene's dome, camera and tracker, and the light of its LEDs."""
 
     def __init__(self, settings: dict[str, str] | None = None) -> None:
-        self.testbed = build_testbed(loader.load(SCENE, settings or {}))
-        tracker = build_tracker(self.testbed)
+        self.lab = build_lab(loader.load(SCENE, settings or {}))
+        tracker = build_tracker(self.lab.camera)
         assert isinstance(tracker, CodedTracker)
         self.tracker, self.noise = tracker, Noise()
 
     def sequence(self, rate_deg_s: float, seed: int, frames: int | None = None, all_frames: bool = False) -> Sequence:
         """Follow the lights over a code's length of frames from a random attitude; ends with the first attitude."""
-        rng, frame_s = random_stream(seed), 1 / self.testbed.scene.exposure.rate_hz
-        testbed, start = self.testbed.in_run(seed), attitude(rng)
+        rng, frame_s = random_stream(seed), 1 / self.lab.scene.exposure.rate_hz
+        lab, start = self.lab.in_run(seed), attitude(rng)
         axis = rng.standard_normal(3)
         turn_rad_s = np.radians(rate_deg_s) * axis / np.linalg.norm(axis)
         begin = int(rng.integers(0, 1000))
@@ -77,11 +78,11 @@ class Bench:
         self.tracker.last_s = None
         for n in range(frames or self.tracker.code.bits):
             body_from_lab = Rotation.from_rotvec(turn_rad_s * n * frame_s) * start
-            centroids, name = self.centroids(testbed, body_from_lab, begin + n, rng)
+            centroids, name = self.centroids(lab, body_from_lab, begin + n, rng)
             fewest = min(fewest, len(name))
             solved = self.tracker.solve_centroids(
                 centroids,
-                exposure_s=testbed.scene.exposure.time_s,
+                exposure_s=lab.scene.exposure.time_s,
                 t_s=(begin + n) * frame_s,
                 frame=begin + n,
             )
@@ -94,18 +95,18 @@ class Bench:
 
     def rendered(self, rate_deg_s: float, seed: int, frames: int) -> Sequence:
         """As `sequence`, in rendered frames, of which all are solved."""
-        rng, scene = random_stream(seed), self.testbed.scene
+        rng, scene = random_stream(seed), self.lab.scene
         start, axis, begin = attitude(rng), rng.standard_normal(3), int(rng.integers(0, 1000))
         turn_rad_s = np.radians(rate_deg_s) * axis / np.linalg.norm(axis)
         last = begin + frames
         t_s = np.array([exposure_window(scene, n).open_s - MARGIN_S for n in (begin, last)])
         body_from_lab = Rotation.from_rotvec(turn_rad_s * (t_s - t_s[0])[:, None]) * start
         trajectory = Trajectory(t_s, body_from_lab.inv(), np.tile(-turn_rad_s, (2, 1)))
-        testbed = replace(self.testbed.in_run(seed), trajectory=trajectory)
+        lab = replace(self.lab.in_run(seed), trajectory=trajectory)
         first, wrong, fewest = 0, False, 99
         self.tracker.last_s = None
         for n in range(begin, last):
-            frame, truth = render_frame(testbed, n)
+            frame, truth = render_frame(lab, n)
             report = factory.solve_frame(self.tracker, frame)
             fewest = min(fewest, len(report.centroids))
             if report.attitude.solved:
@@ -115,21 +116,21 @@ class Bench:
         return Sequence(first, wrong, fewest)
 
     def centroids(
-        self, testbed: Testbed, body_from_lab: Rotation, frame: int, rng: np.random.Generator
+        self, lab: Lab, body_from_lab: Rotation, frame: int, rng: np.random.Generator
     ) -> tuple[Centroids, Ints]:
         """The lights of a frame, brightest first, and the LED of each."""
-        sources, scene, camera = testbed.sources, testbed.scene, self.tracker.camera
+        sources, scene, camera = lab.camera.sources, lab.scene, self.tracker.camera
         xy_px = project(body_from_lab, sources.place[:, :3], self.tracker.lever, camera)
         seen = np.flatnonzero(camera.contains(np.nan_to_num(xy_px, nan=-1e9), BORDER_PX))
-        assert testbed.codes
+        assert lab.camera.codes
         middle_s = frame / scene.exposure.rate_hz
-        shown = testbed.codes.shown(sources, middle_s - scene.exposure.time_s / 2, scene.exposure.time_s, frame)
+        shown = lab.camera.codes.shown(sources, middle_s - scene.exposure.time_s / 2, scene.exposure.time_s, frame)
         offset_m = sources.place[seen, :3] - body_from_lab.inv().apply(self.tracker.lever.camera_body_m)
         distance_m = np.linalg.norm(offset_m, axis=1)
         cos_out = -np.sum(offset_m * sources.normal[seen], axis=1) / distance_m
         cos_in = self.tracker.camera.rays(xy_px[seen])[:, 2]
-        light = irradiance_e_s_m2(shown.strength[seen], testbed.emitter, cos_out, cos_in, distance_m)
-        light_e = light * testbed.optics.collecting_m2 * scene.exposure.time_s
+        light = irradiance_e_s_m2(shown.strength[seen], lab.camera.emitter, cos_out, cos_in, distance_m)
+        light_e = light * lab.camera.optics.collecting_m2 * scene.exposure.time_s
         light_e = light_e * (1 + self.noise.light * rng.standard_normal(len(seen)))
         light_e += np.sqrt(np.maximum(light_e, 0)) * rng.standard_normal(len(seen))
         order = np.argsort(-light_e)

@@ -21,7 +21,7 @@ from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.dome_tracker import SETTINGS, DomeTracker
 from skysim.scene import loader
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 from skysim.sources.dome.shell.surface import Surface, build_surface
 from skysim.tracking.onboard_model import calibration
 
@@ -113,9 +113,9 @@ def errors(frame: Frame, answer: Attitude, lens: Camera) -> tuple[float, float, 
 
 def measure(case: Case, identifier: str, knows: bool, trials: int, seed: int) -> str:
     """One table cell: found %, number of wrong ones; then mean NEES, rms errors of attitude and focal length."""
-    testbed = build_testbed(loader.load("afit_simsat"))
-    surface, lens = build_surface(testbed.scene.light.surface), calibration(testbed.scene.camera).zoomed(case.zoom)
-    lever = Lever(np.array(testbed.mount.camera_body_m), testbed.mount.cam_from_body)
+    lab = build_lab(loader.load("afit_simsat"))
+    surface, lens = build_surface(lab.scene.light.surface), calibration(lab.scene.camera).zoomed(case.zoom)
+    lever = Lever(np.array(lab.camera.mount.camera_body_m), lab.camera.mount.cam_from_body)
     settings = replace(SETTINGS, identifier=identifier, centroid_sigma_px=NOISE_PX)
     outcomes, right, tracker = [], [], None
     for frame in frames(case, surface, lens, lever, trials, np.random.default_rng(seed)):

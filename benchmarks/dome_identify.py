@@ -19,7 +19,7 @@ from estimator.identification.leds import search
 from estimator.identification.leds.index import DomeIndex, build_dome_index
 from skysim.core.types import Floats
 from skysim.scene import loader
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 from skysim.sources.dome.layouts import placing
 from skysim.sources.dome.placement import optimize
 from skysim.sources.dome.shell.surface import Surface, build_surface
@@ -109,11 +109,11 @@ def trial(
 def measure(case: Case, trials: int, seed: int) -> str:
     """One table line."""
     rng = np.random.default_rng(seed)
-    testbed = build_testbed(loader.load("afit_simsat"))
-    surface = build_surface(testbed.scene.light.surface)
+    lab = build_lab(loader.load("afit_simsat"))
+    surface = build_surface(lab.scene.light.surface)
     truth_m = leds_m(case.places, COUNT, surface, rng)
-    camera = calibration(testbed.scene.camera)
-    lever = Lever(np.array(testbed.mount.camera_body_m), testbed.mount.cam_from_body)
+    camera = calibration(lab.scene.camera)
+    lever = Lever(np.array(lab.camera.mount.camera_body_m), lab.camera.mount.cam_from_body)
     assumed_m = truth_m + case.assumed_m * rng.standard_normal(truth_m.shape)
     leds = LedMap(np.arange(len(truth_m)), assumed_m, np.zeros(3), np.ones(3), sigma_m=case.assumed_m)
     dome = build_dome_index(leds, lever, camera)

@@ -39,7 +39,7 @@ from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
 from estimator.identification.chance import ACCEPT_DEX, GATE_SIGMA
 from skysim.scene import loader
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 from skysim.sources.dome.shell.surface import build_surface
 from skysim.tracking.onboard_model import calibration
 
@@ -88,11 +88,11 @@ class Bench:
     """AFIT's camera and dome with LEDs, and the fields of random attitudes."""
 
     def __init__(self, leds: int, zoom: float, map_m: float, seed: int) -> None:
-        testbed = build_testbed(loader.load("afit_simsat"))
+        lab = build_lab(loader.load("afit_simsat"))
         self.rng, self.map_m = np.random.default_rng(seed), map_m
-        self.lens: Camera = calibration(testbed.scene.camera).zoomed(zoom)
-        self.lever = Lever(np.array(testbed.mount.camera_body_m), testbed.mount.cam_from_body)
-        self.place_m = leds_m("poisson_disk", leds, build_surface(testbed.scene.light.surface), self.rng)
+        self.lens: Camera = calibration(lab.scene.camera).zoomed(zoom)
+        self.lever = Lever(np.array(lab.camera.mount.camera_body_m), lab.camera.mount.cam_from_body)
+        self.place_m = leds_m("poisson_disk", leds, build_surface(lab.scene.light.surface), self.rng)
 
     def field(self) -> tuple[Floats, Floats, Ints, Rotation]:
         """(K, 2) true pixels of the LEDs in a random field, (K, 2) those if the pupil is where another attitude has it

@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.timing import verdict, versus
 from skysim.scene import loader
 from skysim.simulation import run
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 
 FLOWN_S = 5.0
 POSES = 200
@@ -37,8 +37,8 @@ def open_loop(name: str, more: dict[str, str]) -> dict[str, Any]:
     """The simulation of `skysim run` without control, against bare mj_step."""
     overrides = {f"vehicle.{key}": part for key, part in more.items()}
     overrides |= {"motion.control": "none", "motion.maneuver": "[]", "exposure.frames": "1"}
-    testbed = build_testbed(loader.load("afit_simsat", overrides | {"exposure.first": f"{FLOWN_S - 0.012} s"}))
-    model = testbed.vehicle.model
+    lab = build_lab(loader.load("afit_simsat", overrides | {"exposure.first": f"{FLOWN_S - 0.012} s"}))
+    model = lab.vehicle.model
 
     def bare() -> None:
         data = mujoco.MjData(model)
@@ -46,7 +46,7 @@ def open_loop(name: str, more: dict[str, str]) -> dict[str, Any]:
             mujoco.mj_step(model, data)
 
     what = f"fly {FLOWN_S:g} s open loop, {name}"
-    return versus(what, lambda: run.simulate_motion(testbed), "bare mj_step", bare, bar=0.9)
+    return versus(what, lambda: run.simulate_motion(lab), "bare mj_step", bare, bar=0.9)
 
 
 def closed_loops() -> list[dict[str, Any]]:
@@ -55,8 +55,8 @@ def closed_loops() -> list[dict[str, Any]]:
 
 
 def closed_loop(name: str) -> dict[str, Any]:
-    testbed = run.prepare(loader.load(name, {"exposure.frames": "3"}))
-    ratio = float(testbed.trajectory.t_s[-1]) / best(lambda: run.simulate_motion(testbed), 30)
+    lab = run.prepare(loader.load(name, {"exposure.frames": "3"}))
+    ratio = float(lab.trajectory.t_s[-1]) / best(lambda: run.simulate_motion(lab), 30)
     return verdict(f"{name} closed loop, 100 Hz", ratio, "x real time", "the clock", 30.0, least=True)
 
 

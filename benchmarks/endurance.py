@@ -13,11 +13,11 @@ import time
 
 import psutil
 
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.results import metrics
 from skysim.scene.loader import load
 from skysim.simulation import run
-from skysim.simulation.testbed import build_testbed, build_tracker
+from skysim.simulation.lab import build_lab, build_tracker
 
 WARM_S = 60.0  # simulated time after which all code was called once; memory growth is counted from here
 SCENE = {
@@ -33,13 +33,13 @@ def main(duration_s: float, rate_hz: float) -> None:
     """Run the simulation; print one line per simulated minute, then memory growth, drift and attitude errors."""
     frames = round(duration_s * rate_hz)
     overrides = SCENE | {"exposure.rate_hz": str(rate_hz), "exposure.frames": str(frames)}
-    testbed = build_testbed(load("simsat_bump", overrides))
+    lab = build_lab(load("simsat_bump", overrides))
     process, begin = psutil.Process(), time.monotonic()
     memory_mb: list[float] = []
     solved = wrong = 0
     first_s = late_s = 0.0
     print(f"{'flight':>8s} {'wall':>8s} {'memory':>10s}  solved  wrong")
-    for n, result in enumerate(run.live(testbed, build_tracker(testbed)), 1):
+    for n, result in enumerate(run.live(lab, build_tracker(lab.camera)), 1):
         first_s = first_s or result.frame.t_mid_s
         late_s = max(late_s, abs(result.frame.t_mid_s - first_s - (n - 1) / rate_hz))
         attitude = result.report.attitude.cam_from_ref if result.report else None

@@ -45,7 +45,7 @@ def result(code: str, leds: int, rate_deg_s: float, sequences: int) -> Result:
     """Some sequences of a code's length, each from a random attitude; a missing attitude is late by all of it."""
     bench = Bench({"light.led.code": CODES[code], "light.layout.count": str(leds)})
     first = np.array([bench.sequence(rate_deg_s, seed).first for seed in range(sequences)])
-    bits, frame_s = bench.tracker.code.bits, 1 / bench.testbed.scene.exposure.rate_hz
+    bits, frame_s = bench.tracker.code.bits, 1 / bench.lab.scene.exposure.rate_hz
     late_s = np.where(first > 0, first, np.inf) * frame_s
     median_s, most_s = np.quantile(late_s, [0.5, 0.95], method="higher")
     return Result(code, leds, rate_deg_s, bits, float(median_s), float(most_s), float(np.mean(first > 0)))

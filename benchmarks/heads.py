@@ -14,15 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from skysim.simulation.run import simulate_motion
 
 from estimator.core.types import Attitude
 from estimator.filter.mekf import AttitudeFilter, GyroModel
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.results.metrics import normalized_error_squared
 from skysim.scene.loader import load_scene
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.run import simulate_motion
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking.factory import solve_frame
 
 NO_GYRO = GyroModel(1e-5, 0.0, np.inf)
@@ -57,11 +57,11 @@ class Gain(NamedTuple):
     nees: float
 
 
-def fused(testbed: Testbed, solutions: list[Attitude]) -> tuple[Rotation, np.ndarray]:
+def fused(lab: Lab, solutions: list[Attitude]) -> tuple[Rotation, np.ndarray]:
     """body_from_ref and its covariance (3, 3) in body axes from one solution of each camera."""
-    start = testbed.mount.cam_from_body.inv() * solutions[0].cam_from_ref
+    start = lab.camera.mount.cam_from_body.inv() * solutions[0].cam_from_ref
     mekf = AttitudeFilter(NO_GYRO, 0.0, start, 0.1, 0.0, considered=(), heads=len(solutions))
-    for head, (camera, solution) in enumerate(zip(testbed.cameras, solutions, strict=True)):
+    for head, (camera, solution) in enumerate(zip(lab.cameras, solutions, strict=True)):
         body_from_cam = camera.mount.cam_from_body.inv()
         R = body_from_cam.as_matrix()
         mekf.update(0.0, body_from_cam * solution.cam_from_ref, R @ solution.covariance_rad2 @ R.T, head=head)
@@ -70,17 +70,17 @@ def fused(testbed: Testbed, solutions: list[Attitude]) -> tuple[Rotation, np.nda
 
 def measured_pairs(count: int, seed: int) -> list[Pair]:
     """Pairs at random attitudes; those that one of the trackers refuses are left out."""
-    rng, testbed, pairs = np.random.default_rng(seed), build_testbed(load_scene("two_heads", EXACT)), list[Pair]()
-    trackers = [build_tracker(camera) for camera in testbed.cameras]
-    main, R = testbed.mount.cam_from_body, testbed.mount.cam_from_body.as_matrix()
+    rng, lab, pairs = np.random.default_rng(seed), build_lab(load_scene("two_heads", EXACT)), list[Pair]()
+    trackers = [build_tracker(camera) for camera in lab.cameras]
+    main, R = lab.camera.mount.cam_from_body, lab.camera.mount.cam_from_body.as_matrix()
     for _ in range(count):
         lab_from_body = Rotation.random(random_state=rng)
-        bed = testbed.in_run(int(rng.integers(2**31)))
+        bed = lab.in_run(int(rng.integers(2**31)))
         frames = [render_frame(camera.at_rest(lab_from_body), 0)[0] for camera in bed.cameras]
         solutions = [solve_frame(tracker, frame).attitude for tracker, frame in zip(trackers, frames, strict=True)]
         if not all(solution.solved for solution in solutions):
             continue
-        estimate, covariance = fused(testbed, solutions)
+        estimate, covariance = fused(lab, solutions)
         errors = main.inv() * solutions[0].cam_from_ref, estimate
         roll = [main.apply((attitude * lab_from_body).as_rotvec())[2] for attitude in errors]
         claimed = solutions[0].covariance_rad2[2, 2], (R @ covariance @ R.T)[2, 2]
@@ -106,11 +106,11 @@ def drift_errors_arcsec(flights: int, seed: int) -> np.ndarray:
     """(flights, 2) errors at the end of the scene: side boresight relative to the main one, and that to the gyro."""
     errors = []
     for n in range(flights):
-        testbed = simulate_motion(build_testbed(load_scene("two_heads", {"seed": seed + n})))
-        cameras = zip(testbed.cameras, ("main", "side"), strict=True)
+        lab = simulate_motion(build_lab(load_scene("two_heads", {"seed": seed + n})))
+        cameras = zip(lab.cameras, ("main", "side"), strict=True)
         row = []
         for camera, name in cameras:
-            mounting = testbed.log.mountings[name]
+            mounting = lab.log.mountings[name]
             error = camera.mount.cam_from_body.apply(mounting.estimate_rad[-1] - mounting.true_rad[-1])
             row.append(np.linalg.norm(error[:2]) / ARCSEC_RAD)
         errors.append(row[::-1])

@@ -30,15 +30,14 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.core.camera import Camera
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD, SPEED_OF_LIGHT_KM_S
 from skysim.core.types import Frame, Trajectory, Truth
 from skysim.results.files import frames as frame_files
 from skysim.results.metrics import WRONG_RAD
 from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import build_testbed
-from skysim.sources.stars import C_M_S
+from skysim.simulation.lab import build_lab
 from skysim.tracking import onboard_model
 from skysim.tracking import settings as tracker_settings
 from skysim.tracking.external import adapter
@@ -148,11 +147,11 @@ def load(name: str, who: str, frames: int) -> Scene:
 
 def render_frames(scene: Scene, seed: int) -> Iterator[tuple[Frame, Truth]]:
     """Yield the frames of a scene, each at rest at its own uniformly random attitude."""
-    testbed = build_testbed(scene)
+    lab = build_lab(scene)
     for n in range(scene.exposure.frames):
         cam_from_icrs = Rotation.random(rng=np.random.default_rng([seed, n]))
-        still = Trajectory.at_rest(cam_from_icrs.inv() * testbed.mount.cam_from_body, testbed.duration_s)
-        yield render_frame(replace(testbed, trajectory=still), n)
+        still = Trajectory.at_rest(cam_from_icrs.inv() * lab.camera.mount.cam_from_body, lab.duration_s)
+        yield render_frame(replace(lab, trajectory=still), n)
 
 
 def lattice(width_px: int, height_px: int) -> NDArray:
@@ -342,7 +341,7 @@ def its_stars(
     radius_deg = 0.7 * tracker.camera.fov_deg
     listed = tracker.database.cone_search(answer.crval_ra_deg, answer.crval_dec_deg, radius_deg)
     places = np.array([(star.ra_deg, star.dec_deg) for star in listed if star.magnitude < DEEPEST_G])
-    moved = unit_vectors(*places.T) + np.array(tracker.velocity_km_s) / (C_M_S / 1000)
+    moved = unit_vectors(*places.T) + np.array(tracker.velocity_km_s) / SPEED_OF_LIGHT_KM_S
     moved /= np.linalg.norm(moved, axis=1, keepdims=True)
     there_px = np.nan_to_num(np.column_stack(answer.world_to_pixel(*radec_deg(moved))), nan=1e6)
     seen = np.array([(one.x, one.y, one.brightness) for one in centroids])

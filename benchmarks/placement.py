@@ -19,13 +19,13 @@ from benchmarks.dome_identify import TILT_DEG, Case, trial
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core.camera import Camera
 from estimator.identification.leds.index import build_dome_index
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.scene.sections import layouts
 from skysim.scene.sections import leds as led_schema
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 from skysim.sources.dome.layouts import registry
 from skysim.sources.dome.placement import fisher, optimize
 from skysim.sources.dome.shell.surface import Surface, build_surface
@@ -84,15 +84,15 @@ class Row:
 
 def build_setup() -> Setup:
     """The test geometry of scene afit_simsat."""
-    testbed = build_testbed(loader.load("afit_simsat"))
-    light, camera = testbed.scene.light, calibration(testbed.scene.camera)
-    lever = Lever(np.array(testbed.mount.camera_body_m), testbed.mount.cam_from_body)
+    lab = build_lab(loader.load("afit_simsat"))
+    light, camera = lab.scene.light, calibration(lab.scene.camera)
+    lever = Lever(np.array(lab.camera.mount.camera_body_m), lab.camera.mount.cam_from_body)
     assert isinstance(light, DomeConfig)
     assert isinstance(light.layout, layouts.PatchBoardsConfig)
     surface = build_surface(light.surface)
-    wide = Setup(surface, camera, lever, light.layout, light.led, testbed.band, 40.0)
+    wide = Setup(surface, camera, lever, light.layout, light.led, lab.camera.band, 40.0)
     reach_deg = float(np.degrees(optimize.field_reach_rad(optimized_config(wide, 3, 0), surface)))
-    return Setup(surface, camera, lever, light.layout, light.led, testbed.band, reach_deg)
+    return Setup(surface, camera, lever, light.layout, light.led, lab.camera.band, reach_deg)
 
 
 def optimized_config(setup: Setup, count: int, seed: int) -> layouts.OptimizedConfig:

@@ -25,13 +25,13 @@ from estimator.core.types import Attitude, RateEstimate
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Truth
 from skysim.experiments.study.execution.trials import constant_rate
 from skysim.results import metrics
 from skysim.scene.loader import load
 from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import factory
 
 RATES_DEG_S = (0.0, 1.0, 2.0, 5.0, 10.0)
@@ -56,9 +56,9 @@ class Work:
     changes: dict[str, str] = field(default_factory=dict)
     tilt_deg: float | None = None
 
-    def testbed(self, rolling: bool) -> Testbed:
+    def lab(self, rolling: bool) -> Lab:
         shutter = f"{{kind: rolling, row_time: '{self.row_time}'}}" if rolling else "{kind: global}"
-        return build_testbed(load(self.scene, ONE_FRAME | self.changes | {"camera.shutter": shutter}))
+        return build_lab(load(self.scene, ONE_FRAME | self.changes | {"camera.shutter": shutter}))
 
 
 PHONE = {"camera.preset": "imx477", "camera.focal_length": "16 mm", "camera.f_number": "1.4", "exposure.time": "20 ms"}
@@ -90,7 +90,7 @@ def measure(works: tuple[Work, ...] = WORKS, rates_deg_s: tuple[float, ...] = RA
     """NEES, error ratios and solved share of each scene, rate and source of the rate."""
     rows = []
     for work in works:
-        beds = work.testbed(True), work.testbed(False)
+        beds = work.lab(True), work.lab(False)
         pooled: dict[str, list[tuple[Floats, Floats]]] = {}
         for n, rate_deg_s in enumerate(rates_deg_s):
             for mode, ours, peer in _compare(work, beds, rate_deg_s, n * work.frames):
@@ -103,7 +103,7 @@ def measure(works: tuple[Work, ...] = WORKS, rates_deg_s: tuple[float, ...] = RA
 
 
 def _compare(
-    work: Work, beds: tuple[Testbed, Testbed], rate_deg_s: float, first_seed: int
+    work: Work, beds: tuple[Lab, Lab], rate_deg_s: float, first_seed: int
 ) -> Iterator[tuple[str, Floats, Floats]]:
     """Yield each source of the rate with (N, 5) rows of Solved under the rolling and under the global shutter."""
     errors: dict[tuple[str, int], list[Solved]] = {}
@@ -120,7 +120,7 @@ def _compare(
         yield mode, np.array(errors[mode, 0]), np.array(errors[mode, 1])
 
 
-def frame_of(work: Work, bed: Testbed, rate_deg_s: float, seed: int) -> tuple[Frame, Truth, factory.Estimator]:
+def frame_of(work: Work, bed: Lab, rate_deg_s: float, seed: int) -> tuple[Frame, Truth, factory.Estimator]:
     """One frame at a random attitude and axis, and its tracker; a dome is surveyed anew for each."""
     rng = np.random.default_rng([seed, 1])
     bed = bed.in_run(int(rng.integers(2**62)))

@@ -18,6 +18,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import yaml
+from skysim.simulation.run import prepare, simulate_motion
 
 from benchmarks import coordination
 from benchmarks.studies import CENTROIDS, run_study
@@ -30,7 +31,6 @@ from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study.execution import engines, trials
 from skysim.experiments.study.plan import Plan
 from skysim.scene import loader
-from skysim.simulation.run import prepare, simulate_motion
 
 SIZE = {"camera.width_px": "1024", "camera.height_px": "1024"}
 # 20 degrees and stars to V 7, as in benchmarks/instrument.py, with all noise of a CMOS chip: shot and read noise, dark
@@ -108,14 +108,14 @@ def parts_of(made: plan.DatasetPlan) -> dict[str, float]:
         tar = shards.TarWriter(file)
         by = None
         for number, levels, setup, one in run.labelled_frames(made, 0):
-            by = by or labeller(setup.testbed.scene)
+            by = by or labeller(setup.lab.scene)
             seed = made.seed(number)
             with timed(spent, "render"):
                 trials.render_trial_frame(setup, seed, AddedCharge(by.threshold_e))
             with timed(spent, "label"):
                 label_frame(setup, seed, by)
             with timed(spent, "encode"):
-                row = shards.frame_labels(one, setup.testbed.scene, {"frame": number, "shard": 0, "seed": seed})
+                row = shards.frame_labels(one, setup.lab.scene, {"frame": number, "shard": 0, "seed": seed})
                 shards.coco_annotations(one, number)
             with timed(spent, "write"):
                 shards.add_frame(tar, number, one, row | {"levels": levels})
@@ -174,15 +174,15 @@ def centroids() -> list[dict[str, Any]]:
 
 def closed_loop() -> list[dict[str, Any]]:
     """SimSat on its wheels under control, against the clock, and against mj_step alone with the same model."""
-    testbed = prepare(loader.load("afit_simsat", {"exposure.frames": "3"}))
-    model, flown_s = testbed.vehicle.model, float(testbed.trajectory.t_s[-1])
+    lab = prepare(loader.load("afit_simsat", {"exposure.frames": "3"}))
+    model, flown_s = lab.vehicle.model, float(lab.trajectory.t_s[-1])
 
     def bare() -> None:
         data = mujoco.MjData(model)
         for _ in range(round(flown_s / model.opt.timestep)):
             mujoco.mj_step(model, data)
 
-    row = versus("closed loop on wheels", lambda: simulate_motion(testbed), "bare mj_step", bare, repeats=20)
+    row = versus("closed loop on wheels", lambda: simulate_motion(lab), "bare mj_step", bare, repeats=20)
     speed = flown_s / (row["value"] / 1e3)
     limit = f"mj_step alone: {flown_s / (row['peer_value'] / 1e3):.0f}x"
     return [row, verdict("closed loop on wheels", speed, "x real time", limit, 100.0, True)]

@@ -24,7 +24,7 @@ from skysim.experiments.study.api import run_study
 from skysim.experiments.study.execution.trials import visible_rows
 from skysim.scene.loader import load
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.lab import Lab, build_lab
 from skysim.sources import gaia
 
 DEEP = Path("out/catalogs/gaia_v10.0.ecsv")
@@ -59,8 +59,8 @@ def bodies() -> list[dict[str, Any]]:
         "background": [{"kind": "sky", "mag_arcsec2": 21.9}],
     }
     trials = study_trials("shefex2", lights, {"body": {"levels": BODIES}}, BODY_FRAMES)
-    testbed = build_testbed(load("shefex2"))
-    enough = np.array([catalog_stars(testbed, row) >= MIN_STARS for row in trials])
+    lab = build_lab(load("shefex2"))
+    enough = np.array([catalog_stars(lab, row) >= MIN_STARS for row in trials])
     return shares(
         f"bodies, satellites and airglow, {len(trials)} frames", trials[enough], len(trials), wrong_of=trials, bar=97
     )
@@ -99,11 +99,11 @@ def study_trials(scene: str, settings: Mapping[str, Any], factors: Mapping[str, 
         return run_study(path, out=folder).trials()
 
 
-def catalog_stars(testbed: Testbed, trial: Any) -> int:
+def catalog_stars(lab: Lab, trial: Any) -> int:
     """Stars of the tracker's limiting magnitude on the chip at a trial's attitude."""
     wxyz = [trial[f"lab_from_body_{axis}"] for axis in "wxyz"]
-    rows = visible_rows(testbed, Rotation.from_quat([wxyz], scalar_first=True))[0].rows
-    return int(np.sum(testbed.sources.magnitude[rows] <= testbed.scene.tracker.limit_mag))
+    rows = visible_rows(lab, Rotation.from_quat([wxyz], scalar_first=True))[0].rows
+    return int(np.sum(lab.camera.sources.magnitude[rows] <= lab.scene.tracker.limit_mag))
 
 
 def shares(name: str, trials: Any, drawn: int, wrong_of: Any, bar: float) -> list[dict[str, Any]]:
@@ -120,16 +120,16 @@ def frame_time() -> dict[str, Any]:
     """Time of a 3 deg frame in a sky to V 10, over that where the sky holds only the stars within 10 deg of it."""
     focal_mm = SHEFEX_MM * SHEFEX_DEG / 3
     keys = {"light.catalog": str(DEEP.resolve()), "camera.focal_length": f"{focal_mm:.4g} mm"}
-    whole = build_testbed(load("shefex2", keys))
+    whole = build_lab(load("shefex2", keys))
     boresight = whole.mount.cam_from_body.inv().apply([0, 0, 1.0])
     direction = whole.trajectory.attitude_at(0.0).apply(boresight)
     near = whole.sources.place[:, :3] @ direction > math.cos(math.radians(10))
     part = replace(whole, sources=whole.sources.take(near))
     seconds: list[list[float]] = [[], []]
     for _ in range(40):
-        for side, testbed in enumerate((whole, part)):
+        for side, lab in enumerate((whole, part)):
             began = time.perf_counter()
-            render_frame(testbed, 0)
+            render_frame(lab, 0)
             seconds[side].append(time.perf_counter() - began)
     ratio = min(seconds[0]) / min(seconds[1])
     what = f"{len(whole.sources)} stars over {int(near.sum())}"

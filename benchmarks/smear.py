@@ -25,7 +25,7 @@ from skysim.core.types import Frame, Trajectory
 from skysim.results.metrics import WRONG_RAD
 from skysim.scene.loader import load
 from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking.onboard_model import calibration
 
 RATES_DEG_S = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
@@ -35,7 +35,7 @@ KNOT_S = 0.5e-3
 Streak = tuple[float, float] | None
 
 
-def frames(testbed: Testbed, rate_deg_s: float, count: int, seed: int) -> Iterator[tuple[Frame, Rotation, Streak]]:
+def frames(lab: Lab, rate_deg_s: float, count: int, seed: int) -> Iterator[tuple[Frame, Rotation, Streak]]:
     """Yield frames at random attitudes, each rotating about a random axis perpendicular to the boresight.
 
     Each comes with cam_from_icrs at mid-exposure and the streak vector at the image center.
@@ -46,12 +46,12 @@ def frames(testbed: Testbed, rate_deg_s: float, count: int, seed: int) -> Iterat
         rate_cam = np.radians(rate_deg_s) * np.array([np.cos(angle), np.sin(angle), 0.0])
         # Knots from 5 ms before the exposure; the attitude is `middle` at mid-exposure, 25 ms after its start.
         t_s = n * FRAME_S + np.arange(-10, 200) * KNOT_S
-        rate_body = testbed.mount.cam_from_body.inv().apply(rate_cam)
+        rate_body = lab.camera.mount.cam_from_body.inv().apply(rate_cam)
         turned = Rotation.from_rotvec(np.outer(t_s - n * FRAME_S - 0.025, rate_body))
-        lab_from_body = middle.inv() * testbed.mount.cam_from_body * turned
+        lab_from_body = middle.inv() * lab.camera.mount.cam_from_body * turned
         trajectory = Trajectory(t_s, lab_from_body, np.tile(rate_body, (len(t_s), 1)))
-        frame, truth = exposure.render_frame(replace(testbed, trajectory=trajectory), n)
-        yield frame, truth.cam_from_lab, streak_of(rate_cam, testbed)
+        frame, truth = exposure.render_frame(replace(lab, trajectory=trajectory), n)
+        yield frame, truth.cam_from_lab, streak_of(rate_cam, lab)
 
 
 def random_southern_attitude(rng: np.random.Generator) -> Rotation:
@@ -62,9 +62,9 @@ def random_southern_attitude(rng: np.random.Generator) -> Rotation:
             return cam_from_icrs
 
 
-def streak_of(rate_cam_rad_s: np.ndarray, testbed: Testbed) -> tuple[float, float]:
+def streak_of(rate_cam_rad_s: np.ndarray, lab: Lab) -> tuple[float, float]:
     """Streak (dx, dy) in pixels of a star on the boresight: d(x / z)/dt = -w_y, d(y / z)/dt = w_x."""
-    pixels_per_rad_s = testbed.scene.exposure.time_s * testbed.scene.camera.focal_px
+    pixels_per_rad_s = lab.scene.exposure.time_s * lab.scene.camera.focal_px
     return -rate_cam_rad_s[1] * pixels_per_rad_s, rate_cam_rad_s[0] * pixels_per_rad_s
 
 
@@ -78,9 +78,9 @@ def is_solved(tracker: StarTracker, frame: Frame, truth: Rotation, streak_px: St
     return right, answer is not None and not right
 
 
-def build_trackers(testbed: Testbed) -> dict[str, StarTracker]:
+def build_trackers(lab: Lab) -> dict[str, StarTracker]:
     """The paper's chain with its star selection, and the default chain with the paper's limiting magnitude (twice)."""
-    camera, scene = calibration(testbed.scene.camera), testbed.scene
+    camera, scene = calibration(lab.scene.camera), lab.scene
     stars = catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv")
     observer = catalog.on_earth(scene.start_time)
     paper_stars = shefex.chosen(stars)
@@ -106,15 +106,15 @@ def build_trackers(testbed: Testbed) -> dict[str, StarTracker]:
 def measure(count: int, seed: int) -> Iterator[str]:
     """One table line per rate."""
     overrides = {"exposure.time": "50 ms", "exposure.first": "0 s", "exposure.frames": str(count)}
-    testbed = build_testbed(load("shefex2", overrides))
-    trackers = build_trackers(testbed)
+    lab = build_lab(load("shefex2", overrides))
+    trackers = build_trackers(lab)
     for rate in RATES_DEG_S:
         score = {name: np.zeros(2, int) for name in trackers}
-        for frame, truth, streak_px in frames(testbed, rate, count, seed):
+        for frame, truth, streak_px in frames(lab, rate, count, seed):
             for name, tracker in trackers.items():
                 score[name] += is_solved(tracker, frame, truth, streak_px if name == "with gyro" else None)
         cells = [f"{100 * score[name][0] / count:10.1f} {100 * score[name][1] / count:7.1f}" for name in trackers]
-        pixels = np.radians(rate) * 0.05 * testbed.scene.camera.focal_px
+        pixels = np.radians(rate) * 0.05 * lab.scene.camera.focal_px
         yield f"{rate:5.1f} {pixels:6.1f}  " + "  ".join(cells)
 
 

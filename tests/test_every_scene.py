@@ -22,7 +22,8 @@ from skysim.scene import loader
 from skysim.scene.sections.light import CollimatedDisplayConfig, StarsConfig
 from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation import exposure, run
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker, exposure_window
+from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.timing import exposure_window
 from skysim.tracking import onboard_model
 
 ALL_NAMES = sorted(path.stem for path in SCENES.glob("*.yaml"))
@@ -37,12 +38,12 @@ NOT_ALL_ALONG = {PAIR, CODED, "afit_test3"}
 MODELS = sorted(path.name for path in (SCENES / "vehicles").glob("*.xml"))
 
 
-def prepared(name: str, frames: int, **overrides: str) -> Testbed:
+def prepared(name: str, frames: int, **overrides: str) -> Lab:
     return run.prepare(loader.load(name, overrides | {"exposure.frames": str(frames)}))
 
 
 @pytest.fixture(scope="module", params=NAMES)
-def testbed(request: pytest.FixtureRequest) -> Testbed:
+def lab(request: pytest.FixtureRequest) -> Lab:
     return prepared(request.param, 2)
 
 
@@ -61,24 +62,24 @@ def test_there_are_scenes() -> None:
 
 
 @pytest.mark.slow
-def test_it_says_what_it_is(testbed: Testbed) -> None:
-    assert testbed.scene.name in NAMES
-    assert 10 < len(testbed.scene.title) < 80
+def test_it_says_what_it_is(lab: Lab) -> None:
+    assert lab.scene.name in NAMES
+    assert 10 < len(lab.scene.title) < 80
 
 
 @pytest.mark.slow
-def test_its_first_frame_shows_at_least_five_sources_or_what_was_published(testbed: Testbed) -> None:
-    frame, truth = exposure.render_frame(testbed, 0)
-    camera, detector = testbed.scene.camera, testbed.scene.camera.detector
+def test_its_first_frame_shows_at_least_five_sources_or_what_was_published(lab: Lab) -> None:
+    frame, truth = exposure.render_frame(lab, 0)
+    camera, detector = lab.scene.camera, lab.scene.camera.detector
     assert frame.image_dn.shape == (camera.height_px, camera.width_px)
     above_noise = truth.sources.peak_e > 5 * np.hypot(detector.read_noise_e, np.sqrt(truth.sources.peak_e))
-    assert above_noise.sum() >= 5 or above_noise.sum() == SHOWN[testbed.scene.name]
+    assert above_noise.sum() >= 5 or above_noise.sum() == SHOWN[lab.scene.name]
     # And none of them blinds the chip.
     assert np.mean(frame.image_dn >= frame.saturation_dn) < 1e-3
 
 
 @pytest.mark.slow
-def test_its_light_is_on_the_frame(testbed: Testbed) -> None:
+def test_its_light_is_on_the_frame(lab: Lab) -> None:
     """Sum above offset, dark and the chip's own pattern, against the truth's electrons, to five sigmas.
 
     A display's black pixels glow beside them.
@@ -88,21 +89,21 @@ def test_its_light_is_on_the_frame(testbed: Testbed) -> None:
     Sensitivity is the one part of the pattern that goes with the light: a source of E electrons over A pixels has
     it as prnu E / sqrt(A).
     """
-    told = testbed.scene.camera.detector
+    told = lab.scene.camera.detector
     step_e = told.full_well_e / 60000
     offset_dn = told.offset_dn * told.gain_e_dn / step_e  # the same in electrons, or noise would be cut off at 0
     fine = {"bits": "16", "gain_e_dn": str(step_e), "offset_dn": str(offset_dn)}
     fine = {f"camera.detector.{key}": value for key, value in fine.items()}
-    testbed = prepared(testbed.scene.name, 1, **fine)
-    frame, truth = exposure.render_frame(testbed, 0)
-    part, detector, pixels = testbed.scene.camera.detector, testbed.detector, frame.image_dn.size
-    assert testbed.scene.background == ()
+    lab = prepared(lab.scene.name, 1, **fine)
+    frame, truth = exposure.render_frame(lab, 0)
+    part, detector, pixels = lab.scene.camera.detector, lab.camera.detector, frame.image_dn.size
+    assert lab.scene.background == ()
     pattern_e = detector.dark_e_s.sum(dtype=float) * frame.exposure_s
     pattern_e += len(frame.image_dn) * detector.column_offset_e.sum(dtype=float)
     found_e = (frame.image_dn.sum(dtype=float) - pixels * part.offset_dn) * part.gain_e_dn - pattern_e
     light_e = truth.sources.electrons
-    camera_m = truth.lab_from_body.apply(testbed.mount.camera_body_m)
-    glow_e_s = black_glow(testbed.scene.light, testbed.optics, truth.cam_from_lab, camera_m, testbed.band)
+    camera_m = truth.lab_from_body.apply(lab.camera.mount.camera_body_m)
+    glow_e_s = black_glow(lab.scene.light, lab.camera.optics, truth.cam_from_lab, camera_m, lab.camera.band)
     glow_e = 0.0 if glow_e_s is None else float(glow_e_s.sum()) * frame.exposure_s
     read = pixels * (part.read_noise_e**2 + part.reset_noise_e**2 + part.gain_e_dn**2 / 12)
     shot = light_e.sum() + glow_e + detector.dark_e_s.sum(dtype=float) * frame.exposure_s
@@ -113,30 +114,30 @@ def test_its_light_is_on_the_frame(testbed: Testbed) -> None:
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(testbed: Testbed) -> None:
-    name, image = testbed.scene.name, exposure.render_frame(testbed, 0)[0].image_dn
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(lab: Lab) -> None:
+    name, image = lab.scene.name, exposure.render_frame(lab, 0)[0].image_dn
     again = exposure.render_frame(prepared(name, 2), 0)[0].image_dn
-    other = exposure.render_frame(prepared(name, 2, seed=str(testbed.scene.seed + 1)), 0)[0].image_dn
+    other = exposure.render_frame(prepared(name, 2, seed=str(lab.scene.seed + 1)), 0)[0].image_dn
     assert image.tobytes() == again.tobytes()
     assert np.mean(image != other) > 0.1
 
 
 @pytest.mark.long
-def test_a_frame_alone_is_the_frame_of_a_sequence(testbed: Testbed) -> None:
-    sequence = [shot.frame.image_dn for shot in run.run(testbed, build_tracker(testbed))]
-    alone, _ = exposure.render_frame(prepared(testbed.scene.name, 2), 1)
+def test_a_frame_alone_is_the_frame_of_a_sequence(lab: Lab) -> None:
+    sequence = [shot.frame.image_dn for shot in run.run(lab, build_tracker(lab.camera))]
+    alone, _ = exposure.render_frame(prepared(lab.scene.name, 2), 1)
     assert alone.image_dn.tobytes() == sequence[1].tobytes()
 
 
-def test_its_first_frames_are_solved_and_right(testbed: Testbed) -> None:
-    for shot in run.run(testbed, build_tracker(testbed)):
+def test_its_first_frames_are_solved_and_right(lab: Lab) -> None:
+    for shot in run.run(lab, build_tracker(lab.camera)):
         answer = shot.report.attitude
-        if testbed.scene.name in SHOWN:  # seen, each where it is, to half a pixel; two alone are no attitude
+        if lab.scene.name in SHOWN:  # seen, each where it is, to half a pixel; two alone are no attitude
             found_px, seen_px = shot.report.centroids.xy_px, shot.truth.sources.xy_px
             apart_px = np.linalg.norm(found_px[:, None] - seen_px, axis=2)
-            assert len(found_px) == len(seen_px) == SHOWN[testbed.scene.name]
+            assert len(found_px) == len(seen_px) == SHOWN[lab.scene.name]
             assert apart_px.min(axis=1).max() < 0.5
-            assert testbed.scene.name != PAIR or answer.status == "too few stars detected"
+            assert lab.scene.name != PAIR or answer.status == "too few stars detected"
             continue
         assert answer.status == "solved"
         true_attitude = shot.truth.cam_from_lab
@@ -151,21 +152,21 @@ def test_an_ideal_scene_s_tracker_knows_its_dome(name: str) -> None:
     """It differs from its base in the tracker alone, whose map and lever are the true ones."""
     ideal, base = loader.load(name), loader.load(name.removesuffix("_ideal"))
     assert ideal.model_copy(update={"tracker": base.tracker, "title": base.title, "name": base.name}) == base
-    testbed = build_testbed(ideal)
+    lab = build_lab(ideal)
     leds, lever = (
-        onboard_model.assumed_dome(ideal, ideal.light, testbed.sources),
-        onboard_model.assumed_lever(ideal, testbed.mount),
+        onboard_model.assumed_dome(ideal, ideal.light, lab.camera.sources),
+        onboard_model.assumed_lever(ideal, lab.camera.mount),
     )
-    np.testing.assert_array_equal(leds.position_m, testbed.sources.place[:, :3])
-    np.testing.assert_array_equal(lever.camera_body_m, testbed.mount.camera_body_m)
+    np.testing.assert_array_equal(leds.position_m, lab.camera.sources.place[:, :3])
+    np.testing.assert_array_equal(lever.camera_body_m, lab.camera.mount.camera_body_m)
     assert (leds.sigma_m, lever.sigma_m) == (0, 0)
-    assert onboard_model.assumed_lever(base, testbed.mount).sigma_m > 0
+    assert onboard_model.assumed_lever(base, lab.camera.mount).sigma_m > 0
 
 
 def test_a_square_of_equal_leds_is_never_solved_wrong() -> None:
     """AFIT's nine LEDs are their own picture after a quarter turn, but for 0.12 mm of glue: 1.3 px."""
-    testbed = prepared(GRID, 4)
-    for shot in run.run(testbed, build_tracker(testbed)):
+    lab = prepared(GRID, 4)
+    for shot in run.run(lab, build_tracker(lab.camera)):
         answer = shot.report.attitude
         if answer.solved:
             assert np.degrees((answer.cam_from_ref * shot.truth.cam_from_lab.inv()).magnitude()) < 10 / 60
@@ -196,16 +197,16 @@ def test_its_claimed_error_is_the_one_it_makes(name: str) -> None:
         tilt_deg=TILT_DEG.get(name.removesuffix("_ideal"), (0.0, 25.0)),
         rate_deg_s=float(np.degrees(np.median(turned.magnitude())) / 0.01),
     )
-    testbed, outcomes, rng = build_testbed(loader.load(name)), [], np.random.default_rng(300)
+    lab, outcomes, rng = build_lab(loader.load(name)), [], np.random.default_rng(300)
     for survey in range(SURVEYS):
-        scene = with_config(testbed.scene, "tracker.survey", seed=survey)
+        scene = with_config(lab.scene, "tracker.survey", seed=survey)
         if isinstance(scene.light, CollimatedDisplayConfig):
             dec_deg = np.degrees(np.arcsin(rng.uniform(-1, 1)))
             scene = with_config(scene, "light", axis_ra_deg=rng.uniform(0, 360), axis_dec_deg=dec_deg)
-            testbed = build_testbed(scene)
+            lab = build_lab(scene)
         if survey == 0 or not isinstance(scene.light, StarsConfig):
-            tracker = build_tracker(replace(testbed, scene=scene))
-        setup = Setup(replace(testbed, scene=scene), tracker, trial, "")
+            tracker = build_tracker(replace(lab, scene=scene))
+        setup = Setup(replace(lab, scene=scene), tracker, trial, "")
         outcomes += [run_frame_trial(setup, survey * FRAMES + frame) for frame in range(FRAMES)]
     nees = np.array([one.nees for one in outcomes if one.solved])
     assert sum(one.wrong for one in outcomes) == 0
@@ -217,13 +218,13 @@ STEERED = [name for name in NAMES if loader.load(name).motion.control]
 
 
 @pytest.fixture(scope="module", params=STEERED)
-def whole(request: pytest.FixtureRequest) -> Testbed:
+def whole(request: pytest.FixtureRequest) -> Lab:
     """A scene flown to its last frame, none of which is rendered."""
     return run.prepare(loader.load(request.param, NO_EYES.get(request.param)))
 
 
 @pytest.mark.long
-def test_the_camera_sees_five_leds_all_along_the_maneuver(whole: Testbed) -> None:
+def test_the_camera_sees_five_leds_all_along_the_maneuver(whole: Lab) -> None:
     """In every frame, at geometry alone: what is on the chip, by the tracker's map."""
     if isinstance(whole.scene.light, StarsConfig):
         pytest.skip("no LEDs")
@@ -237,7 +238,7 @@ def test_the_camera_sees_five_leds_all_along_the_maneuver(whole: Testbed) -> Non
 
 
 @pytest.mark.long
-def test_it_is_steered_to_where_it_is_told_and_off_its_stop(whole: Testbed) -> None:
+def test_it_is_steered_to_where_it_is_told_and_off_its_stop(whole: Lab) -> None:
     telemetry = whole.telemetry
     assert telemetry is not None
     assert telemetry.lab_from_ref is not None

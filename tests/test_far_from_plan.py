@@ -97,5 +97,5 @@ def test_the_gyros_apparent_bias_is_what_the_navigator_drifts_by() -> None:
 
 def test_a_vehicle_of_one_tick_is_reported_too() -> None:
     overrides = {"vehicle.imu": "{}", "exposure": "{time: 1 ms, rate_hz: 10, frames: 1, first: 0 s}"}
-    testbed = run.prepare(loader.load("afit_simsat", overrides))
-    assert telemetry_report.summary(testbed.log)["gyro_saturated_s"] == 0
+    lab = run.prepare(loader.load("afit_simsat", overrides))
+    assert telemetry_report.summary(lab.log)["gyro_saturated_s"] == 0

@@ -77,9 +77,9 @@ def test_a_full_disk_is_named_and_what_was_written_is_whole(mounted: Path) -> No
 def flown(tmp_path_factory: pytest.TempPathFactory) -> recording.Recording:
     """Three frames with their truth."""
     folder = tmp_path_factory.mktemp("flown")
-    testbed = run.prepare(loader.load("shefex2", {"exposure.frames": "3", "light.limit_mag": "5"}))
-    for frame, truth, _ in run.render_frames(testbed):
-        frames.write_frame(folder, frame, truth, testbed.scene)
+    lab = run.prepare(loader.load("shefex2", {"exposure.frames": "3", "light.limit_mag": "5"}))
+    for frame, truth, _ in run.render_frames(lab):
+        frames.write_frame(folder, frame, truth, lab.scene)
     return recording.open_recording(folder)
 
 

@@ -10,7 +10,7 @@ from estimator.trackers.dome_tracker import DomeTracker
 from skysim.results import metrics
 from skysim.scene import loader
 from skysim.simulation import run
-from skysim.simulation.testbed import build_tracker
+from skysim.simulation.lab import build_tracker
 
 FIELDS = 60
 

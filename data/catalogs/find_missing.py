@@ -31,13 +31,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from skysim.core.constants import ARCSEC_RAD
 from skysim.sources import gaia as gaia_dr3
-from skysim.sources.catalog import MAS_RAD, write
+from skysim.sources.catalog import write
 from skysim.sources.hipparcos import COLUMNS, EPOCH_JYEAR, HD_BASE, SUPPLEMENT, hip2_rows, v_from_hp
 
 LIMIT_HP = 6.5
 APART_ARCSEC = 10.0
-ARCSEC_RAD = 1000 * MAS_RAD
 
 
 class Pick(NamedTuple):

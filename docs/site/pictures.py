@@ -12,7 +12,6 @@ from skysim.dynamics.multibody.view.picture import picture
 from skysim.results import report, telemetry_report
 from skysim.scene import loader
 from skysim.simulation import exposure, run
-from skysim.simulation.testbed import export_mjcf
 
 IMAGES = Path(__file__).parents[1] / "images"
 OUT = Path(__file__).parents[2] / "out"
@@ -37,8 +36,8 @@ def main() -> None:
         width = 1200
         size = (width, round(width * annotated.shape[0] / annotated.shape[1]))
         files.write_image(IMAGES / f"{name}.jpg", cv2.resize(annotated, size, interpolation=cv2.INTER_AREA))
-    testbed = run.prepare(loader.load("simsat_slew"))
-    rendered = picture(export_mjcf(testbed), testbed.log.joints[700])
+    lab = run.prepare(loader.load("simsat_slew"))
+    rendered = picture(lab.export_mjcf(), lab.log.joints[700])
     files.write_image(IMAGES / "lab.jpg", rendered[:, :, ::-1])
     (IMAGES / "bump.png").write_bytes(telemetry_report.figure(run.prepare(loader.load("simsat_bump")).log))
     exposures = [frame(rate) for rate in RATES_DEG_S]

@@ -13,6 +13,7 @@ import numpy as np
 
 from estimator.core import checks
 from estimator.core.arrays import Floats
+from estimator.core.constants import SIGMA_PER_MAD
 from estimator.core.errors import ImageError
 
 
@@ -50,5 +51,5 @@ def magnitude_zero(instrumental_mag: Floats, v_mag: Floats, vectors_ref: Floats)
     difference = v_mag - instrumental_mag
     each = np.array([np.median(difference[star == k]) for k in range(star.max() + 1)])
     offset = float(np.median(each))
-    scatter = float(1.4826 * np.median(np.abs(each - offset)))
+    scatter = float(SIGMA_PER_MAD * np.median(np.abs(each - offset)))
     return MagnitudeZero(offset, float(np.sqrt(np.pi / 2 / len(each))) * scatter, scatter, len(each))

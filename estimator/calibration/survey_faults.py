@@ -23,6 +23,7 @@ from scipy.special import gammainccinv
 from estimator.attitude.dome_map import LedMap, Lever, on_surface, project
 from estimator.core.arrays import Floats, Ints
 from estimator.core.camera import Camera
+from estimator.core.constants import SIGMA_PER_MAD
 
 Mask = NDArray[np.bool_]
 FALSE_ALARMS = 1e-3  # mean number of surveys with a false alarm of one kind
@@ -293,7 +294,7 @@ def _log_likelihood(table: LightTable) -> Floats:
     tested = both.sum(axis=0) >= MIN_FRAMES
     between_sigma = within_sigma = MIN_SCATTER
     if tested.any():
-        between_sigma = max(1.4826 * float(np.median(np.abs(np.diag(mean)[tested]))), MIN_SCATTER)
+        between_sigma = max(SIGMA_PER_MAD * float(np.median(np.abs(np.diag(mean)[tested]))), MIN_SCATTER)
         spread = np.sqrt(np.diag(within) / np.maximum(np.diag(counts) - 1, 1))
         within_sigma = max(float(np.median(spread[tested])), MIN_SCATTER)
     silent = table.shown & ~seen

@@ -21,13 +21,19 @@ from scipy.spatial import cKDTree
 
 from estimator.core import checks
 from estimator.core.arrays import Floats, Ints
+from estimator.core.constants import (
+    DAY_S,
+    J2000,
+    J2000_JD,
+    JULIAN_YEAR_DAY,
+    MAS_RAD,
+    SPEED_OF_LIGHT_M_S,
+    SUN_DEFLECTION_RAD,
+    TT_MINUS_UTC_S,
+)
 from estimator.core.errors import ImageError
 
-SPEED_OF_LIGHT_M_S = 299_792_458.0
 EPOCHS_YR = 1800.0, 2200.0  # allowed: linear proper motions are good for a century or two
-MAS_RAD = np.pi / 180 / 3.6e6
-SUN_DEFLECTION_RAD = 1.974e-8  # 2 G M_sun / (c^2 1 au)
-TT_MINUS_UTC_DAY = 69.184 / 86400  # since 2017; fewer leap seconds before that are negligible here
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,10 +171,10 @@ def on_earth(time_utc: datetime.datetime) -> Observer:
     if time_utc.tzinfo is not None:
         time_utc = time_utc.astimezone(datetime.UTC).replace(tzinfo=None)
     # epv00 takes TDB; TT is within 2 ms of it.
-    days = (time_utc - datetime.datetime(2000, 1, 1, 12)) / datetime.timedelta(days=1) + TT_MINUS_UTC_DAY
-    _, barycentric = erfa.epv00(erfa.DJ00, days)
-    meters_per_second = erfa.DAU / erfa.DAYSEC
-    return Observer(2000 + days / 365.25, barycentric["p"], barycentric["v"] * meters_per_second)
+    days = (time_utc - J2000) / datetime.timedelta(days=1) + TT_MINUS_UTC_S / DAY_S
+    _, barycentric = erfa.epv00(J2000_JD, days)
+    meters_per_second = erfa.DAU / DAY_S
+    return Observer(2000 + days / JULIAN_YEAR_DAY, barycentric["p"], barycentric["v"] * meters_per_second)
 
 
 def read(path: str | Path) -> StarCatalog:

@@ -17,10 +17,10 @@ from scipy.spatial import cKDTree
 from estimator.catalog import spatial_grid
 from estimator.catalog.spatial_grid import Cells
 from estimator.core.arrays import Floats, Ints
+from estimator.core.constants import ARCSEC_RAD
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
-ARCSEC_RAD = np.pi / 648_000
 BUCKET_WIDTH_RAD = 100 * ARCSEC_RAD  # from the thesis (Padro 2012, section 3.7.3)
 
 

@@ -14,10 +14,16 @@ import numpy as np
 from estimator.catalog.catalog import utc
 from estimator.core import checks
 from estimator.core.arrays import Floats
+from estimator.core.constants import (
+    ARCSEC_RAD,
+    DAY_S,
+    J2000,
+    JULIAN_CENTURY_DAY,
+    STANDARD_PRESSURE_HPA,
+    STANDARD_TEMPERATURE_K,
+    ZERO_CELSIUS_K,
+)
 
-J2000 = datetime.datetime(2000, 1, 1, 12)
-DAY_S = 86400.0
-ARCSEC_RAD = np.pi / 648_000
 LOWEST_RAD = np.radians(85.0)  # of the apparent zenith distance; the formula fails nearer to the horizon
 RAISING_STEPS = 6
 
@@ -37,7 +43,7 @@ class SiteAir:
     latitude_deg: float
     longitude_deg: float
     epoch: datetime.datetime | str
-    pressure_hpa: float = 1013.25
+    pressure_hpa: float = STANDARD_PRESSURE_HPA
     temperature_c: float = 15.0
     wavelength_m: float = 600e-9
 
@@ -76,7 +82,7 @@ def zenith_icrs(days: float, latitude_rad: float, longitude_rad: float) -> Float
     Greenwich mean sidereal time is 280.46061837 + 360.98564736629 d + 0.000387933 T^2 degrees; precession turns the
     mean equator of date by the angles of IAU 1976 (Lieske et al. 1977, A&A 58, 1). Source: Meeus (1998), ch. 12, 21.
     """
-    centuries = days / 36525
+    centuries = days / JULIAN_CENTURY_DAY
     sidereal_deg = 280.46061837 + 360.98564736629 * days + 0.000387933 * centuries**2
     hour = np.radians(sidereal_deg % 360) + longitude_rad
     of_date = np.array([np.cos(latitude_rad) * np.cos(hour), np.cos(latitude_rad) * np.sin(hour), np.sin(latitude_rad)])
@@ -109,10 +115,10 @@ def refraction_constants(pressure_hpa: float, temperature_c: float, wavelength_m
     1051) and beta = 0.001254 T / 273.15 K, the scale height of the air over the Earth's radius. Within 0.2" of
     ray tracing above 15 degrees of altitude.
     """
-    per_um2, t_k = (1e-6 / wavelength_m) ** 2, temperature_c + 273.15
+    per_um2, t_k = (1e-6 / wavelength_m) ** 2, temperature_c + ZERO_CELSIUS_K
     standard = 1e-6 * (64.328 + 29498.1 / (146 - per_um2) + 255.4 / (41 - per_um2))
-    refractivity = standard * pressure_hpa / 1013.25 * 288.15 / t_k
-    beta = 0.001254 * t_k / 273.15
+    refractivity = standard * pressure_hpa / STANDARD_PRESSURE_HPA * STANDARD_TEMPERATURE_K / t_k
+    beta = 0.001254 * t_k / ZERO_CELSIUS_K
     return refractivity * (1 - beta), -refractivity * (beta - refractivity / 2)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.core.arrays import Floats
+from estimator.core.constants import SIGMA_PER_MAD
 from estimator.core.jit import jit
 from estimator.core.types import Background
 
@@ -169,7 +170,7 @@ def _robust_estimate(values: NDArray, samples: NDArray) -> tuple[float, float]:
     middle = _median_by_counting(samples)
     for k in range(count):
         samples[k] = abs(samples[k] - middle)
-    return middle, 1.4826 * _median_by_counting(samples)
+    return middle, SIGMA_PER_MAD * _median_by_counting(samples)
 
 
 @jit

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics, ScaledOptics
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD, HOUR_S, PPM
 from skysim.core.types import Mount, Sources
 from skysim.scene.sections.thermal import (
     LinearTemperatureConfig,
@@ -19,8 +19,6 @@ from skysim.scene.sections.thermal import (
     TemperatureTableConfig,
     ThermalConfig,
 )
-
-HOUR_S = 3600.0
 
 
 def steady(config: SteadyTemperatureConfig, _hours: float) -> float:
@@ -82,8 +80,8 @@ def at_time(config: ThermalConfig, hardware: Hardware, t_s: float) -> Hardware:
     if (sources.place[:, 3] > 0).any():
         anchor_m = np.array([0.0, 0.0, config.anchor_height_m])
         place = sources.place.copy()
-        place[:, :3] += 1e-6 * config.dome_ppm_k * difference_k * (place[:, :3] - anchor_m) + config.creep_m
+        place[:, :3] += PPM * config.dome_ppm_k * difference_k * (place[:, :3] - anchor_m) + config.creep_m
         sources = replace(sources, place=place)
     mount = replace(mount, cam_from_body=turned(config, t_s) * mount.cam_from_body)
-    scale = 1 + 1e-6 * config.lens_ppm_k * difference_k
+    scale = 1 + PPM * config.lens_ppm_k * difference_k
     return Hardware(sources, mount, ScaledOptics.of(optics, scale) if config.lens_ppm_k else optics)

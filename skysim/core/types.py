@@ -51,6 +51,25 @@ class Trajectory:
         ends = Rotation.concatenate([lab_from_body, lab_from_body])
         return cls(np.array([0.0, end_s]), ends, np.zeros((2, 3)))
 
+    @classmethod
+    def at_rate(cls, lab_from_body: Rotation, rate_body_rad_s: Floats, at_s: float, t_s: Floats) -> Trajectory:
+        """A constant rate (3,) in body axes, with this attitude at at_s; sampled at times (N,)."""
+        turned = Rotation.from_rotvec(np.outer(t_s - at_s, rate_body_rad_s))
+        return cls(t_s, lab_from_body * turned, np.tile(rate_body_rad_s, (len(t_s), 1)))
+
+    def since(self, begin_s: float) -> Trajectory:
+        """The same motion; if it begins later than that, after a turn at the rate of its start."""
+        if self.t_s[0] <= begin_s:
+            return self
+        before = Trajectory.at_rate(
+            self.lab_from_body[0], self.rate_body_rad_s[0], float(self.t_s[0]), np.array([begin_s])
+        )
+        return Trajectory(
+            np.concatenate([before.t_s, self.t_s]),
+            Rotation.concatenate([before.lab_from_body, self.lab_from_body]),
+            np.concatenate([before.rate_body_rad_s, self.rate_body_rad_s]),
+        )
+
     def hermite_segments(self) -> tuple[Floats, Floats]:
         """Attitudes (N, 4) as wxyz and hermite_rad (N - 1, 3, 3) for `quaternion.interpolate`; computed once."""
         if not self._segments:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skysim.core import quaternion
+from skysim.core.constants import ARCSEC_RAD, DEG_H_RAD_S, EARTH_RATE_RAD_S, PPM, STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.quantities.tolerance import scaled_errors
@@ -26,8 +27,6 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.scene.sections.vehicle import AccelerometerConfig, GyroConfig, ImuConfig, SiteConfig
 
-EARTH_RATE_RAD_S = 7.2921150e-5  # sidereal rate, 15.041 deg/h (WGS 84)
-STANDARD_GRAVITY_M_S2 = 9.80665  # unit of the accelerometers' g and ug, independent of the lab's gravity
 CUBIC_POINTS = 4  # knots per polynomial: a cubic, with an error of the fourth order in their spacing
 GAUSS_OFFSET = 0.5 / math.sqrt(3)  # the two Gauss-Legendre points, at +-this from the middle: exact for a cubic
 TIME_TOLERANCE_S = 1e-9  # tolerance for rounding of sample times
@@ -268,12 +267,11 @@ def corrupt(
 
 def gyro_triad(config: GyroConfig, hardware: Floats, start: Floats) -> Triad:
     """The gyro triad from standard normal draws: hardware (4, 3), start (3,) of the Gauss-Markov bias."""
-    per_hour = math.radians(1) / 3600
     return Triad(
         matrix=response_matrix(config.scale_ppm, config.misalignment_arcsec, hardware[1:]),
-        turn_on_bias=per_hour * scaled_errors(config.turn_on_bias_deg_h, hardware[0]),
-        markov_bias=config.bias_deg_h * per_hour * start,
-        markov_sd=config.bias_deg_h * per_hour,
+        turn_on_bias=DEG_H_RAD_S * scaled_errors(config.turn_on_bias_deg_h, hardware[0]),
+        markov_bias=config.bias_deg_h * DEG_H_RAD_S * start,
+        markov_sd=config.bias_deg_h * DEG_H_RAD_S,
         markov_time_s=config.bias_time_s,
         white=math.radians(config.arw_deg_sqrt_h) / 60,
         limit=math.radians(config.rate_limit_deg_s),
@@ -285,7 +283,7 @@ def accelerometer_triad(config: AccelerometerConfig, hardware: Floats, start: Fl
     """The accelerometer triad, as `gyros`. Its noise density in ug/sqrt(Hz), squared, is the variance of a mean
     over 1 s.
     """
-    ug = 1e-6 * STANDARD_GRAVITY_M_S2
+    ug = PPM * STANDARD_GRAVITY_M_S2
     return Triad(
         matrix=response_matrix(config.scale_ppm, config.misalignment_arcsec, hardware[1:]),
         turn_on_bias=ug * scaled_errors(config.turn_on_bias_ug, hardware[0]),
@@ -300,8 +298,8 @@ def accelerometer_triad(config: AccelerometerConfig, hardware: Floats, start: Fl
 
 def response_matrix(scale_ppm: float, misalignment_arcsec: float, normal: Floats) -> Floats:
     """(3, 3) identity plus the scale errors on its diagonal and every sensor's misalignment off it."""
-    scale = 1e-6 * scaled_errors(scale_ppm, normal)
-    tilt_rad = math.radians(1 / 3600) * scaled_errors(misalignment_arcsec, normal)
+    scale = PPM * scaled_errors(scale_ppm, normal)
+    tilt_rad = ARCSEC_RAD * scaled_errors(misalignment_arcsec, normal)
     return np.eye(3) + np.where(np.eye(3) > 0, scale, tilt_rad)
 
 

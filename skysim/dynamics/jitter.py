@@ -1,7 +1,7 @@
 """Vibration: small rotations about the body axes added to the simulated attitude, always or for an interval.
 
 A vibration is a sum of sines of the rotation vector in body axes: single frequencies (`line`) or a random spectrum
-(`band`). It is kinematic: MuJoCo does not simulate it, but the IMU senses it (`closed_loop.recent_motion`) and it
+(`band`). It is kinematic: MuJoCo does not simulate it, but the IMU senses it (`Motion.last_knots`) and it
 smears the images.
 """
 

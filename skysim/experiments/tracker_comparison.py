@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,8 @@ from skysim.core.types import Frame, FrameRow, Truth
 from skysim.experiments.configs import with_config
 from skysim.results import metrics, scoring
 from skysim.scene.scene import Scene
-from skysim.simulation import run
-from skysim.simulation.run import FrameResult
-from skysim.simulation.testbed import Testbed, build_tracker
+from skysim.simulation.flight import Flight, Progress
+from skysim.simulation.lab import Lab, build_tracker
 from skysim.tracking import factory
 from skysim.tracking.external.interface import FAILED, SOLVED
 
@@ -49,34 +48,35 @@ class TrackerScore:
     refusals: dict[str, int]
 
 
-def build_trackers(testbed: Testbed, names: Sequence[str]) -> dict[str, factory.Estimator]:
+def build_trackers(lab: Lab, names: Sequence[str], programs: Mapping[str, str]) -> dict[str, factory.Estimator]:
     """Set up the trackers by name, all with the scene's tracker options and onboard model. Raises InputError."""
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
         raise InputError("trackers", f"{repeated[0]} is given twice", "once")
-    scenes = {name: with_config(testbed.scene, "tracker", name=name) for name in names}
-    return {name: build_tracker(replace(testbed, scene=scene)) for name, scene in scenes.items()}
+    scenes = {name: with_config(lab.scene, "tracker", name=name) for name in names}
+    return {name: build_tracker(lab.with_scene(scene).camera, programs) for name, scene in scenes.items()}
 
 
 def compare_frames(
-    testbed: Testbed, estimators: Mapping[str, factory.Estimator]
+    flight: Flight, estimators: Mapping[str, factory.Estimator], progress: Progress | None = None
 ) -> Iterator[tuple[Frame, Truth, dict[str, FrameRow]]]:
-    """Yield each frame with its truth and the row of each tracker.
+    """Yield each frame of the main camera with its truth and the row of each tracker.
 
-    The order of the trackers rotates from frame to frame, so that none always runs first (with cold caches). Frames
-    that the first tracker solved for the attitude filter during the motion simulation are not solved again.
+    The order of the trackers rotates from frame to frame, so that none always runs first (with cold caches). With an
+    attitude filter the first tracker, which must be the flight's, closes the loop: its solutions are the flight's.
     """
     order = list(estimators)
-    closed_loop_tracker = order[0]  # the tracker whose solutions updated the attitude filter
-    for name in order:
-        run.warm_up(testbed, estimators[name])
-    for frame, truth, seconds in run.render_frames(testbed):
+    lab = flight.lab
+    closed_loop_tracker = order[0] if lab.scene.filter else ""
+    for shot in flight.shots(cameras=[0], solves=False, progress=progress):
         rows = {}
         for name in order:
-            report = testbed.reports.get(frame.index) if name == closed_loop_tracker else None
-            report = report or factory.solve_frame(estimators[name], frame)
-            rows[name] = scoring.row(FrameResult(frame, truth, report, seconds), testbed.scene, testbed.mount)
-        yield frame, truth, rows
+            if shot.frame.index == 0 and not isinstance(estimators[name], factory.UserTracker):
+                factory.solve_frame(estimators[name], shot.frame)  # compiled before it is timed
+            report = shot.report if name == closed_loop_tracker else None
+            report = report or factory.solve_frame(estimators[name], shot.frame)
+            rows[name] = scoring.row(lab.camera, shot.frame, shot.truth, report)
+        yield shot.frame, shot.truth, rows
         order.append(order.pop(0))
 
 

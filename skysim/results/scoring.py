@@ -1,22 +1,26 @@
-"""Compare the tracker's solution of each frame with the truth, as rows and tables of numbers."""
+"""Compare the tracker's solution of each shot with the truth, as rows and tables of numbers."""
 
 from __future__ import annotations
 
+import html
+from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.core.types import RateEstimate, ra_dec_roll_rad
+from estimator.core.types import Attitude, RateEstimate, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, FrameRow, Mount, Truth
-from skysim.results import metrics
+from skysim.results import metrics, report, stretch
 from skysim.results.report import annotate, visible
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
-from skysim.simulation.run import FrameResult
+from skysim.simulation.flight import Shot
+from skysim.simulation.lab import StarCamera
 
 
 def angle_names(scene: Scene) -> tuple[str, str, str]:
@@ -34,12 +38,14 @@ def angles_deg(cam_from_lab: Rotation, scene: Scene, mount: Mount) -> tuple[floa
     return float(roll), float(pitch), float(yaw)
 
 
-def row(result: FrameResult, scene: Scene, mount: Mount, verdict: str = "") -> FrameRow:
-    """Truth, solution and errors of one frame; `verdict` is how the attitude filter used the solution.
+def row(camera: StarCamera, frame: Frame, truth: Truth, report: Report, update_status: str = "") -> FrameRow:
+    """Truth, solution and errors of one frame; `update_status` is how the attitude filter used the solution.
 
     Errors and standard deviations are in arcseconds, NaN without a solution.
     """
-    truth, attitude = result.truth, result.report.attitude
+    scene = camera.scene
+    mount = camera.mount
+    attitude = report.attitude
     # With the mount of the calibration: one that has moved since makes an error of the vehicle's attitude.
     cam_from_lab = mount.cam_from_body * truth.lab_from_body.inv()
     cross = roll = cross_sigma = roll_sigma = chance = float("nan")
@@ -57,7 +63,7 @@ def row(result: FrameResult, scene: Scene, mount: Mount, verdict: str = "") -> F
         chance = attitude.match.log10_chance if attitude.match else chance
     rate_error, rate_sigma = rate_errors_deg_s(attitude.rate, truth)
     return FrameRow(
-        frame=result.frame.index,
+        frame=frame.index,
         t_s=truth.t_s,
         rate_deg_s=float(np.degrees(np.linalg.norm(truth.rate_cam_rad_s))),
         status=attitude.status,
@@ -68,13 +74,13 @@ def row(result: FrameResult, scene: Scene, mount: Mount, verdict: str = "") -> F
         cross_sigma_arcsec=cross_sigma / ARCSEC_RAD,
         roll_sigma_arcsec=roll_sigma / ARCSEC_RAD,
         log10_chance=chance,
-        detected=len(result.report.centroids),
+        detected=len(report.centroids),
         matched=len(attitude.match.observed) if attitude.match else 0,
         rms_px=attitude.rms_px,
-        time_ms=1e3 * sum(result.report.seconds.values()),
+        time_ms=1e3 * sum(report.seconds.values()),
         wrong=wrong,
-        filter=verdict,
-        exposure_s=result.frame.exposure_s,
+        filter=update_status,
+        exposure_s=frame.exposure_s,
         rate_error_deg_s=rate_error,
         rate_sigma_deg_s=rate_sigma,
     )
@@ -129,3 +135,61 @@ def annotated(frame: Frame, truth: Truth, report: Report | None) -> NDArray[np.u
     match = report.attitude.match if report else None
     matched = detected[match.observed] if match else np.empty((0, 2))
     return annotate(frame.image_dn, detected, matched, truth_px=truth.sources.xy_px[visible(truth.sources)])
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Score:
+    """A shot with the error of its solution.
+
+    row : the shot as numbers: angles in degrees, errors and the tracker's standard deviations in arcseconds
+    """
+
+    shot: Shot
+    row: FrameRow
+
+    @property
+    def image(self) -> NDArray[Any]:
+        """(H, W) digital numbers: uint16, or float64 for a noise-free detector."""
+        return self.shot.frame.image_dn
+
+    @property
+    def truth(self) -> Truth:
+        """Attitude, rates and sources at mid-exposure."""
+        return self.shot.truth
+
+    @property
+    def attitude(self) -> Attitude:
+        """The tracker's solution; if it has no attitude, its `status` gives the reason."""
+        assert self.shot.report is not None
+        return self.shot.report.attitude
+
+    @property
+    def error_arcsec(self) -> float:
+        """Rotation angle between the solution and the truth, arcseconds; NaN without a solution."""
+        estimate = self.attitude.cam_from_ref
+        if estimate is None:
+            return float("nan")
+        return float((estimate * self.truth.cam_from_lab.inv()).magnitude() / ARCSEC_RAD)
+
+    def annotated(self) -> NDArray[np.uint8]:
+        """(H, W, 3) stretched frame in BGR: truth in blue, detections in red, identified sources in green."""
+        return annotated(self.shot.frame, self.truth, self.shot.report)
+
+    def __repr__(self) -> str:
+        identified = f"{self.row.matched} of {self.row.detected} detections identified"
+        return f"<frame {self.row.frame}: {self.row.status}, error {self.error_arcsec:.3g} arcsec, {identified}>"
+
+    def _repr_html_(self) -> str:
+        return f"{image_tag(self.annotated())}<p>{html.escape(repr(self)[1:-1])}</p>"
+
+
+def score(shot: Shot) -> Score:
+    """A solved shot with the error of its solution."""
+    assert shot.report is not None
+    return Score(shot, row(shot.camera, shot.frame, shot.truth, shot.report, shot.update_status))
+
+
+def image_tag(image: NDArray[np.uint8]) -> str:
+    """An HTML <img> element of an image, reduced to at most 800 pixels in width."""
+    data = cv2.imencode(".jpg", stretch.reduce_width(image, 800))[1].tobytes()
+    return f'<img src="{report.embed(data, "jpeg")}">'

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skysim.core.constants import SIGMA_PER_MAD
+
 CURVES: dict[str, Any] = {
     "square root": np.sqrt,
     "linear": lambda fraction: fraction,
@@ -59,7 +61,7 @@ def frame_statistics(image: NDArray, saturation_dn: float) -> FrameStatistics:
     sample = image[:: 2 * SAMPLE_STRIDE, ::SAMPLE_STRIDE].astype(float)
     sky = float(np.median(sample))
     deviation = np.abs(sample - sky)
-    background = sample[deviation <= max(5 * 1.4826 * float(np.median(deviation)), 3.0)]
+    background = sample[deviation <= max(5 * SIGMA_PER_MAD * float(np.median(deviation)), 3.0)]
     peak = float(image.max())
     saturated = int(np.count_nonzero(image >= saturation_dn)) if peak >= saturation_dn else 0
     return FrameStatistics(sky, float(background.std()), peak, saturated)

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.core.quantities.units import ARCSEC_RAD, RPM_RAD_S
+from skysim.core.constants import ARCSEC_DEG, ARCSEC_RAD, RPM_RAD_S
 from skysim.core.types import Floats, Telemetry
 from skysim.dynamics.imu import Increments, tilt_rad
 from skysim.results.plots import figure_png, stacked_axes
 
 AXES = ("x", "y", "z")
 EULER = ("roll", "pitch", "yaw")
-ARCSEC_DEG = 1 / 3600
 
 
 def euler_deg(lab_from_body: Rotation) -> Floats:

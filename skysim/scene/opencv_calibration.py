@@ -9,9 +9,9 @@ from typing import Any
 
 import yaml
 
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import StrictLoader, excerpt, parse_yaml
-from skysim.core.quantities.units import ARCSEC_RAD
 
 MAX_BYTES = 1 << 20  # enough for a calibration with the points of all its views
 MAX_ASPECT_ERROR = (

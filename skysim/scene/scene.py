@@ -13,12 +13,13 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
+from skysim.core.constants import DAY_S
 from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import fault_of
 from skysim.core.quantities.tolerance import TimeError
 from skysim.core.quantities.units import ConfigModel, Length, Number, Spin, Time
-from skysim.core.quantities.utc import check_year
 from skysim.core.random_streams import HEAD_SEED, derived_seed
+from skysim.core.time import check_year
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, Glow, Light, StarsConfig
@@ -32,7 +33,7 @@ NAME_ALIAS = "(the file's name)"  # alias of Scene.name, not a valid key in a fi
 
 EPHEMERIS_KEYS = "bodies", "satellites"  # of a light, whose places need the ephemeris
 BODIES_YEARS = 1972, 2100  # UTC has leap seconds from 1972; the ephemeris ends with 2100
-MAX_FRAMES, MAX_DURATION_S = 1_000_000, 86_400.0  # of a run, limited by memory
+MAX_FRAMES, MAX_DURATION_S = 1_000_000, DAY_S  # of a run, limited by memory
 
 
 class ExposureConfig(ConfigModel):
@@ -234,10 +235,11 @@ class Scene(ConfigModel):
             raise InputError("tracker.gyro", "requires the section vehicle.imu")
         if control is None:
             return self
-        present = {"ideal": True} | {kind: getattr(self.vehicle, kind) for kind in ("wheels", "fans", "cmgs")}
-        if not present[control.actuators]:
+        commanded = getattr(self.vehicle, control.actuators, None)
+        if commanded is None and control.actuators != "ideal":
             raise InputError("motion.control.actuators", f"requires the section vehicle.{control.actuators}")
-        if control.desaturation and (not self.vehicle.fans or control.actuators not in ("wheels", "cmgs")):
+        stores_momentum = commanded is not None and commanded.stores_momentum
+        if control.desaturation and not (self.vehicle.fans and stores_momentum):
             raise InputError("motion.control.desaturation", "requires vehicle.fans, and actuators wheels or cmgs")
         if {"truth": False, "imu": not imu, "filter": not self.filter}[control.feedback]:
             section = "vehicle.imu" if control.feedback == "imu" else "filter"

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 
 import numpy as np
 from numba.core import event
+from scipy.spatial.transform import Rotation
 
 from skysim.camera.detector.detector import saturation_dn
 from skysim.core.errors import InputError
@@ -22,7 +23,8 @@ from skysim.core.io.yaml_reader import parse_overrides
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Frame
 from skysim.scene import loader
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker, exposure_window
+from skysim.simulation.lab import StarCamera, build_lab, build_tracker
+from skysim.simulation.timing import exposure_window
 from skysim.tracking import factory
 from skysim.tracking.onboard_model import assumed_camera
 
@@ -73,27 +75,31 @@ def compile_tracker(scene: str, overrides: Sequence[str] = ()) -> None:
 
     overrides : `KEY=VALUE` as on the command line
     """
-    testbed = build_testbed(loader.load(scene, parse_overrides(list(overrides))))
-    tracker = build_tracker(testbed)
-    if not isinstance(tracker, factory.UserTracker):
-        factory.solve_frame(tracker, synthetic_frame(testbed))
+    lab = build_lab(loader.load(scene, parse_overrides(list(overrides))))
+    warm_up(lab.camera, lab.start, build_tracker(lab.camera))
 
 
-def synthetic_frame(testbed: Testbed) -> Frame:
-    """A frame at the initial attitude with equal Gaussian spots at the LEDs or the brightest stars, drawn without the
-    renderer.
+def warm_up(camera: StarCamera, lab_from_body: Rotation, tracker: factory.Estimator) -> None:
+    """Solve a synthetic frame so that numba compiles before timing.
+
+    External trackers are skipped: each frame must reach them once, in order.
     """
-    camera = assumed_camera(testbed.scene)
-    when = exposure_window(testbed.scene, 0)
-    lab_from_body = testbed.trajectory.lab_from_body[0]
-    place = testbed.sources.place[np.argsort(testbed.sources.magnitude, kind="stable")]
-    toward = place[:, :3] - place[:, 3:] * lab_from_body.apply(testbed.mount.camera_body_m)
-    vectors_cam = (testbed.mount.cam_from_body * lab_from_body.inv()).apply(toward)
-    xy_px = camera.pixels(vectors_cam[vectors_cam[:, 2] > 0])
-    xy_px = xy_px[camera.contains(xy_px)][:MAX_SPOTS]
-    full_dn = saturation_dn(testbed.scene.camera.detector)
-    image_dn = random_stream(0).normal(0.1 * full_dn, NOISE_DN, (camera.height_px, camera.width_px))
-    x, y = np.arange(camera.width_px), np.arange(camera.height_px)
+    if not isinstance(tracker, factory.UserTracker):
+        factory.solve_frame(tracker, synthetic_frame(camera, lab_from_body))
+
+
+def synthetic_frame(camera: StarCamera, lab_from_body: Rotation) -> Frame:
+    """A frame at an attitude with equal Gaussian spots at the LEDs or the brightest stars; it needs no renderer."""
+    assumed = assumed_camera(camera.scene)
+    when = exposure_window(camera.scene, 0)
+    place = camera.sources.place[np.argsort(camera.sources.magnitude, kind="stable")]
+    toward = place[:, :3] - place[:, 3:] * lab_from_body.apply(camera.mount.camera_body_m)
+    vectors_cam = (camera.mount.cam_from_body * lab_from_body.inv()).apply(toward)
+    xy_px = assumed.pixels(vectors_cam[vectors_cam[:, 2] > 0])
+    xy_px = xy_px[assumed.contains(xy_px)][:MAX_SPOTS]
+    full_dn = saturation_dn(camera.scene.camera.detector)
+    image_dn = random_stream(0).normal(0.1 * full_dn, NOISE_DN, (assumed.height_px, assumed.width_px))
+    x, y = np.arange(assumed.width_px), np.arange(assumed.height_px)
     for x_px, y_px in xy_px:
         along, down = (np.exp(-(((axis - at) / SPOT_SIGMA_PX) ** 2) / 2) for axis, at in ((x, x_px), (y, y_px)))
         image_dn += 0.5 * full_dn * np.outer(down, along)

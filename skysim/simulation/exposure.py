@@ -30,19 +30,18 @@ from skysim.camera.optics import Optics
 from skysim.camera.render import OcclusionTest, Poses, Window, in_view, poses, project, render
 from skysim.camera.stray import ghosts, glare, wall
 from skysim.core.random_streams import DETECTOR, SCINTILLATION, random_stream
-from skysim.core.types import Floats, Frame, Sources, SourceTruth, Truth, with_sources
+from skysim.core.types import Floats, Frame, Sources, SourceTruth, Trajectory, Truth, with_sources
 from skysim.dynamics import multibody
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.testbed import (
-    Testbed,
+from skysim.simulation.lab import (
+    StarCamera,
     bodies_during,
-    exposure_window,
     lights_during,
     observer_during,
     satellites_during,
     sky_during,
-    time_tag_error_s,
 )
+from skysim.simulation.timing import exposure_window, frame_end_s, time_tag_error_s
 from skysim.sources.air.air import Sky
 from skysim.sources.dome.led import Emitter, warm_up_factor
 from skysim.sources.orbit.earth import sun_m
@@ -52,23 +51,25 @@ from skysim.sources.solar_system.bodies import BodyLight
 
 
 def render_frame(
-    testbed: Testbed,
+    camera: StarCamera,
+    trajectory: Trajectory,
     index: int,
     clock: Clock | None = None,
-    exposure_s: float | None = None,
+    window: Window | None = None,
     added: AddedCharge | None = None,
 ) -> tuple[Frame, Truth]:
     """Render one frame and its truth, both for mid-exposure of the middle row.
 
-    They depend only on the test bed, the index and the exposure time (the scene's if left out), not on other frames.
+    They depend only on the camera, its motion, the index and the window (the scene's if left out), not on other frames.
     added : gets the masks of smear and particles
     """
     clock = clock or Clock()
-    scene, camera = testbed.scene, testbed.scene.camera
-    window = exposure_window(scene, index, exposure_s)
-    middle_s = window.middle_s(camera.height_px)
+    testbed = camera
+    scene = testbed.scene
+    window = window or exposure_window(scene, index)
+    middle_s = window.middle_s(scene.camera.height_px)
     testbed = at_time(testbed, middle_s)
-    lab_from_body = testbed.trajectory.attitude_at(middle_s)
+    lab_from_body = trajectory.attitude_at(middle_s)
     cam_from_lab = testbed.mount.cam_from_body * lab_from_body.inv()
     camera_m = lab_from_body.apply(testbed.mount.camera_body_m)
     sky, light_e = sky_during(testbed, middle_s), testbed.canvas
@@ -76,18 +77,18 @@ def render_frame(
     bodies = bodies_during(testbed, middle_s)
     stray_e_s = sum(stray_light_e_s(testbed, bodies, cam_from_lab, middle_s).values())
     fill_background(light_e, testbed, sky, cam_from_lab, camera_m, middle_s, window.exposure_s, stray_e_s)
-    view = view_of(testbed, window, cam_from_lab, middle_s)
+    view = view_of(testbed, trajectory, window, cam_from_lab, middle_s)
     satellites = satellites_during(testbed, view, middle_s, index)
     stars = lights_during(testbed, view, middle_s, window.exposure_s)
     if testbed.codes:
         stars = testbed.codes.shown(stars, window.open_s, window.exposure_s, index)
     if sky:
-        stars = seen_stars(testbed, stars, sky, window, index)
+        stars = seen_stars(testbed, trajectory, stars, sky, window, index)
     streaks = satellite_sources(testbed, sky, satellites)
     lights = Lights(with_images(testbed, stars, cam_from_lab, camera_m), bodies, streaks)
     occludes = occlusion_test(testbed, lab_from_body, sky)
     optics = seeing_optics(testbed, sky, cam_from_lab) if sky else testbed.optics
-    exposed = Exposed(optics, testbed.trajectory, testbed.mount, window)
+    exposed = Exposed(optics, trajectory, testbed.mount, window)
     sources = draw_lights(light_e, lights, exposed, testbed.emitter, occludes)
     sources = add_stray(light_e, sources, lights, exposed, testbed, occludes)
     smear(light_e, window.exposure_s, testbed.detector.shutter, added)
@@ -97,18 +98,23 @@ def render_frame(
     rng = random_stream(scene.seed, DETECTOR, index)
     image = expose(light_e, window.exposure_s, testbed.detector, rng, added)
     clock.lap("detector")
-    rate_cam = testbed.mount.cam_from_body.apply(testbed.trajectory.rate_at(middle_s))
+    rate_cam = testbed.mount.cam_from_body.apply(trajectory.rate_at(middle_s))
     seen = tuple(body.truth() for body in lights.bodies if body.id in sources.id)
     streaked = tuple(light.truth for light in satellites if light.truth.id in sources.id)
     hidden_ids = occluded_ids(testbed, lab_from_body, stars, occludes)
     truth = Truth(middle_s, lab_from_body, cam_from_lab, rate_cam, sources, hidden_ids, seen, streaked)
     tagged_s = middle_s + time_tag_error_s(scene, index)
-    return Frame(index, image, tagged_s, window.exposure_s, saturation_dn(camera.detector)), truth
+    return Frame(index, image, tagged_s, window.exposure_s, saturation_dn(scene.camera.detector)), truth
+
+
+def render_at_rest(camera: StarCamera, lab_from_body: Rotation, index: int = 0) -> tuple[Frame, Truth]:
+    """Render one frame of a vehicle that is at rest at an attitude."""
+    return render_frame(camera, Trajectory.at_rest(lab_from_body, frame_end_s(camera.scene, index)), index)
 
 
 def fill_background(
     light_e: NDArray[Any],
-    testbed: Testbed,
+    testbed: StarCamera,
     sky: Sky | None,
     cam_from_lab: Rotation,
     camera_m: Floats,
@@ -132,7 +138,7 @@ def fill_background(
 
 
 def stray_light_e_s(
-    testbed: Testbed, bodies: Sequence[BodyLight], cam_from_lab: Rotation, t_s: float
+    testbed: StarCamera, bodies: Sequence[BodyLight], cam_from_lab: Rotation, t_s: float
 ) -> dict[str, float]:
     """Electrons s^-1 px^-1 that each body, and the Earth, sends past the baffle; empty without a baffle.
 
@@ -152,7 +158,7 @@ def stray_light_e_s(
     return {name: light * scene.camera.pixel_m**2 for name, light in found.items()}
 
 
-def satellite_sources(testbed: Testbed, sky: Sky | None, satellites: Sequence[MovingLight]) -> Sources | None:
+def satellite_sources(testbed: StarCamera, sky: Sky | None, satellites: Sequence[MovingLight]) -> Sources | None:
     """The satellites as light sources, through the air where there is one; None without satellites."""
     if not satellites:
         return None
@@ -165,7 +171,7 @@ def add_stray(
     sources: SourceTruth,
     lights: Lights,
     exposed: Exposed,
-    testbed: Testbed,
+    testbed: StarCamera,
     occludes: OcclusionTest | None,
 ) -> SourceTruth:
     """Add the lens's ghosts and glare to the image, in place; return the truth of all images."""
@@ -180,7 +186,9 @@ def add_stray(
     return sources
 
 
-def add_earth(light_e: NDArray[Any], testbed: Testbed, cam_from_lab: Rotation, t_s: float, exposure_s: float) -> None:
+def add_earth(
+    light_e: NDArray[Any], testbed: StarCamera, cam_from_lab: Rotation, t_s: float, exposure_s: float
+) -> None:
     """Add the Earth's light at a time to the image, in place, where the scene's orbit has it."""
     config = testbed.scene.orbit.earth if testbed.scene.orbit else None
     if config is None:
@@ -194,20 +202,22 @@ def add_earth(light_e: NDArray[Any], testbed: Testbed, cam_from_lab: Rotation, t
         light_e += own
 
 
-def view_of(testbed: Testbed, window: Window, cam_from_lab: Rotation, middle_s: float) -> View:
+def view_of(
+    testbed: StarCamera, trajectory: Trajectory, window: Window, cam_from_lab: Rotation, middle_s: float
+) -> View:
     """What the camera can see in the exposure."""
     duration_s = window.close_s(testbed.scene.camera.height_px) - window.open_s
-    turn_rad = float(np.linalg.norm(testbed.trajectory.rate_at(middle_s))) * duration_s
+    turn_rad = float(np.linalg.norm(trajectory.rate_at(middle_s))) * duration_s
     return View(cam_from_lab.inv().apply([0.0, 0.0, 1.0]), testbed.optics.field_rad, turn_rad, duration_s)
 
 
-def light_left(testbed: Testbed, t_s: float) -> float:
+def light_left(testbed: StarCamera, t_s: float) -> float:
     """Light of the dome's LEDs at that time, over that when they were switched on."""
     light = testbed.scene.light
     return warm_up_factor(light.led.warm_up, t_s) if isinstance(light, DomeConfig) else 1.0
 
 
-def at_time(testbed: Testbed, t_s: float) -> Testbed:
+def at_time(testbed: StarCamera, t_s: float) -> StarCamera:
     """The test bed with LEDs as bright as they are at that time, and LEDs, mount and lens where the temperature has
     moved them.
     """
@@ -224,7 +234,7 @@ def at_time(testbed: Testbed, t_s: float) -> Testbed:
     return replace(testbed, **thermal.at_time(testbed.scene.thermal, hardware, t_s)._asdict())
 
 
-def with_images(testbed: Testbed, sources: Sources, cam_from_lab: Rotation, camera_m: Floats) -> Sources:
+def with_images(testbed: StarCamera, sources: Sources, cam_from_lab: Rotation, camera_m: Floats) -> Sources:
     """The sources, and the images of LEDs that a camera there sees in the wall."""
     if not (testbed.reflecting and testbed.reflecting.config.mirrors):
         return sources
@@ -253,14 +263,16 @@ def draw_lights(
     return concatenated(truths) if len(truths) > 1 else truths[0]
 
 
-def seen_stars(testbed: Testbed, stars: Sources, sky: Sky, window: Window, index: int) -> Sources:
+def seen_stars(
+    testbed: StarCamera, trajectory: Trajectory, stars: Sources, sky: Sky, window: Window, index: int
+) -> Sources:
     """The stars near the field of a frame as they are seen through the air.
 
     The site turns by 15" in a second, which changes a refraction by less than 0.02" at 15 degrees of altitude, so the
     air is that of mid-exposure.
     """
     scene, rows = testbed.scene, testbed.scene.camera.height_px
-    few_poses = poses(testbed.trajectory, testbed.mount, np.linspace(window.open_s, window.close_s(rows), FEW))
+    few_poses = poses(trajectory, testbed.mount, np.linspace(window.open_s, window.close_s(rows), FEW))
     seen = sky.stars_seen(stars.take(in_view(stars, testbed.optics, few_poses)))
     if not sky.air.config.scintillation:
         return seen
@@ -268,13 +280,13 @@ def seen_stars(testbed: Testbed, stars: Sources, sky: Sky, window: Window, index
     return sky.twinkling(seen, scene.camera.pupil_m, window.exposure_s, rng)
 
 
-def seeing_optics(testbed: Testbed, sky: Sky, cam_from_lab: Rotation) -> Optics:
+def seeing_optics(testbed: StarCamera, sky: Sky, cam_from_lab: Rotation) -> Optics:
     """The optics with the blur of the seeing at the boresight."""
     boresight = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
     return replace(testbed.optics, blur_px=sky.seeing_px(boresight, testbed.scene.camera.focal_px))
 
 
-def occlusion_test(testbed: Testbed, lab_from_body: Rotation, sky: Sky | None) -> OcclusionTest | None:
+def occlusion_test(testbed: StarCamera, lab_from_body: Rotation, sky: Sky | None) -> OcclusionTest | None:
     """The test for sources that the vehicle, the dome or the skyline hides; None if nothing can."""
     by_parts = partial(multibody.occluded, testbed.obstacles, lab_from_body) if testbed.obstacles else None
     if sky is None:
@@ -288,7 +300,7 @@ def occlusion_test(testbed: Testbed, lab_from_body: Rotation, sky: Sky | None) -
 
 
 def occluded_ids(
-    testbed: Testbed, lab_from_body: Rotation, light: Sources, occludes: OcclusionTest | None
+    testbed: StarCamera, lab_from_body: Rotation, light: Sources, occludes: OcclusionTest | None
 ) -> NDArray[np.int64]:
     """(M,) ids of the occluded sources that would otherwise be on the chip at that attitude."""
     if occludes is None:

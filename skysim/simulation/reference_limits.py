@@ -9,25 +9,29 @@ import numpy as np
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
-from skysim.dynamics.flight_computer import build_actuators, controlling_actuator, usage
+from skysim.dynamics.flight_computer import controlling_actuator, usage
+from skysim.dynamics.multibody.actuators.registry import build_actuators
+from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import ControlConfig
 from skysim.scene.sections.vehicle import VehicleConfig
-from skysim.simulation.testbed import Testbed
 
 TILT_CHECK_S = 0.05  # sampling interval of a maneuver when its tilt is checked
 ROUNDING = 1e-6  # relative
 
 
-def check_reference(reference: guidance.Reference, testbed: Testbed) -> None:
+def check_reference(
+    reference: guidance.Reference, scene: Scene, model: multibody.VehicleModel, duration_s: float
+) -> None:
     """Raise InputError for a maneuver beyond the tilt stop, the gyros' range or the actuators' torque.
 
     The controller would push against the stop, or fall behind. A prescribed motion needs no torque.
     """
-    scene, motion, vehicle = testbed.scene, testbed.scene.motion, testbed.scene.vehicle
+    motion = scene.motion
+    vehicle = scene.vehicle
     if motion.control is None:
         return
-    check_tilt(reference, vehicle, testbed.duration_s)
-    actuators = build_actuators(scene, testbed.vehicle)
+    check_tilt(reference, vehicle, duration_s)
+    actuators = build_actuators(scene.vehicle, model.model)
     legs = zip(reference.legs, reference.start_s, motion.maneuver, strict=False)
     for n, (leg, begin_s, element) in enumerate(legs):
         if element.kind not in ("profile", "chirp"):
@@ -36,9 +40,9 @@ def check_reference(reference: guidance.Reference, testbed: Testbed) -> None:
         key = f"motion.maneuver.{n}: {element.kind}"
         check_rate(key, begin_s + t_s, rate, vehicle)
         if not motion.is_prescribed:
-            inertia = testbed.vehicle.inertia_kg_m2
+            inertia = model.inertia_kg_m2
             torque_nm = acceleration @ inertia.T + np.cross(rate, rate @ inertia.T)
-            used = usage(controlling_actuator(motion.control, actuators, testbed.vehicle), torque_nm)
+            used = usage(controlling_actuator(motion.control, actuators, model), torque_nm)
             check_torque(key, begin_s + t_s, used, torque_nm, motion.control)
 
 

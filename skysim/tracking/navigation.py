@@ -16,7 +16,7 @@ from estimator.core.types import Attitude
 from estimator.filter.mekf import AttitudeFilter
 from estimator.filter.models import GyroModel, JumpModel, TrackerModel
 from skysim.core import quaternion
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD, HOUR_S, PPM
 from skysim.core.types import Floats, Mount
 from skysim.dynamics import imu
 from skysim.scene.scene import Scene
@@ -95,10 +95,16 @@ class Navigation:
             compensation = self.earth_body_rad_s(self.attitude_wxyz("filter"))
             self.filter.propagate(ends_s, measured.angle_rad - compensation * self.step_s, measured.saturated)
 
-    def imu_samples(self) -> imu.Increments:
-        """The IMU samples that are kept."""
+    def imu_samples(self, since_s: float = -math.inf) -> imu.Increments:
+        """The kept IMU samples from about this time on: whole control periods."""
+        if not self.measured:
+            none = np.zeros((0, 3))
+            return imu.Increments(np.zeros(0), self.step_s, none, none, np.zeros(0, bool), np.zeros(0, bool))
+        first = len(self.measured) - 1
+        while first > 0 and self.measured[first - 1].t_s[-1] >= since_s:
+            first -= 1
         columns = zip(
-            *((m.t_s, m.angle_rad, m.velocity_m_s, m.saturated, m.overloaded) for m in self.measured),
+            *((m.t_s, m.angle_rad, m.velocity_m_s, m.saturated, m.overloaded) for m in self.measured[first:]),
             strict=True,
         )
         t_s, angle, velocity, saturated, overloaded = (np.concatenate(column) for column in columns)
@@ -157,12 +163,11 @@ def zeroed_attitude(lab_from_body: Rotation, error_deg: tuple[float, float, floa
 
 def build_filter(config: FilterConfig, lab_from_body: Rotation, cameras: int = 1) -> AttitudeFilter:
     """The attitude filter at the start; its reference frame is the lab."""
-    hour_s = 3600.0
     gyro = GyroModel(
-        math.radians(config.arw_deg_sqrt_h) / math.sqrt(hour_s),
-        math.radians(config.bias_deg_h) / hour_s,
+        math.radians(config.arw_deg_sqrt_h) / math.sqrt(HOUR_S),
+        math.radians(config.bias_deg_h) / HOUR_S,
         config.bias_time_s,
-        config.scale_ppm * 1e-6,
+        config.scale_ppm * PPM,
         config.misalignment_arcsec * ARCSEC_RAD,
         math.radians(config.rate_limit_deg_s or math.inf),
     )
@@ -171,18 +176,18 @@ def build_filter(config: FilterConfig, lab_from_body: Rotation, cameras: int = 1
         config.systematic_time_s,
         math.radians(config.systematic_angle_deg),
         config.mounting_arcsec * ARCSEC_RAD,
-        config.mounting_drift_arcsec_sqrt_h * ARCSEC_RAD / math.sqrt(hour_s),
+        config.mounting_drift_arcsec_sqrt_h * ARCSEC_RAD / math.sqrt(HOUR_S),
     )
     return AttitudeFilter(
         gyro,
         0.0,
         lab_from_body.inv(),
         math.radians(config.start_deg),
-        math.radians(config.start_bias_deg_h) / hour_s,
+        math.radians(config.start_bias_deg_h) / HOUR_S,
         config.floor_arcsec * ARCSEC_RAD,
         config.gate_sigma,
         tracker,
-        JumpModel(config.missed_per_h / hour_s, config.wrong_share, config.wrong_repeat),
+        JumpModel(config.missed_per_h / HOUR_S, config.wrong_share, config.wrong_repeat),
         config.considered,
         cameras,
     )

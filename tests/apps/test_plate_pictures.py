@@ -45,8 +45,8 @@ STORED = {
 def photographed(focal: str = "25 mm") -> tuple[Scene, Frame, Truth]:
     """The SHEFEX-2 camera at rest behind a lens."""
     still = {"exposure.frames": "1", "motion.rate_deg_s": "[0, 0, 0]", "camera.focal_length": focal}
-    testbed = run.prepare(loader.load("shefex2", still))
-    return testbed.scene, *exposure.render_frame(testbed, 0)
+    lab = run.prepare(loader.load("shefex2", still))
+    return lab.scene, *exposure.render_frame(lab, 0)
 
 
 @pytest.fixture(scope="module")

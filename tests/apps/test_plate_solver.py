@@ -16,12 +16,12 @@ from estimator.trackers.residuals.refinement import NO_MATCH
 from estimator.trackers.star_tracker import NO_STARS
 from skysim.apps import plate_solver
 from skysim.apps.plate_solver import solver as searching
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.scene import loader
 from skysim.simulation import exposure, run
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 from skysim.sources import stars
 
 ATTITUDE = Rotation.from_rotvec([0.1, 0.2, 0.3])
@@ -137,7 +137,7 @@ def blind() -> plate_solver.Solver:
     return plate_solver.make_solver(None, None)
 
 
-def photographed(focal: str) -> Testbed:
+def photographed(focal: str) -> Lab:
     """The SHEFEX-2 camera at rest behind a lens."""
     still = {"exposure.frames": "1", "motion.rate_deg_s": "[0, 0, 0]"}
     return run.prepare(loader.load("shefex2", still | {"camera.focal_length": focal}))
@@ -160,11 +160,11 @@ def test_a_rendered_field_is_solved_with_nothing_told(blind: plate_solver.Solver
 def test_smeared_frames_of_a_known_camera_are_placed_by_their_streaks() -> None:
     """14 px of unmodeled smear: error below 100" and consistent with the covariance; round-star fits roll 400" off."""
     fast = {"exposure.frames": "16", "motion.rate_deg_s": "[4.8, 6.4, 0]"}
-    testbed = run.prepare(loader.load("scoreboard", fast))
+    lab = run.prepare(loader.load("scoreboard", fast))
     camera = plate_solver.make_solver(None, SCENES / "shefex2.yaml")
     for n in (5, 15):
-        frame, truth = exposure.render_frame(testbed, n)
-        found = plate_solver.solve_array(frame.image_dn, camera, testbed.scene.start_time)[0].attitude
+        frame, truth = exposure.render_frame(lab, n)
+        found = plate_solver.solve_array(frame.image_dn, camera, lab.scene.start_time)[0].attitude
         assert found.cam_from_ref is not None
         error_rad = (found.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec()
         assert np.abs(error_rad).max() < 100 * ARCSEC_RAD

@@ -10,14 +10,14 @@ from skysim.camera.glow.air_glow import airglow_nl, diffuse_air_mass, seen_place
 from skysim.camera.glow.background import NANOLAMBERT_V0, glow_map
 from skysim.scene.loader import load
 from skysim.scene.sections.light import SkyGlowConfig
-from skysim.simulation.testbed import Testbed, build_testbed, sky_during
+from skysim.simulation.lab import Lab, build_lab, sky_during
 
 SITE = "{latitude_deg: 53.1, longitude_deg: 8.8, height: 10 m}"
 
 
-def bed(time: str, **glow: str) -> Testbed:
+def bed(time: str, **glow: str) -> Lab:
     keys = {"start_time": time, "site": SITE, "light.air.glow.twilight": "true"}
-    return build_testbed(load("shefex2", keys | {f"light.air.{key}": value for key, value in glow.items()}))
+    return build_lab(load("shefex2", keys | {f"light.air.{key}": value for key, value in glow.items()}))
 
 
 def mag_arcsec2(nanolamberts: float) -> float:
@@ -70,20 +70,22 @@ def test_the_moon_lights_the_sky_only_above_the_horizon() -> None:
     mean = {}
     for name, time in (("up", full_up), ("down", full_down)):
         for moonlight in ("true", "false"):
-            testbed = bed(time, **{"glow.moonlight": moonlight, "glow.twilight": "false"})
-            sky = sky_during(testbed, 0.0)
+            lab = bed(time, **{"glow.moonlight": moonlight, "glow.twilight": "false"})
+            sky = sky_during(lab, 0.0)
             assert sky is not None
             moon = sky.altitude_rad(seen_place("moon", sky).direction[None])[0]
             assert (moon > 0) == (name == "up")
-            pointing = up_pointing(testbed)
-            mean[name, moonlight] = float(glow_map((), testbed.optics, pointing, testbed.band, sky_light(sky)).mean())
+            pointing = up_pointing(lab)
+            mean[name, moonlight] = float(
+                glow_map((), lab.camera.optics, pointing, lab.camera.band, sky_light(sky)).mean()
+            )
     assert mean["up", "true"] > 3 * mean["up", "false"]
     assert mean["down", "true"] == mean["down", "false"]
 
 
-def up_pointing(testbed: Testbed) -> Rotation:
+def up_pointing(lab: Lab) -> Rotation:
     """cam_from_icrs of a camera that looks at the zenith."""
-    sky = sky_during(testbed, 0.0)
+    sky = sky_during(lab, 0.0)
     assert sky is not None
     north, east, up = sky.axes
     return Rotation.from_matrix(np.stack([-east, -north, up]))
@@ -91,12 +93,12 @@ def up_pointing(testbed: Testbed) -> Rotation:
 
 @pytest.mark.slow
 def test_below_the_skyline_there_is_no_glow() -> None:
-    testbed = bed("2012-06-24T23:00:00")
-    sky = sky_during(testbed, 0.0)
+    lab = bed("2012-06-24T23:00:00")
+    sky = sky_during(lab, 0.0)
     assert sky is not None
     north, east, up = sky.axes
     level = Rotation.from_matrix(np.stack([east, -up, north]))  # looks north along the ground
-    glow = glow_map((), testbed.optics, level, testbed.band, sky_light(sky))
+    glow = glow_map((), lab.camera.optics, level, lab.camera.band, sky_light(sky))
     half = len(glow) // 2
     assert (glow[:half] > 0).all()
     assert not glow[half + 1 :].any()
@@ -106,9 +108,9 @@ def test_below_the_skyline_there_is_no_glow() -> None:
 @pytest.mark.slow
 def test_dark_glow_is_that_of_the_told_sky() -> None:
     """At the zenith, moonless and at night: as a background of kind sky of the same magnitude."""
-    testbed = bed("2012-12-13T23:00:00", **{"glow.dark_mag_arcsec2": "21", "extinction_mag": "0"})
-    ours = glow_map((), testbed.optics, up_pointing(testbed), testbed.band, sky_light(sky_during(testbed, 0.0)))
+    lab = bed("2012-12-13T23:00:00", **{"glow.dark_mag_arcsec2": "21", "extinction_mag": "0"})
+    ours = glow_map((), lab.camera.optics, up_pointing(lab), lab.camera.band, sky_light(sky_during(lab, 0.0)))
     told = SkyGlowConfig(kind="sky", mag_arcsec2=21)
-    even = glow_map((told,), testbed.optics, up_pointing(testbed), testbed.band)
+    even = glow_map((told,), lab.camera.optics, up_pointing(lab), lab.camera.band)
     center = tuple(size // 2 for size in ours.shape)
     assert ours[center] == pytest.approx(even[center], rel=2e-3)

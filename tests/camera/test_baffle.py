@@ -9,18 +9,17 @@ from scipy import integrate
 from skysim.camera.glow import baffle as stray
 from skysim.camera.glow import earth_glow
 from skysim.camera.glow.baffle import stray_of_bodies_e_s_m2, stray_of_earth_e_s_m2
+from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.scene.sections.camera import BaffleConfig
 from skysim.scene.sections.orbit import EarthConfig
 from skysim.simulation.exposure import render_frame, stray_light_e_s
-from skysim.simulation.testbed import Testbed, bodies_during, build_testbed
-from skysim.sources.orbit.earth import RADIUS_M
+from skysim.simulation.lab import Lab, bodies_during, build_lab
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
-from skysim.sources.solar_system.magnitudes import SUN_MAG
 
 BAND = Band.from_efficiency(0.5)  # flat from 400 to 1000 nm
-IRRADIANCE = float(star_flux_e_s_m2(SUN_MAG, *SUN, BAND))
+IRRADIANCE = float(star_flux_e_s_m2(SUN_V_MAG, *SUN, BAND))
 EVEN = BaffleConfig(angle_deg=(0, 180), pst=(1e-4, 1e-4))
 STEEP = BaffleConfig(angle_deg=(20, 50, 90, 120), pst=(1e-3, 1e-7, 1e-9, 1e-12))
 DARK_EARTH = EarthConfig(albedo=0.3, airglow_mag_arcsec2=30.0)
@@ -31,38 +30,38 @@ ORBIT = "{kind: circular, altitude: 500 km, inclination_deg: 97, raan_deg: 90, e
 @pytest.fixture
 def sphere(monkeypatch: pytest.MonkeyPatch) -> None:
     """A round Earth without air."""
-    monkeypatch.setattr(earth_glow, "TO_SPHERE", np.full(3, 1 / RADIUS_M))
+    monkeypatch.setattr(earth_glow, "TO_SPHERE", np.full(3, 1 / EARTH_RADIUS_M))
     monkeypatch.setattr(earth_glow, "AIR_M", 1.0)
 
 
-def in_space(ra_deg: float, dec_deg: float, **keys: str) -> Testbed:
+def in_space(ra_deg: float, dec_deg: float, **keys: str) -> Lab:
     start = f"{{ra_deg: {ra_deg}, dec_deg: {dec_deg}, roll_deg: 0}}"
     given = {"camera.baffle": TABLE, "motion.start": start, "start_time": "2012-06-24T21:00:00", "background": "[]"}
     overrides = given | {key.replace("__", "."): value for key, value in keys.items()}
-    testbed = build_testbed(loader.load("shefex2", overrides))
-    return testbed.at_rest(testbed.trajectory.lab_from_body[0], 0)
+    lab = build_lab(loader.load("shefex2", overrides))
+    return lab.at_rest(lab.start, 0)
 
 
-def stray_of(testbed: Testbed, t_s: float = 0.0) -> dict[str, float]:
-    cam_from_lab = testbed.mount.cam_from_body * testbed.trajectory.lab_from_body[0].inv()
-    return stray_light_e_s(testbed, bodies_during(testbed, t_s), cam_from_lab, t_s)
+def stray_of(lab: Lab, t_s: float = 0.0) -> dict[str, float]:
+    cam_from_lab = lab.camera.mount.cam_from_body * lab.start.inv()
+    return stray_light_e_s(lab, bodies_during(lab, t_s), cam_from_lab, t_s)
 
 
 def test_the_sun_s_light_is_its_irradiance_times_the_transmittance() -> None:
     """1361 W/m2 of a black body of 5772 K, counted in photons: Kopp & Lean 2011; V = -26.74 gives 4 % more."""
-    testbed = in_space(90.0, -20.0, light__bodies="{moon: false, planets: false}")
-    sun = bodies_during(testbed, 0.0)[0]
+    lab = in_space(90.0, -20.0, light__bodies="{moon: false, planets: false}")
+    sun = bodies_during(lab, 0.0)[0]
     m = np.linalg.norm(np.cross(sun.place.direction, [0.0, np.cos(np.radians(20)), np.sin(np.radians(-20))]))
     angle_deg = np.degrees(np.arcsin(m))
     assert 40 < angle_deg < 50
     wavelength_m = np.linspace(100e-9, 100e-6, 400_001)
     power = wavelength_m**-5 / np.expm1(0.014387769 / (wavelength_m * 5772))
     power *= 1361 / integrate.simpson(power, x=wavelength_m) / 1.0165**2  # aphelion was ten days later
-    response = np.interp(wavelength_m, testbed.band.wavelength_m, testbed.band.response, left=0, right=0)
+    response = np.interp(wavelength_m, lab.camera.band.wavelength_m, lab.camera.band.response, left=0, right=0)
     electrons = integrate.simpson(power * wavelength_m / 1.98644586e-25 * response, x=wavelength_m)
     pst = 10 ** (-3 - 4 * (angle_deg - 20) / 30)
-    expected = electrons * pst * testbed.scene.camera.pixel_m**2
-    assert stray_of(testbed)["sun"] == pytest.approx(expected, rel=0.05)
+    expected = electrons * pst * lab.scene.camera.pixel_m**2
+    assert stray_of(lab)["sun"] == pytest.approx(expected, rel=0.05)
 
 
 @pytest.mark.parametrize("phase_deg", [0.0, 70.0, 130.0])
@@ -70,7 +69,7 @@ def test_a_far_earth_lights_the_chip_as_lambert_s_sphere(sphere: None, phase_deg
     """E PST (2/3) a (R / d)^2 (sin p + (pi - p) cos p) / pi; the airglow is negligible."""
     phase, far = np.radians(phase_deg), 1000.0
     sun_m = 1.5e11 * np.array([np.sin(phase), 0.0, np.cos(phase)])
-    place_m = np.array([0.0, 0.0, far * RADIUS_M])
+    place_m = np.array([0.0, 0.0, far * EARTH_RADIUS_M])
     light = stray_of_earth_e_s_m2(EVEN, DARK_EARTH, place_m, sun_m, np.array([1.0, 0.0, 0.0]), BAND)
     law = (np.sin(phase) + (np.pi - phase) * np.cos(phase)) / np.pi
     assert light == pytest.approx(IRRADIANCE * 1e-4 * 0.3 * 2 / 3 / far**2 * law, rel=0.004)
@@ -82,16 +81,16 @@ def test_a_near_earth_lights_the_chip_as_its_ground_does(sphere: None, sun_deg: 
 
     sun_deg : from the zenith;  boresight_deg : above the horizontal plane
     """
-    place_m, sun, up = np.array([0.0, 0.0, RADIUS_M + 700e3]), np.radians(sun_deg), np.radians(boresight_deg)
+    place_m, sun, up = np.array([0.0, 0.0, EARTH_RADIUS_M + 700e3]), np.radians(sun_deg), np.radians(boresight_deg)
     sun_m = 1.5e11 * np.array([np.sin(sun), 0.0, np.cos(sun)])
     boresight = np.array([0.0, np.cos(up), np.sin(up)])
-    edge = np.arccos(RADIUS_M / place_m[2])
+    edge = np.arccos(EARTH_RADIUS_M / place_m[2])
     colatitude, longitude = (part.ravel() for part in np.meshgrid((np.arange(600) + 0.5) * edge / 600, steps(600)))
     normal = np.column_stack(
         [*(np.sin(colatitude) * np.array([np.cos(longitude), np.sin(longitude)])), np.cos(colatitude)]
     )
-    area_m2 = RADIUS_M**2 * np.sin(colatitude) * (edge / 600) * (2 * np.pi / 600)
-    toward = RADIUS_M * normal - place_m
+    area_m2 = EARTH_RADIUS_M**2 * np.sin(colatitude) * (edge / 600) * (2 * np.pi / 600)
+    toward = EARTH_RADIUS_M * normal - place_m
     d_m = np.linalg.norm(toward, axis=1)
     emission = -np.sum(toward * normal, axis=1) / d_m
     through = 10 ** np.interp(np.degrees(np.arccos(toward @ boresight / d_m)), STEEP.angle_deg, np.log10(STEEP.pst))
@@ -126,8 +125,8 @@ def test_a_frame_has_the_stray_light_in_every_pixel() -> None:
 @pytest.mark.slow
 def test_the_light_follows_the_orbit_and_the_date() -> None:
     """The Sun's is none behind the Earth; the Earth's is strongest over the day side; both change with the season."""
-    testbed = in_space(90.0, 60.0, light__bodies="{}", orbit=ORBIT)
-    around = [stray_of(testbed, t_s) for t_s in range(0, 5670, 210)]
+    lab = in_space(90.0, 60.0, light__bodies="{}", orbit=ORBIT)
+    around = [stray_of(lab, t_s) for t_s in range(0, 5670, 210)]
     assert 0.55 < np.mean(["sun" in one for one in around]) < 1
     earth = np.array([one["earth"] for one in around])
     assert earth.max() > 100 * earth.min()
@@ -138,9 +137,9 @@ def test_the_light_follows_the_orbit_and_the_date() -> None:
 
 def test_a_body_below_the_skyline_gives_no_light() -> None:
     site = {"site": "{latitude_deg: 53, longitude_deg: 9}", "light__air": "{}", "light__bodies": "{planets: false}"}
-    testbed = in_space(250.0, 60.0, **site, start_time="2012-06-24T23:00:00")
-    assert "sun" not in stray_of(testbed)
-    assert stray_of(testbed, 12 * 3600.0)["sun"] > 0
+    lab = in_space(250.0, 60.0, **site, start_time="2012-06-24T23:00:00")
+    assert "sun" not in stray_of(lab)
+    assert stray_of(lab, 12 * 3600.0)["sun"] > 0
 
 
 def test_no_body_gives_no_light() -> None:

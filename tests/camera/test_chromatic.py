@@ -18,7 +18,7 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount, Sources, Trajectory
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
-from skysim.simulation.testbed import bodies_during, build_testbed
+from skysim.simulation.lab import bodies_during, build_lab
 from skysim.sources.orbit.satellites import as_sources, moving_light
 from skysim.sources.photometry import (
     Band,
@@ -171,8 +171,8 @@ CELESTIAL = "{kind: celestial, cap_deg: 10, count: 20, camera: [0 m, 0 m, 0 m], 
 )
 def test_every_light_of_a_scene_has_its_color(scene: str, keys: dict[str, str]) -> None:
     """And is imaged where its mean wavelength is."""
-    testbed = build_testbed(loader.load(scene, keys | {"camera.chromatic": LENS}))
-    sources, config = testbed.sources, testbed.scene.camera
+    lab = build_lab(loader.load(scene, keys | {"camera.chromatic": LENS}))
+    sources, config = lab.camera.sources, lab.scene.camera
     assert sources.chromatic is not None
     assert sources.chromatic.shape == (len(sources), 4)
     assert np.all((sources.chromatic[:, [0, 2]] > 0) & (sources.chromatic[:, [0, 2]] < [40e-6, 1]))
@@ -182,19 +182,19 @@ def test_every_light_of_a_scene_has_its_color(scene: str, keys: dict[str, str]) 
     pose = Poses((Rotation.from_euler("x", 2, degrees=True) * toward).as_matrix()[None], np.zeros((1, 3)))
     first = sources.take(np.arange(1))
     gray = Sources(*(getattr(first, name) for name in Sources.__slots__[:-1]))
-    seen, nominal = (project(one, testbed.optics, pose)[0][0, 0] - config.center_px for one in (first, gray))
+    seen, nominal = (project(one, lab.camera.optics, pose)[0][0, 0] - config.center_px for one in (first, gray))
     np.testing.assert_allclose(seen, nominal * (1 + first.chromatic[0, 2] / config.corner_px), rtol=1e-9, atol=1e-9)
 
 
 def test_bodies_and_satellites_have_their_colors() -> None:
     """Mars is redder than the Sun and Uranus bluer; a satellite is as the Sun."""
     lens = {"camera.chromatic": LENS, "light.bodies": "{}"}
-    testbed = build_testbed(loader.load("shefex2", lens))
-    lights = {body.name: points_of(body, np.zeros((2, 2))).chromatic for body in bodies_during(testbed, 0.0)}
+    lab = build_lab(loader.load("shefex2", lens))
+    lights = {body.name: points_of(body, np.zeros((2, 2))).chromatic for body in bodies_during(lab, 0.0)}
     assert lights["mars"][1, 2] > lights["sun"][1, 2] + 0.02
     assert lights["uranus"][1, 2] < lights["sun"][1, 2] - 0.02
     path = np.array([0.0, 0, 1]), np.zeros((2, 3))
-    satellite = as_sources([moving_light(1, "one", 3.0, path, (500.0, 90.0, 1.0))], testbed.band)
+    satellite = as_sources([moving_light(1, "one", 3.0, path, (500.0, 90.0, 1.0))], lab.camera.band)
     np.testing.assert_allclose(satellite.chromatic, lights["sun"][:1], rtol=1e-12)
 
 

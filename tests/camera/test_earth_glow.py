@@ -7,28 +7,27 @@ import pytest
 
 from skysim.camera.glow import earth_glow
 from skysim.camera.glow.earth_glow import LAYER, earth_radiance
+from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.scene import loader
 from skysim.scene.sections.orbit import EarthConfig
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import build_testbed
-from skysim.sources.orbit.earth import RADIUS_M
+from skysim.simulation.lab import build_lab
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
-from skysim.sources.solar_system.magnitudes import SUN_MAG
 
 BAND = Band.from_efficiency("interline")
-IRRADIANCE = float(star_flux_e_s_m2(SUN_MAG, *SUN, BAND))
+IRRADIANCE = float(star_flux_e_s_m2(SUN_V_MAG, *SUN, BAND))
 DARK = 30.0  # mag arcsec^-2
 
 
 @pytest.fixture
 def sphere(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(earth_glow, "TO_SPHERE", np.full(3, 1 / RADIUS_M))
+    monkeypatch.setattr(earth_glow, "TO_SPHERE", np.full(3, 1 / EARTH_RADIUS_M))
 
 
 @pytest.mark.parametrize("phase_deg", [0.0, 60.0, 120.0])
 def test_the_disc_s_light_is_that_of_a_lambert_sphere(sphere: None, phase_deg: float) -> None:
     """From far away: E (2/3) a (R / d)^2 (sin p + (pi - p) cos p) / pi; the air adds 2 H / R or a little more."""
-    far_m, phase = 200 * RADIUS_M, np.radians(phase_deg)
+    far_m, phase = 200 * EARTH_RADIUS_M, np.radians(phase_deg)
     edge = np.arcsin(1.02 / 200)
     axis = (np.arange(400) + 0.5) / 200 - 1
     x, y = (part.ravel() * edge for part in np.meshgrid(axis, axis))
@@ -43,7 +42,7 @@ def test_the_disc_s_light_is_that_of_a_lambert_sphere(sphere: None, phase_deg: f
 
 
 def test_the_airglow_is_brightest_at_the_bottom_of_its_layer(sphere: None) -> None:
-    place, night = np.array([0.0, 0.0, 1.1 * RADIUS_M]), np.array([0.0, 0.0, -1.5e11])
+    place, night = np.array([0.0, 0.0, 1.1 * EARTH_RADIUS_M]), np.array([0.0, 0.0, -1.5e11])
     impact = np.array([0.0, *LAYER, 1.05])
     nadir = np.arcsin(impact / 1.1)
     toward = np.column_stack([np.sin(nadir), np.zeros(4), -np.cos(nadir)])
@@ -57,7 +56,7 @@ def test_the_airglow_is_brightest_at_the_bottom_of_its_layer(sphere: None) -> No
 @pytest.mark.slow
 def test_the_limb_is_where_its_dip_says() -> None:
     """From 500 km above the equator, looking 2 degrees above the horizon ahead: the ground's edge is so far off."""
-    dip_deg = np.degrees(np.arccos(RADIUS_M / (RADIUS_M + 500e3)))
+    dip_deg = np.degrees(np.arccos(EARTH_RADIUS_M / (EARTH_RADIUS_M + 500e3)))
     keys = {
         "orbit": "{kind: circular, altitude: 500 km, inclination_deg: 0, argument_deg: 0, earth: {albedo: 0.3}}",
         "motion.start": f"{{ra_deg: {90 + dip_deg - 2:.9f}, dec_deg: 0, roll_deg: 90}}",
@@ -67,10 +66,10 @@ def test_the_limb_is_where_its_dip_says() -> None:
         "exposure.time": "10 us",
         "background": "[]",
     }
-    testbed = build_testbed(loader.load("shefex2", keys | {"start_time": "2012-06-22T09:00:00"}))
-    testbed = testbed.at_rest(testbed.trajectory.lab_from_body[0], 0)
-    frame, _ = render_frame(testbed, 0)
-    camera, image = testbed.scene.camera, frame.image_dn
+    lab = build_lab(loader.load("shefex2", keys | {"start_time": "2012-06-22T09:00:00"}))
+    lab = lab.at_rest(lab.start, 0)
+    frame, _ = render_frame(lab, 0)
+    camera, image = lab.scene.camera, frame.image_dn
     middle = image[:, round(camera.center_px[0])] - image.min()
     assert middle.max() > 0
     rows = np.flatnonzero(middle > middle.max() / 2)

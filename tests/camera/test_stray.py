@@ -19,7 +19,7 @@ from skysim.scene.sections.leds import CosineLobeConfig
 from skysim.scene.sections.light import ReflectionConfig
 from skysim.simulation import run
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 from skysim.sources.dome.reflection.dome import ReflectingDome
 from skysim.sources.dome.reflection.interreflection import diffuse_light, spiral
 from skysim.sources.dome.shell.surface import Ellipsoid
@@ -75,7 +75,7 @@ def test_reflections_are_in_the_frame_and_its_truth() -> None:
     lights = truth.sources
     false = lights.id > MIRRORED
     assert false.sum() >= 5
-    assert set(lights.id[false] % MIRRORED) <= set(build_testbed(loader.load("apl_dome", DEEP)).sources.id)
+    assert set(lights.id[false] % MIRRORED) <= set(build_lab(loader.load("apl_dome", DEEP)).sources.id)
     gain = loader.load("apl_dome").camera.detector.gain_e_dn
     assert gained.sum() * gain == pytest.approx(lights.electrons[false].sum(), rel=2e-3)
     for n in np.flatnonzero(false):

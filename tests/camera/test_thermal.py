@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics
 from skysim.camera.thermal import Hardware, at_time, temperature_c
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Mount, Sources
 from skysim.scene import loader
 from skysim.scene.sections.thermal import ThermalConfig
@@ -86,16 +86,16 @@ def test_boresight_drifts_by_its_coefficient_in_the_truth() -> None:
         "exposure.rate_hz": "1",
         "camera.detector.noise": "false",
     }
-    testbed = run.prepare(loader.load("shefex2", settings))
+    lab = run.prepare(loader.load("shefex2", settings))
     for index in range(3):
-        _, truth = render_frame(testbed, index)
-        nominal = testbed.mount.cam_from_body * truth.lab_from_body.inv()
+        _, truth = render_frame(lab, index)
+        nominal = lab.camera.mount.cam_from_body * truth.lab_from_body.inv()
         drift_k = -1 + truth.t_s  # 2 K an hour, 1800 times as fast
         turned = (truth.cam_from_lab * nominal.inv()).as_rotvec() / ARCSEC_RAD
         np.testing.assert_allclose(turned, np.array([300.0, -200.0, 100.0]) * drift_k, atol=1e-6)
-        stars = testbed.sources.take(np.isin(testbed.sources.id, truth.sources.id))
+        stars = lab.camera.sources.take(np.isin(lab.camera.sources.id, truth.sources.id))
         rows = np.searchsorted(truth.sources.id, stars.id, sorter=np.argsort(truth.sources.id))
-        xy_px = testbed.optics.project(truth.cam_from_lab.apply(stars.place[:, :3]))
+        xy_px = lab.camera.optics.project(truth.cam_from_lab.apply(stars.place[:, :3]))
         found = truth.sources.xy_px[np.argsort(truth.sources.id)[rows]]
         np.testing.assert_allclose(found, xy_px, atol=1e-6)
 

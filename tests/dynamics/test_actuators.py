@@ -13,7 +13,9 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.dynamics.actuators import STEERING, CmgSet, Desaturator, FanSet, WheelSet
+from skysim.dynamics.multibody.actuators.cmgs import STEERING, CmgSet
+from skysim.dynamics.multibody.actuators.fans import Desaturator, FanSet
+from skysim.dynamics.multibody.actuators.wheels import WheelSet
 from skysim.scene.sections.motion import DesaturationConfig
 
 BUS = np.array([[3.0, 0.2, -0.1], [0.2, 4.0, 0.3], [-0.1, 0.3, 5.0]])  # kg m2, less the rotors about their axles
@@ -277,7 +279,7 @@ def test_away_from_singularities_both_ways_of_steering_agree():
 
 def test_the_robust_inverse_is_wie_s_at_any_time():
     """A^T (A A^T + lambda E)^-1: E is 1 on the diagonal, e_i = 0.01 sin(pi t / 2 + phase_i) off it."""
-    plain, rng = interpreted("skysim.dynamics.actuators"), np.random.default_rng(4)
+    plain, rng = interpreted("skysim.dynamics.multibody.actuators.cmgs"), np.random.default_rng(4)
     for t_s in (0.0, 0.3, 1.1, 2.6):
         jacobian, asked = 0.3 * rng.normal(size=(3, 4)), rng.normal(size=3)
         e_1, e_2, e_3 = 0.01 * np.sin(np.pi * t_s / 2 + np.array([0, np.pi / 2, np.pi]))

@@ -241,11 +241,11 @@ def test_an_unbalanced_bearing_needs_the_integral(law: str) -> None:
         "motion.maneuver": "[]",
         "exposure": "{time: 10 ms, rate_hz: 1, frames: 1, first: 25 s}",
     }
-    testbed = run.prepare(loader.load("afit_simsat", out_of_balance))
-    assert testbed.telemetry is not None
-    left_deg = np.degrees(testbed.telemetry.lab_from_body[-1].as_rotvec())
+    lab = run.prepare(loader.load("afit_simsat", out_of_balance))
+    assert lab.telemetry is not None
+    left_deg = np.degrees(lab.telemetry.lab_from_body[-1].as_rotvec())
     tilt = math.radians(1.03)
     expected = {"pd": -1.03 * math.cos(tilt), "pid": 0.0}[law]  # towards the heavy side
     np.testing.assert_allclose(left_deg, [expected, 0, 0], rtol=0, atol=1e-4)
-    torque = testbed.telemetry.torque_nm[-1]
+    torque = lab.telemetry.torque_nm[-1]
     np.testing.assert_allclose(torque, [WEIGHT_N * OFFSET_M * math.cos(expected * tilt), 0, 0], atol=1e-5)

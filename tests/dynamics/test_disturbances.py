@@ -17,7 +17,7 @@ from skysim.dynamics.imu import earth_rate_lab_rad_s
 from skysim.scene import loader
 from skysim.scene.sections.vehicle import AirCurrentConfig, DisturbancesConfig, SiteConfig
 from skysim.simulation import run
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 
 AXES = Rotation.from_rotvec([0.2, -0.4, 0.3]).as_matrix()
 TENSOR = AXES @ np.diag([6.0, 6.5, 9.0]) @ AXES.T  # of a vehicle whose principal axes are not the body's
@@ -26,7 +26,7 @@ BALANCED = {"vehicle.center_of_mass": "[0 m, 0 m, 0 m]", "motion.control": "none
 QUIET = DisturbancesConfig()
 
 
-def flown(duration_s: float, **changes: str) -> Testbed:
+def flown(duration_s: float, **changes: str) -> Lab:
     """SimSat, balanced and flown by nobody."""
     until = {"exposure": f"{{time: 10 ms, rate_hz: 1, frames: 1, first: {duration_s - 0.012} s}}"}
     given = BALANCED | until | {key.replace("__", "."): value for key, value in changes.items()}
@@ -99,13 +99,13 @@ def test_a_steady_wind_and_the_turbine_blow_along_the_lab_s_axes() -> None:
 
 def test_turbine_spins_a_vehicle_up() -> None:
     """w = T t / J about z: 2e-3 N m for 4 s on 9 kg m2."""
-    testbed = flown(4.0, vehicle__disturbances="{turbine: [0 N m, 0 N m, 2 mN m]}")
-    expected = 2e-3 / 9 * testbed.trajectory.t_s[-1]
-    np.testing.assert_allclose(testbed.trajectory.rate_body_rad_s[-1], [0, 0, expected], rtol=1e-9, atol=1e-12)
-    assert testbed.telemetry is not None
+    lab = flown(4.0, vehicle__disturbances="{turbine: [0 N m, 0 N m, 2 mN m]}")
+    expected = 2e-3 / 9 * lab.trajectory.t_s[-1]
+    np.testing.assert_allclose(lab.trajectory.rate_body_rad_s[-1], [0, 0, expected], rtol=1e-9, atol=1e-12)
+    assert lab.telemetry is not None
     np.testing.assert_allclose(
-        testbed.telemetry.disturbance_nm,
-        np.tile([0, 0, 2e-3], (400, 1))[: len(testbed.telemetry.t_s)],
+        lab.telemetry.disturbance_nm,
+        np.tile([0, 0, 2e-3], (400, 1))[: len(lab.telemetry.t_s)],
         atol=1e-12,
     )
 
@@ -176,9 +176,9 @@ def test_a_flown_vehicle_feels_the_earth_turn() -> None:
     """Let go with no turn among the stars, it turns in the lab with -15.04 deg/h about the Earth's axis."""
     earth = earth_rate_lab_rad_s(SiteConfig(latitude_deg=39.8, x_azimuth_deg=90))
     rate = str((-np.degrees(earth)).tolist())
-    testbed = flown(20.0, vehicle__disturbances="{earth_rotation: true}", motion__rate_deg_s=rate)
-    t_s = testbed.trajectory.t_s[-1]
-    turned = testbed.trajectory.lab_from_body[-1].as_rotvec()
+    lab = flown(20.0, vehicle__disturbances="{earth_rotation: true}", motion__rate_deg_s=rate)
+    t_s = lab.trajectory.t_s[-1]
+    turned = lab.trajectory.lab_from_body[-1].as_rotvec()
     np.testing.assert_allclose(turned, -earth * t_s, rtol=0, atol=1e-6 * np.linalg.norm(earth) * t_s)
     spinning = '{start_rpm: [3000, 0, 0], torque_limit: "0.5 N m"}'
     pushed = flown(2.0, vehicle__disturbances="{earth_rotation: true}", vehicle__wheels=spinning)
@@ -202,10 +202,10 @@ def bump(**more: str) -> str:
 
 def test_a_knock_changes_the_rate_by_what_the_scene_says() -> None:
     """On a sphere about three axes at once, beginning and ending within steps and ticks."""
-    testbed = flown(0.5, motion__maneuver=f"[{HOLD}, {bump()}]", **SPHERE)
-    rate = np.degrees(testbed.trajectory.rate_body_rad_s)
+    lab = flown(0.5, motion__maneuver=f"[{HOLD}, {bump()}]", **SPHERE)
+    rate = np.degrees(lab.trajectory.rate_body_rad_s)
     np.testing.assert_allclose(rate[-1], [3, -2, 14], rtol=1e-6, atol=0)
-    t_s = testbed.trajectory.t_s
+    t_s = lab.trajectory.t_s
     assert (rate[t_s < 0.1234] == 0).all()
     # A half-sine: its integral is (1 - cos(pi x)) / 2 of the whole. Every step has its exact share.
     x = np.clip((t_s - 0.1234) / 0.040, 0, 1)
@@ -216,15 +216,15 @@ def test_a_knock_changes_the_rate_by_what_the_scene_says() -> None:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_knock_is_felt_by_each_moment_of_inertia(axis: int) -> None:
     rate = (5.0 * np.eye(3)[axis]).tolist()
-    testbed = flown(0.3, motion__maneuver=f'[{{kind: bump, rate_deg_s: {rate}, duration: "30 ms"}}]')
-    np.testing.assert_allclose(np.degrees(testbed.trajectory.rate_body_rad_s[-1]), rate, rtol=1e-6, atol=1e-12)
+    lab = flown(0.3, motion__maneuver=f'[{{kind: bump, rate_deg_s: {rate}, duration: "30 ms"}}]')
+    np.testing.assert_allclose(np.degrees(lab.trajectory.rate_body_rad_s[-1]), rate, rtol=1e-6, atol=1e-12)
 
 
 def test_a_caught_vehicle_is_at_rest_again_and_somewhere_else() -> None:
     """Turned by rate times the time between the knocks: 14.5 deg/s for 0.2 s, 2.9 deg."""
-    testbed = flown(0.6, motion__maneuver=f"[{HOLD}, {bump(caught_after='0.2 s')}]", **SPHERE)
-    assert np.degrees(np.abs(testbed.trajectory.rate_body_rad_s[-1])).max() < 1e-6
-    turned = np.degrees(testbed.trajectory.lab_from_body[-1].as_rotvec())
+    lab = flown(0.6, motion__maneuver=f"[{HOLD}, {bump(caught_after='0.2 s')}]", **SPHERE)
+    assert np.degrees(np.abs(lab.trajectory.rate_body_rad_s[-1])).max() < 1e-6
+    turned = np.degrees(lab.trajectory.lab_from_body[-1].as_rotvec())
     np.testing.assert_allclose(turned, np.array([3, -2, 14]) * 0.2, rtol=1e-6, atol=0)
 
 

@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 from skysim.core import quaternion
 from skysim.core.types import Floats, Telemetry
 from skysim.dynamics import multibody
-from skysim.dynamics.flight_computer import ControlInput, FlightComputer
+from skysim.dynamics.flight_computer import FlightComputer
 from skysim.dynamics.guidance import plan
+from skysim.dynamics.multibody.actuators.kind import ControlInput
 from skysim.scene import loader
 from skysim.simulation import run
 

@@ -15,11 +15,10 @@ import pytest
 from scipy.integrate import quad_vec
 from scipy.spatial.transform import Rotation
 
+from skysim.core.constants import EARTH_RATE_RAD_S, STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics.imu import (
-    EARTH_RATE_RAD_S,
-    STANDARD_GRAVITY_M_S2,
     Imu,
     Increments,
     Navigator,

@@ -18,7 +18,7 @@ from skysim.dynamics.multibody.occlusion import behind_wall
 from skysim.scene import loader
 from skysim.scene.sections import light
 from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.lab import Lab, build_lab
 from skysim.sources.dome.shell import surface
 from skysim.sources.dome.shell.surface import Surface
 
@@ -46,11 +46,11 @@ def mast(place_m: Floats) -> str:
     return f'<geom type="box" pos="{words(place_m)}" quat="{quat}" size="{words(MAST_HALF_M)}" mass="0.1"/>'
 
 
-def furnished(folder: Path, mjcf: str, **changes: str) -> Testbed:
+def furnished(folder: Path, mjcf: str, **changes: str) -> Lab:
     """The lab of afit_simsat with another vehicle, whose body stands at its start throughout."""
     (folder / "vehicle.xml").write_text(mjcf, encoding="utf-8")
     given = QUIET | {"vehicle.model": str(folder / "vehicle.xml")}
-    return build_testbed(loader.load("afit_simsat", given | {k.replace("__", "."): v for k, v in changes.items()}))
+    return build_lab(loader.load("afit_simsat", given | {k.replace("__", "."): v for k, v in changes.items()}))
 
 
 def on_bus(geom: str) -> str:
@@ -66,21 +66,21 @@ def crosses(begin_m: Floats, end_m: Floats, middle_m: Floats) -> np.ndarray:
     return np.asarray((enters < leaves) & (leaves > 0) & (enters < 1))
 
 
-def picture(testbed: Testbed) -> tuple[bytes, set[int], Any]:
-    frame, truth = exposure.render_frame(testbed, 0)
+def picture(lab: Lab) -> tuple[bytes, set[int], Any]:
+    frame, truth = exposure.render_frame(lab, 0)
     return frame.image_dn.tobytes(), set(truth.sources.id.tolist()), truth
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("start", STARTS)
 def test_a_mast_on_the_vehicle_hides_just_the_leds_behind_it(start: str, tmp_path: Path) -> None:
-    testbed = furnished(tmp_path, on_bus(mast(MAST_M)), motion__start=start)
+    lab = furnished(tmp_path, on_bus(mast(MAST_M)), motion__start=start)
     bare = furnished(tmp_path, on_bus(mast(MAST_M)), motion__start=start, light__occlusion="false")
-    _, seen, truth = picture(testbed)
+    _, seen, truth = picture(lab)
     everything = picture(bare)[1]
     to_body = truth.lab_from_body.inv()
-    behind = crosses(testbed.mount.camera_body_m, to_body.apply(testbed.sources.place[:, :3]), MAST_M)
-    gone = set(testbed.sources.id[behind].tolist())
+    behind = crosses(lab.camera.mount.camera_body_m, to_body.apply(lab.camera.sources.place[:, :3]), MAST_M)
+    gone = set(lab.camera.sources.id[behind].tolist())
     assert seen == everything - gone
     # Those beyond the border whose blur reaches in are on the frame, but not on the chip.
     assert set(truth.hidden.tolist()) <= gone & everything
@@ -88,9 +88,9 @@ def test_a_mast_on_the_vehicle_hides_just_the_leds_behind_it(start: str, tmp_pat
     assert len(picture(bare)[2].hidden) == 0
     assert len(everything & gone) >= 4
     assert len(seen) >= 10
-    assert testbed.obstacles is not None
+    assert lab.camera.obstacles is not None
     np.testing.assert_array_equal(
-        multibody.occluded(testbed.obstacles, truth.lab_from_body, testbed.sources.place), behind
+        multibody.occluded(lab.camera.obstacles, truth.lab_from_body, lab.camera.sources.place), behind
     )
 
 
@@ -99,12 +99,12 @@ def test_a_beam_of_the_lab_stays_while_the_vehicle_turns(tmp_path: Path) -> None
     beam = SIMSAT.replace("<worldbody>", f"<worldbody>{mast(MAST_M)}", 1)
     counts = []
     for start in ["{yaw_deg: 0}", "{roll_deg: 3, yaw_deg: 60}", "{roll_deg: 20}"]:
-        testbed = furnished(tmp_path, beam, motion__start=start)
-        lab_from_body = testbed.trajectory.lab_from_body[0]
-        assert testbed.obstacles is not None
-        found = multibody.occluded(testbed.obstacles, lab_from_body, testbed.sources.place)
-        camera_m = lab_from_body.apply(testbed.mount.camera_body_m)
-        behind = crosses(camera_m, testbed.sources.place[:, :3], MAST_M)
+        lab = furnished(tmp_path, beam, motion__start=start)
+        lab_from_body = lab.start
+        assert lab.camera.obstacles is not None
+        found = multibody.occluded(lab.camera.obstacles, lab_from_body, lab.camera.sources.place)
+        camera_m = lab_from_body.apply(lab.camera.mount.camera_body_m)
+        behind = crosses(camera_m, lab.camera.sources.place[:, :3], MAST_M)
         np.testing.assert_array_equal(found, behind)
         counts.append(int(behind.sum()))
     assert min(counts) >= 4
@@ -124,8 +124,8 @@ def test_where_nothing_is_in_the_way_the_frame_is_the_same_bit_for_bit(tmp_path:
 
 
 def test_it_is_on_unless_the_scene_says_otherwise() -> None:
-    assert build_testbed(loader.load("afit_simsat")).obstacles is not None
-    assert build_testbed(loader.load("afit_simsat", {"light.occlusion": "false"})).obstacles is None
+    assert build_lab(loader.load("afit_simsat")).obstacles is not None
+    assert build_lab(loader.load("afit_simsat", {"light.occlusion": "false"})).obstacles is None
 
 
 LENS = '<geom type="cylinder" size="0.022 0.015" pos="0 0 0.065" mass="0.2" rgba="0.05 0.05 0.06 1"/>'
@@ -157,15 +157,15 @@ def test_stars_are_hidden_by_the_body_that_they_are_behind() -> None:
 
     A ray u from the origin meets it where the discriminant of |(s u - c) / a|^2 = 1 is not negative, ahead.
     """
-    testbed = build_testbed(loader.load("shefex2"))
+    lab = build_lab(loader.load("shefex2"))
     center, axes = np.array([0.0, 0.0, -0.8]), np.array([0.25, 0.25, 0.6])
-    assert testbed.obstacles is not None
-    turn = testbed.trajectory.lab_from_body[0]
-    rays = turn.inv().apply(testbed.sources.place[:, :3]) / axes
+    assert lab.camera.obstacles is not None
+    turn = lab.start
+    rays = turn.inv().apply(lab.camera.sources.place[:, :3]) / axes
     along = rays @ (center / axes)
     root = along**2 - np.sum(rays**2, axis=1) * (np.sum((center / axes) ** 2) - 1)
     behind = (root >= 0) & (along > 0)
-    np.testing.assert_array_equal(multibody.occluded(testbed.obstacles, turn, testbed.sources.place), behind)
+    np.testing.assert_array_equal(multibody.occluded(lab.camera.obstacles, turn, lab.camera.sources.place), behind)
     assert 100 < behind.sum() < len(behind) / 4
 
 
@@ -219,10 +219,10 @@ def test_gimbals_stand_where_they_are_at_the_start() -> None:
 
 
 def test_no_source_is_no_question() -> None:
-    testbed = build_testbed(loader.load("afit_simsat"))
-    assert testbed.obstacles is not None
-    no_sources = testbed.sources.take(np.zeros(0, np.int64))
-    assert multibody.occluded(testbed.obstacles, Rotation.identity(), no_sources.place).shape == (0,)
+    lab = build_lab(loader.load("afit_simsat"))
+    assert lab.camera.obstacles is not None
+    no_sources = lab.camera.sources.take(np.zeros(0, np.int64))
+    assert multibody.occluded(lab.camera.obstacles, Rotation.identity(), no_sources.place).shape == (0,)
 
 
 # --- the dome's wall ----------------------------------------------------------------------------------------
@@ -280,21 +280,21 @@ def test_a_wall_hides_what_its_scene_says(tmp_path: Path) -> None:
     beside = SIMSAT.replace('name="star_camera" pos="0 0 0.081"', 'name="star_camera" pos="0.5 0 0.0"')
     drum = "{kind: cylinder, axis: z, apex: 3 m, radius: 0.4 m, length: 2.4 m}"
     layout = "{kind: listed, cap_deg: 40, positions: [[-0.4 m, 0 m, 0.8 m], [-0.4 m, 0 m, 2.8 m]]}"
-    testbed = furnished_drum(tmp_path, beside, drum, layout)
-    assert testbed.obstacles is not None
+    lab = furnished_drum(tmp_path, beside, drum, layout)
+    assert lab.camera.obstacles is not None
     # At the near wall, 1/9 of the way over, the sights are 0.36 m and 0.58 m high; the wall begins at 0.6 m.
-    level = multibody.occluded(testbed.obstacles, Rotation.identity(), testbed.sources.place)
+    level = multibody.occluded(lab.camera.obstacles, Rotation.identity(), lab.camera.sources.place)
     np.testing.assert_array_equal(level, [False, False])
     # Farther out, at 1 m, half of the way: 0.55 m and 1.55 m.
     far = SIMSAT.replace('name="star_camera" pos="0 0 0.081"', 'name="star_camera" pos="1.2 0 0.0"')
-    testbed = furnished_drum(tmp_path, far, drum, layout)
-    assert testbed.obstacles is not None
+    lab = furnished_drum(tmp_path, far, drum, layout)
+    assert lab.camera.obstacles is not None
     np.testing.assert_array_equal(
-        multibody.occluded(testbed.obstacles, Rotation.identity(), testbed.sources.place), [False, True]
+        multibody.occluded(lab.camera.obstacles, Rotation.identity(), lab.camera.sources.place), [False, True]
     )
 
 
-def furnished_drum(folder: Path, mjcf: str, drum: str, layout: str) -> Testbed:
+def furnished_drum(folder: Path, mjcf: str, drum: str, layout: str) -> Lab:
     (folder / "vehicle.xml").write_text(mjcf, encoding="utf-8")
     given = {"vehicle.model": str(folder / "vehicle.xml"), "light.surface": drum, "light.layout": layout}
-    return build_testbed(loader.load("afit_simsat", given))
+    return build_lab(loader.load("afit_simsat", given))

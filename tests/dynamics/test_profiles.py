@@ -10,9 +10,9 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.io import text
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.dynamics.guidance import plan, profile_start
 from skysim.dynamics.profiles.load import read_profile
 from skysim.dynamics.profiles.samples import MAX_SAMPLES, Samples, check_samples

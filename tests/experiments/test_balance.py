@@ -21,16 +21,16 @@ from skysim.experiments.balance.procedure import Plan
 from skysim.experiments.configs import with_config
 from skysim.scene import loader
 from skysim.scene.scene import Scene
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 
 SIGMA_RAD = 5e-5
 UNCERTAINTY = assumptions.parse_uncertainty("10%", "500 um", "0.1%", "0.03 deg", 1.0)
 BALANCE = Plan("wheels", 8.0, 5e-5, 4, True)
 
 
-def noisy_truth(testbed: Testbed, watch: object) -> list[tuple[float, Rotation, Floats, Floats]]:
+def noisy_truth(lab: Lab, watch: object) -> list[tuple[float, Rotation, Floats, Floats]]:
     """The attitudes of a tracker of 10 arcsec, in place of rendered and solved frames: two a second, none shared."""
-    log, rng = testbed.log, random_stream(testbed.scene.seed, 999)
+    log, rng = lab.log, random_stream(lab.scene.seed, 999)
     every = round(0.5 / log.period_s)
     turned = Rotation.from_rotvec(SIGMA_RAD * rng.standard_normal((len(log.t_s[::every]), 3)))
     attitudes = log.lab_from_body[::every] * turned

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from skysim.core.time import tt_jd
 from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.orbit import earth, elements, satellites
 from skysim.sources.solar_system import magnitudes, observer, places
@@ -89,11 +90,11 @@ def test_satellites_are_skyfield_s(skyfield: Skyfield, tmp_path: Path) -> None:
         their_time = skyfield.time.from_datetime(time.replace(tzinfo=datetime.UTC))
         seen = (skyfield.bodies["earth"] + theirs).at(their_time)
         place_m = elements.gcrs_states(ours, time, np.zeros(1))[0][:, 0]
-        lit = earth.sunlit_fraction(place_m, earth.sun_m(observer.tt_jd(time)))
+        lit = earth.sunlit_fraction(place_m, earth.sun_m(tt_jd(time)))
 
         def site_at(after_s: float, time: datetime.datetime = time) -> observer.GcrsState:
             then = time + datetime.timedelta(seconds=after_s)
-            return observer.site_in_gcrs(then, observer.tt_jd(then), site)
+            return observer.site_in_gcrs(then, tt_jd(then), site)
 
         for n in range(len(ours.numbers)):
             satellite = EarthSatellite(lines[2 * n], lines[2 * n + 1], ts=skyfield.time)

@@ -18,7 +18,7 @@ from skysim.core.paths import ROOT
 from skysim.results import scoring
 from skysim.scene import loader
 from skysim.simulation import run
-from skysim.simulation.testbed import build_testbed, build_tracker
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.tracking.external import interface
 from skysim.tracking.external import tetra3rs as tetra3rs_tracker
 from skysim.tracking.external.interface import Setup
@@ -42,9 +42,9 @@ def test_it_solves_our_frames_without_a_bias(options: str) -> None:
     """Twelve fields; proper motion and aberration (20 arcsec) are both its own, so what is left is noise."""
     keys = {"tracker.name": "tetra3rs", "tracker.options": options, "exposure.frames": "12"}
     told = loader.load("scoreboard", keys | {"motion.rate_deg_s": "[0.6, 0.8, 0]"})
-    testbed = run.prepare(told)
-    shots = list(run.run(testbed, build_tracker(testbed)))
-    rows = [scoring.row(shot, told, testbed.mount) for shot in shots]
+    lab = run.prepare(told)
+    shots = list(run.run(lab, build_tracker(lab.camera)))
+    rows = [scoring.row(shot, told, lab.camera.mount) for shot in shots]
     assert sum(row.status == "solved" for row in rows) >= 11
     assert not any(row.wrong for row in rows)
     turns = [
@@ -58,7 +58,7 @@ def test_it_solves_our_frames_without_a_bias(options: str) -> None:
 @pytest.mark.parametrize("name", ["afit_simsat", "collimated_display"])
 def test_it_refuses_what_is_no_sky(name: str) -> None:
     with pytest.raises(InputError, match=re.escape("tetra3rs solves star fields only")):
-        build_tracker(build_testbed(loader.load(name, {"tracker.name": "tetra3rs"})))
+        build_tracker(build_lab(loader.load(name, {"tracker.name": "tetra3rs"})).camera)
 
 
 PAGE = (ROOT / "docs/howto/external_tracker.md").read_text(encoding="utf-8")

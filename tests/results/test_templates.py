@@ -15,7 +15,7 @@ from skysim.core.types import Floats
 from skysim.results.files.builder import templates
 from skysim.results.files.builder.drawing import Drawing, Text, to_dxf
 from skysim.scene import loader
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.lab import Lab, build_lab
 from skysim.sources.dome.shell.surface import Ellipsoid, Plane
 
 RADIUS_M = 1.2
@@ -28,8 +28,8 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 
 @pytest.fixture(scope="module")
-def testbed() -> Testbed:
-    return build_testbed(loader.load("afit_simsat", DOME | {"motion.maneuver": "[]", "motion.control": "null"}))
+def lab() -> Lab:
+    return build_lab(loader.load("afit_simsat", DOME | {"motion.maneuver": "[]", "motion.control": "null"}))
 
 
 def rays(count: int) -> Floats:
@@ -53,10 +53,10 @@ def test_a_flat_panel_is_its_own_paper() -> None:
     assert paper_m == pytest.approx(place_m[:, 1::-1], abs=1e-12)
 
 
-def test_the_printed_leds_are_where_the_scene_has_them(testbed: Testbed) -> None:
+def test_the_printed_leds_are_where_the_scene_has_them(lab: Lab) -> None:
     """Each circle, measured from its gore's apex, names its LED's direction from the bearing."""
-    place_m = dict(zip(testbed.sources.id.tolist(), testbed.sources.place[:, :3], strict=True))
-    root = ElementTree.fromstring(templates.template(testbed, ".svg"))
+    place_m = dict(zip(lab.camera.sources.id.tolist(), lab.camera.sources.place[:, :3], strict=True))
+    root = ElementTree.fromstring(templates.template(lab, ".svg"))
     assert root.get("width") == f"{root.get('viewBox', '').split()[2]}mm"
     gores, seen = 0, set()
     for element, after in zip(root, [*root[3:], None, None, None], strict=True):
@@ -80,14 +80,14 @@ def test_the_printed_leds_are_where_the_scene_has_them(testbed: Testbed) -> None
     assert seen == place_m.keys()
 
 
-def test_the_pattern_to_cut_is_that_to_print(testbed: Testbed, tmp_path: Path) -> None:
+def test_the_pattern_to_cut_is_that_to_print(lab: Lab, tmp_path: Path) -> None:
     """DXF as ezdxf reads it, whose y points up from the sheet's lower edge, against the SVG of the same gores."""
     path = tmp_path / "gores.dxf"
-    path.write_text(templates.template(testbed, ".dxf"))
+    path.write_text(templates.template(lab, ".dxf"))
     document = ezdxf.readfile(path)
     assert (document.dxfversion, document.header["$INSUNITS"]) == ("AC1009", 4)
     assert not document.audit().errors
-    root = ElementTree.fromstring(templates.template(testbed, ".svg"))
+    root = ElementTree.fromstring(templates.template(lab, ".svg"))
     height_mm = float(str(root.get("viewBox")).split()[3])
     drawn = document.modelspace()
     circles = [(c.dxf.center.x, height_mm - c.dxf.center.y, c.dxf.radius) for c in drawn.query("CIRCLE[layer=='LEDS']")]
@@ -119,8 +119,8 @@ def test_words_of_a_cutting_pattern_are_ascii() -> None:
     assert "gr\\U+00F6\\U+00DFer\\U+2033" in text
 
 
-def test_the_mesh_is_the_surface_with_a_mark_at_each_led(testbed: Testbed) -> None:
-    objects = re.split(r"^o ", templates.template(testbed, ".obj"), flags=re.M)[1:]
+def test_the_mesh_is_the_surface_with_a_mark_at_each_led(lab: Lab) -> None:
+    objects = re.split(r"^o ", templates.template(lab, ".obj"), flags=re.M)[1:]
     vertices = {
         one.split("\n", 1)[0]: np.array([line.split()[1:] for line in one.split("\n") if line.startswith("v ")], float)
         for one in objects
@@ -128,8 +128,8 @@ def test_the_mesh_is_the_surface_with_a_mark_at_each_led(testbed: Testbed) -> No
     shell_mm = vertices.pop("shell")
     assert np.linalg.norm(shell_mm, axis=1) == pytest.approx(1e3 * RADIUS_M, abs=1e-3)
     assert np.degrees(np.arccos(shell_mm[:, 2].min() / 1200)) == pytest.approx(35, abs=0.01)
-    assert set(vertices) == {f"led_{number}" for number in testbed.sources.id}
-    for number, place in zip(testbed.sources.id, testbed.sources.place, strict=True):
+    assert set(vertices) == {f"led_{number}" for number in lab.camera.sources.id}
+    for number, place in zip(lab.camera.sources.id, lab.camera.sources.place, strict=True):
         mark_mm = vertices[f"led_{number}"]
         assert mark_mm[:3].mean(axis=0) == pytest.approx(1e3 * place[:3], abs=1e-3)
         assert np.linalg.norm(mark_mm[3]) == pytest.approx(1204, abs=1e-3)
@@ -139,9 +139,9 @@ def test_the_mesh_is_the_surface_with_a_mark_at_each_led(testbed: Testbed) -> No
     assert set(used) == set(range(1, len(shell_mm) + 4 * len(vertices) + 1))
 
 
-def test_every_face_looks_inward_or_out_of_its_mark(testbed: Testbed) -> None:
+def test_every_face_looks_inward_or_out_of_its_mark(lab: Lab) -> None:
     """The shell is seen from inside, a mark from all sides: its volume is positive."""
-    lines = templates.template(testbed, ".obj").split("\n")
+    lines = templates.template(lab, ".obj").split("\n")
     points = np.array([line.split()[1:] for line in lines if line.startswith("v ")], float)
     corners = [np.array(line.split()[1:], int) - 1 for line in lines if line.startswith("f ")]
     first = 1 + templates.RINGS * templates.SECTORS
@@ -157,4 +157,4 @@ def test_every_face_looks_inward_or_out_of_its_mark(testbed: Testbed) -> None:
 
 def test_the_sky_has_no_gores() -> None:
     with pytest.raises(InputError, match=r"light.kind: stars has no .svg; allowed: dome"):
-        templates.template(build_testbed(loader.load("shefex2")), ".svg")
+        templates.template(build_lab(loader.load("shefex2")), ".svg")

@@ -19,9 +19,9 @@ from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.quantities.tolerance import ErrorSchema, ToleranceConfig
 from skysim.core.quantities.units import SI_SUFFIX, ConfigModel
-from skysim.dynamics.actuators import STEERING
 from skysim.dynamics.guidance import LEGS
 from skysim.dynamics.jitter import SPECTRA
+from skysim.dynamics.multibody.actuators.cmgs import STEERING
 from skysim.scene import loader, scene
 from skysim.scene.sections import camera, leds, light, motion, vehicle
 from skysim.scene.sections.layouts import Layout

@@ -177,14 +177,14 @@ def test_a_section_of_another_kind_and_a_list_replace_and_null_switches_off(tmp_
 
 def test_a_base_stands_beside_the_scene_and_brings_its_own_files(tmp_path: Path) -> None:
     """The base's vehicle is beside the base, though the scene is elsewhere."""
-    testbed, campaign = tmp_path / "lab", tmp_path / "campaign"
-    testbed.mkdir()
+    lab, campaign = tmp_path / "lab", tmp_path / "campaign"
+    lab.mkdir()
     campaign.mkdir()
     model = (SCENES / "vehicles" / "simsat.xml").read_text(encoding="utf-8")
-    (testbed / "ours.xml").write_text(model, encoding="utf-8")
-    written(testbed, "ours", base="afit_simsat", vehicle={"model": "ours.xml"})
+    (lab / "ours.xml").write_text(model, encoding="utf-8")
+    written(lab, "ours", base="afit_simsat", vehicle={"model": "ours.xml"})
     mine = loader.load(written(campaign, "mine", base="../lab/ours.yaml", seed=5))
-    assert Path(mine.vehicle.model) == testbed / "ours.xml"
+    assert Path(mine.vehicle.model) == lab / "ours.xml"
 
 
 def test_a_base_that_is_none_is_told_with_its_place(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from skysim.core.errors import InputError
 from skysim.core.types import Truth
 from skysim.scene.loader import load
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker, sky_during
+from skysim.simulation.lab import Lab, build_lab, build_tracker, sky_during
 from skysim.sources.air import scintillation
 from skysim.tracking.factory import solve_frame
 
@@ -29,13 +29,13 @@ AIR = {
 NO_AIR = ("start_time", "camera.detector.noise", "motion.jitter", "light.occlusion")
 
 
-def bed(**keys: str) -> Testbed:
-    return build_testbed(load("shefex2", AIR | keys))
+def bed(**keys: str) -> Lab:
+    return build_lab(load("shefex2", AIR | keys))
 
 
-def level(testbed: Testbed, altitude_deg: float) -> Rotation:
+def level(lab: Lab, altitude_deg: float) -> Rotation:
     """cam_from_icrs of a camera toward the south at an altitude, the zenith up in its image."""
-    sky = sky_during(testbed, 0.0)
+    sky = sky_during(lab, 0.0)
     assert sky is not None
     north, _, up = sky.axes
     h = np.radians(altitude_deg)
@@ -43,24 +43,24 @@ def level(testbed: Testbed, altitude_deg: float) -> Rotation:
     return Rotation.from_matrix(np.stack([np.cross(y, z), y, z]))
 
 
-def frame_at(testbed: Testbed, altitude_deg: float, index: int = 0) -> Truth:
+def frame_at(lab: Lab, altitude_deg: float, index: int = 0) -> Truth:
     """The truth of a frame of the camera at rest."""
-    cam_from_lab = level(testbed, altitude_deg)
-    return render_frame(testbed.at_rest(cam_from_lab.inv() * testbed.mount.cam_from_body, index), index)[1]
+    cam_from_lab = level(lab, altitude_deg)
+    return render_frame(lab.at_rest(cam_from_lab.inv() * lab.camera.mount.cam_from_body, index), index)[1]
 
 
 def test_stars_are_raised_and_dimmed_in_the_frame() -> None:
     """Against the same frame without air: up in the image by A tan Z + B tan^3 Z, fainter by Kasten & Young's law."""
-    testbed = bed()
-    empty = replace(testbed, air=None)
-    cam_from_lab = level(testbed, 30.0)
-    through = frame_at(testbed, 30.0).sources
+    lab = bed()
+    empty = replace(lab, air=None)
+    cam_from_lab = level(lab, 30.0)
+    through = frame_at(lab, 30.0).sources
     at_rest = empty.at_rest(cam_from_lab.inv() * empty.mount.cam_from_body)
     without = render_frame(at_rest, 0)[1].sources
     both, ours, bare = np.intersect1d(through.id, without.id, return_indices=True)
     assert len(both) > 30
-    focal_px = testbed.scene.camera.focal_px
-    x, y = ((without.xy_px[bare] - np.array(testbed.scene.camera.center_px)) / focal_px).T
+    focal_px = lab.scene.camera.focal_px
+    x, y = ((without.xy_px[bare] - np.array(lab.scene.camera.center_px)) / focal_px).T
     tilt = np.radians(30.0)
     altitude = np.arcsin((np.sin(tilt) - y * np.cos(tilt)) / np.sqrt(1 + x**2 + y**2))
     moved_px = through.xy_px[ours] - without.xy_px[bare]
@@ -70,7 +70,7 @@ def test_stars_are_raised_and_dimmed_in_the_frame() -> None:
     wanted = 57.6 * cot - 0.066 * cot**3  # arcsec, sea level, 15 C, 0.7 um
     np.testing.assert_allclose(raised_arcsec[near_center], wanted[near_center], rtol=0.02)
     lost_mag = -2.5 * np.log10(through.electrons[ours] / without.electrons[bare])
-    inside = (np.abs(without.xy_px[bare] - testbed.scene.camera.center_px) < [280, 200]).all(axis=1)
+    inside = (np.abs(without.xy_px[bare] - lab.scene.camera.center_px) < [280, 200]).all(axis=1)
     h_deg = np.degrees(altitude)
     masses = 1 / (np.sin(altitude) + 0.50572 * (h_deg + 6.07995) ** -1.6364)
     np.testing.assert_allclose(lost_mag[inside], 0.172 * masses[inside], rtol=0.02)
@@ -92,20 +92,20 @@ def test_the_skyline_hides_stars_and_the_truth_says_which() -> None:
 
 @pytest.mark.slow
 def test_stars_twinkle_by_frame_and_star() -> None:
-    testbed = bed(**{"light.air.scintillation": "true"})
-    sources = [frame_at(testbed, 60.0, index).sources for index in (0, 0, 1)]
+    lab = bed(**{"light.air.scintillation": "true"})
+    sources = [frame_at(lab, 60.0, index).sources for index in (0, 0, 1)]
     same = [one.electrons for one in sources]
     np.testing.assert_array_equal(same[0], same[1])
     still = frame_at(bed(), 60.0).sources
     ratios = []
     for index in range(12):
-        seen = frame_at(testbed, 60.0, index).sources
+        seen = frame_at(lab, 60.0, index).sources
         _, a, b = np.intersect1d(seen.id, still.id, return_indices=True)
         ratios.append(seen.electrons[a] / still.electrons[b])
     ratio = np.concatenate(ratios)
-    camera, exposure_s = testbed.scene.camera, testbed.scene.exposure.time_s
+    camera, exposure_s = lab.scene.camera, lab.scene.exposure.time_s
     mass = np.array([1 / np.sin(np.radians(60))])
-    variance = scintillation.variance(mass, camera.pupil_m, exposure_s, testbed.scene.site.height_m, 660e-9)[0]
+    variance = scintillation.variance(mass, camera.pupil_m, exposure_s, lab.scene.site.height_m, 660e-9)[0]
     assert ratio.mean() == pytest.approx(1, abs=4 * np.sqrt(variance / len(ratio)))
     assert ratio.var() == pytest.approx(variance, rel=0.25)
 
@@ -133,12 +133,12 @@ def test_air_needs_a_site() -> None:
         load("shefex2", AIR | {"light.air.horizon": "{azimuth_deg: [0, 360], altitude_deg: [0, 20]}"})
 
 
-def errors_arcsec(testbed: Testbed, altitude_deg: float, index: int = 0) -> tuple[float, float]:
+def errors_arcsec(lab: Lab, altitude_deg: float, index: int = 0) -> tuple[float, float]:
     """Error across the boresight and rms residual in px of a frame."""
-    cam_from_lab = level(testbed, altitude_deg) if testbed.air else level(bed(), altitude_deg)
-    at_rest = testbed.at_rest(cam_from_lab.inv() * testbed.mount.cam_from_body, index)
+    cam_from_lab = level(lab, altitude_deg) if lab.camera.air else level(bed(), altitude_deg)
+    at_rest = lab.at_rest(cam_from_lab.inv() * lab.camera.mount.cam_from_body, index)
     frame, truth = render_frame(at_rest, index)
-    attitude = solve_frame(build_tracker(testbed), frame).attitude
+    attitude = solve_frame(build_tracker(lab.camera), frame).attitude
     assert attitude.cam_from_ref is not None
     error = (attitude.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec() * 206264.8
     return float(np.hypot(*error[:2])), attitude.rms_px
@@ -149,7 +149,7 @@ def errors_arcsec(testbed: Testbed, altitude_deg: float, index: int = 0) -> tupl
 def test_a_tracker_that_knows_its_site_is_as_good_as_without_air(altitude_deg: float) -> None:
     """Noise is off: what is left is the centroiding's own error, and 0.3" of the ground's aberration."""
     told, later = {"tracker.refraction": "true"}, {"exposure.first": "600 s"}
-    without = errors_arcsec(build_testbed(load("shefex2", {key: AIR[key] for key in NO_AIR})), altitude_deg)
+    without = errors_arcsec(build_lab(load("shefex2", {key: AIR[key] for key in NO_AIR})), altitude_deg)
     undone = errors_arcsec(bed(**told), altitude_deg)
     assert undone[0] < without[0] + 1.0
     assert undone[1] == pytest.approx(without[1], abs=0.02)

@@ -17,7 +17,7 @@ from skysim.experiments.study import loader as loader_of_studies
 from skysim.experiments.study.plan import resolve_point
 from skysim.scene import loader
 from skysim.simulation import compilation, run
-from skysim.simulation.testbed import Testbed, build_tracker
+from skysim.simulation.lab import Lab, build_tracker
 from skysim.tracking import factory
 
 BUMP = 'kind: bump, rate_deg_s: [3, -2, 14], duration: "40 ms", caught_after: "0.2 s"'
@@ -34,13 +34,13 @@ IMU_ALONE = {
 }
 
 
-def prepared(name: str = "simsat_bump", **changes: str) -> Testbed:
+def prepared(name: str = "simsat_bump", **changes: str) -> Lab:
     given = {key.replace("__", "."): value for key, value in changes.items()}
     return run.prepare(loader.load(name, given))
 
 
 @pytest.fixture(scope="module")
-def bumped() -> Testbed:
+def bumped() -> Lab:
     return prepared(**EARLY | EXACT_MAP)
 
 
@@ -55,15 +55,15 @@ def test_the_tracker_is_compiled_before_the_first_frame_of_a_flight(monkeypatch:
         return solve(tracker, frame, **known)
 
     monkeypatch.setattr(factory, "solve_frame", watched)
-    testbed = prepared(exposure='{time: 10 ms, rate_hz: 5, frames: 2, first: "0.1 s"}', motion__maneuver="[]")
+    lab = prepared(exposure='{time: 10 ms, rate_hz: 5, frames: 2, first: "0.1 s"}', motion__maneuver="[]")
     assert [frame.index for frame in solved] == [0, 0, 1]
-    np.testing.assert_array_equal(solved[0].image_dn, compilation.synthetic_frame(testbed).image_dn)
-    assert len(testbed.reports) == 2
+    np.testing.assert_array_equal(solved[0].image_dn, compilation.synthetic_frame(lab).image_dn)
+    assert len(lab.reports) == 2
 
 
-def told(testbed: Testbed) -> Telemetry:
-    assert testbed.telemetry is not None
-    return testbed.telemetry
+def told(lab: Lab) -> Telemetry:
+    assert lab.telemetry is not None
+    return lab.telemetry
 
 
 def off_deg(telemetry: Telemetry) -> Floats:
@@ -89,13 +89,13 @@ def in_sigma(telemetry: Telemetry) -> Floats:
 
 
 @pytest.mark.slow
-def test_every_frame_is_solved_and_used(bumped: Testbed) -> None:
+def test_every_frame_is_solved_and_used(bumped: Lab) -> None:
     assert bumped.update_statuses == dict.fromkeys(range(8), "used")
     assert {report.attitude.status for report in bumped.reports.values()} == {"solved"}
 
 
 @pytest.mark.slow
-def test_the_imu_is_wrong_for_good_by_the_turn_it_missed(bumped: Testbed) -> None:
+def test_the_imu_is_wrong_for_good_by_the_turn_it_missed(bumped: Lab) -> None:
     """What is beyond its limit of 10 deg/s about z, integrated along the true rate: 0.58 deg; it stays."""
     telemetry, path = told(bumped), bumped.trajectory
     excess = np.maximum(np.abs(np.degrees(path.rate_body_rad_s[:, 2])) - 10, 0)
@@ -114,7 +114,7 @@ def test_the_imu_is_wrong_for_good_by_the_turn_it_missed(bumped: Testbed) -> Non
 
 
 @pytest.mark.slow
-def test_the_filter_knows_what_it_does_not_know(bumped: Testbed) -> None:
+def test_the_filter_knows_what_it_does_not_know(bumped: Lab) -> None:
     """Within four of its own sigma always: no surer than it may be before the star tracker has seen anything, while
     turns are missed, and after.
     """
@@ -150,7 +150,7 @@ def test_the_filter_allows_for_the_survey_s_error() -> None:
     assert np.degrees(error[late]).min() * 3600 > 60  # 0.5 mm of lever are 85 arcsec at 1.2 m
 
 
-def test_the_star_tracker_brings_attitude_and_bias_back(bumped: Testbed) -> None:
+def test_the_star_tracker_brings_attitude_and_bias_back(bumped: Lab) -> None:
     telemetry = told(bumped)
     assert telemetry.lab_from_filter is not None
     assert telemetry.assumed_bias_rad_s is not None
@@ -164,7 +164,7 @@ def test_the_star_tracker_brings_attitude_and_bias_back(bumped: Testbed) -> None
     assert deg_h.max() < 5  # of 15, the Earth's turning, that it had to find
 
 
-def test_the_vehicle_is_brought_back(bumped: Testbed) -> None:
+def test_the_vehicle_is_brought_back(bumped: Lab) -> None:
     off = off_deg(told(bumped))
     assert off.max() > 1
     assert off[told(bumped).t_s > 7].max() < 0.05
@@ -184,7 +184,7 @@ def test_steered_by_the_imu_it_stays_where_the_imu_is_wrong() -> None:
 
 
 @pytest.mark.slow
-def test_what_was_solved_in_flight_is_what_the_frames_say_afterwards(bumped: Testbed) -> None:
+def test_what_was_solved_in_flight_is_what_the_frames_say_afterwards(bumped: Lab) -> None:
     """Rendered from a piece of the flight when its time came, and from the whole: the same photons, one answer."""
     kept = [shot.report.attitude for shot in run.run(bumped, build_tracker(bumped))]
     forgotten = replace(bumped, reports={})
@@ -199,44 +199,44 @@ def test_what_was_solved_in_flight_is_what_the_frames_say_afterwards(bumped: Tes
 @pytest.mark.parametrize("latency_s", [0.0, 0.2])
 def test_a_solution_comes_after_its_latency(latency_s: float) -> None:
     """The filter is sure of itself at the first tick after the exposure's end and the latency, and right."""
-    testbed = prepared(
+    lab = prepared(
         filter=f'{{start_deg: 0.5, latency: "{latency_s} s"}}',
         motion__maneuver="[{kind: sine, amplitude_deg: [2, 1, 3], frequency_hz: 0.5, duration: 5 s}]",
         exposure='{time: "10 ms", rate_hz: 2, frames: 4, first: "0.4 s"}',
     )
-    telemetry = told(testbed)
+    telemetry = told(lab)
     knows = telemetry.t_s[(telemetry.sigma_attitude_rad < np.radians(0.1)).all(axis=1)]
     assert knows[0] == pytest.approx(0.41 + latency_s, abs=0.0101)
     assert in_sigma(telemetry)[1:].max() < 4
     # What comes too late for the flight is no longer told the filter, but solved after all.
-    assert sorted(testbed.reports) == list(range(4 if latency_s == 0 else 3))
-    shots = list(run.run(testbed, build_tracker(testbed)))
+    assert sorted(lab.reports) == list(range(4 if latency_s == 0 else 3))
+    shots = list(run.run(lab, build_tracker(lab.camera)))
     assert [shot.report.attitude.status for shot in shots] == ["solved"] * 4
 
 
 @pytest.mark.long
 def test_the_loop_with_latency_survives_the_accident() -> None:
-    testbed = prepared(**EARLY, filter__latency="0.2 s")
-    assert set(testbed.update_statuses.values()) == {"used"}
-    assert in_sigma(told(testbed))[1:].max() < 4
-    assert off_deg(told(testbed))[told(testbed).t_s > 7].max() < 0.06
+    lab = prepared(**EARLY, filter__latency="0.2 s")
+    assert set(lab.update_statuses.values()) == {"used"}
+    assert in_sigma(told(lab))[1:].max() < 4
+    assert off_deg(told(lab))[told(lab).t_s > 7].max() < 0.06
 
 
 def test_a_frame_without_an_answer_leaves_the_filter_alone() -> None:
     """The lens is capped: no LEDs, no solution; the filter goes on with the gyros and is less and less sure."""
-    testbed = prepared(light__led__intensity="1 ucd", exposure='{time: "10 ms", rate_hz: 2, frames: 2}')
-    assert "used" not in testbed.update_statuses.values()
-    assert [testbed.update_statuses[k] for k in range(2)] == [testbed.reports[k].attitude.status for k in range(2)]
-    sigma = told(testbed).sigma_attitude_rad
+    lab = prepared(light__led__intensity="1 ucd", exposure='{time: "10 ms", rate_hz: 2, frames: 2}')
+    assert "used" not in lab.update_statuses.values()
+    assert [lab.update_statuses[k] for k in range(2)] == [lab.reports[k].attitude.status for k in range(2)]
+    sigma = told(lab).sigma_attitude_rad
     assert sigma is not None
     assert (np.diff(sigma, axis=0) > 0).all()
 
 
 def test_under_the_stars_the_filter_s_lab_is_the_sky() -> None:
     """The same loop with the other tracker: a free vehicle, its attitude among the stars."""
-    testbed = prepared("shefex2", vehicle__imu="{}", filter="{start_deg: 0.5}", exposure__frames="4")
-    assert testbed.update_statuses == dict.fromkeys(range(4), "used")
-    telemetry = told(testbed)
+    lab = prepared("shefex2", vehicle__imu="{}", filter="{start_deg: 0.5}", exposure__frames="4")
+    assert lab.update_statuses == dict.fromkeys(range(4), "used")
+    telemetry = told(lab)
     assert in_sigma(telemetry)[1:].max() < 4
     assert telemetry.sigma_attitude_rad is not None
     assert np.degrees(telemetry.sigma_attitude_rad[-1]).max() < 0.02
@@ -254,5 +254,5 @@ def test_the_same_seed_flies_the_same_flight_bit_for_bit() -> None:
         assert getattr(told(one), name).tobytes() == getattr(told(same), name).tobytes()
         assert getattr(told(one), name).tobytes() != getattr(told(other), name).tobytes()
     for telemetry in ("lab_from_body", "lab_from_imu", "lab_from_filter"):
-        quaternions = [getattr(told(testbed), telemetry).as_quat().tobytes() for testbed in (one, same, other)]
+        quaternions = [getattr(told(lab), telemetry).as_quat().tobytes() for lab in (one, same, other)]
         assert quaternions[0] == quaternions[1] != quaternions[2]

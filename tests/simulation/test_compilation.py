@@ -7,7 +7,7 @@ import pytest
 from skysim.core.paths import SCENES
 from skysim.scene import loader
 from skysim.simulation.compilation import synthetic_frame
-from skysim.simulation.testbed import build_testbed, build_tracker
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.tracking import factory
 
 SYMMETRIC = {"afit_test1", "afit_test2", "afit_test3"}  # too few or too regular LEDs for an attitude
@@ -19,5 +19,5 @@ NAMES = {path.stem.removesuffix("_ideal") for path in SCENES.glob("*.yaml")} - S
 @pytest.mark.parametrize("name", sorted(NAMES))
 def test_the_synthetic_frame_is_solved(name: str) -> None:
     """A frame that is refused earlier would leave the later stages to be compiled in the first process."""
-    testbed = build_testbed(loader.load(name))
-    assert factory.solve_frame(build_tracker(testbed), synthetic_frame(testbed)).attitude.status == "solved"
+    lab = build_lab(loader.load(name))
+    assert factory.solve_frame(build_tracker(lab.camera), synthetic_frame(lab)).attitude.status == "solved"

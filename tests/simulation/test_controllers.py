@@ -25,8 +25,8 @@ from skysim.experiments.study.execution.engines import Serial
 from skysim.scene import loader
 from skysim.simulation import run
 from skysim.simulation.checks import check
-from skysim.simulation.testbed import build_testbed
-from skysim.simulation.user_parts import build_testbed_with
+from skysim.simulation.lab import build_lab
+from skysim.simulation.user_parts import build_lab_with
 from skysim.tracking.external import process
 
 PD = '''
@@ -96,7 +96,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def flown(changes: dict[str, Any] | None = None, **parts: Any) -> Telemetry:
     """The motion alone of `skysim.simulate`, without its frame."""
     scene = skysim.load_scene("simsat_slew", SHORT | (changes or {}))
-    return run.simulate_motion(build_testbed_with(scene, **parts)).log
+    return run.simulate_motion(build_lab_with(scene, **parts)).log
 
 
 def command(folder: Path, text: str) -> dict[str, str]:
@@ -150,7 +150,7 @@ def test_it_gets_what_the_page_says() -> None:
     (setup,) = told
     assert (setup.period_s, setup.actuators, setup.feedback, setup.seed) == (0.01, "wheels", "truth", scene.seed)
     assert (setup.bandwidth_rad_s, setup.damping, setup.rate_limit_rad_s) == (2.5, 0.7, None)
-    np.testing.assert_allclose(setup.inertia_kg_m2, build_testbed(scene).vehicle.inertia_kg_m2, rtol=0, atol=0)
+    np.testing.assert_allclose(setup.inertia_kg_m2, build_lab(scene).vehicle.inertia_kg_m2, rtol=0, atol=0)
     assert [now.tick for now in seen] == list(range(len(log.t_s)))
     np.testing.assert_allclose([now.t_s for now in seen], log.t_s, rtol=0, atol=1e-12)
     measured = Rotation.from_quat([now.lab_from_body_xyzw for now in seen])
@@ -293,12 +293,12 @@ def test_a_program_ends_with_its_motion(tmp_path: Path) -> None:
     far = [{"kind": "step", "roll_deg": 50, "duration": "1 s"}]
     for maneuver, told in ((far, "tilt of 50 deg"), ([], None)):
         changes = {"motion.control": {"law": "mine"}, "motion.maneuver": maneuver}
-        testbed = build_testbed(skysim.load_scene("simsat_slew", SHORT | changes), programs)
+        lab = build_lab(skysim.load_scene("simsat_slew", SHORT | changes), programs)
         if told:
             with pytest.raises(InputError, match=told):
-                run.simulate_motion(testbed)
+                run.simulate_motion(lab)
         else:
-            run.simulate_motion(testbed)
+            run.simulate_motion(lab)
         with pytest.raises(ProcessLookupError):
             os.kill(int((tmp_path / "pid").read_text()), 0)
 
@@ -307,8 +307,8 @@ def test_a_check_does_not_start_a_program(tmp_path: Path) -> None:
     """Or `skysim run`, which checks its plan, would start it twice."""
     started = tmp_path / "started"
     programs = command(tmp_path, f"open({str(started)!r}, 'w')\n{READY}")
-    testbed = build_testbed(skysim.load_scene("simsat_slew", SHORT | {"motion.control": {"law": "mine"}}), programs)
-    check(testbed)
+    lab = build_lab(skysim.load_scene("simsat_slew", SHORT | {"motion.control": {"law": "mine"}}), programs)
+    check(lab)
     assert not started.exists()
 
 
@@ -316,7 +316,7 @@ def test_an_unknown_law_is_told_before_the_motion() -> None:
     with pytest.raises(
         InputError, match=r"motion.control.law: unknown law 'lqr'; allowed: pid, pd, prescribed.*--progr"
     ):
-        build_testbed(loader.load("simsat_slew", {"motion.control": "lqr"}))
+        build_lab(loader.load("simsat_slew", {"motion.control": "lqr"}))
 
 
 @pytest.mark.parametrize("name", ["pid", "pd", "prescribed", "mine"])

@@ -9,7 +9,7 @@ import pytest
 import scipy
 from scipy.spatial.transform import Rotation
 
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Trajectory
 from skysim.results import metrics
 from skysim.scene import loader
@@ -19,7 +19,8 @@ from skysim.simulation.checks.detection import Context, fit_loss, timing_sigma_s
 from skysim.simulation.checks.expected_error import Common, Independent, covariance, gains
 from skysim.simulation.checks.views import View, image_gradient, peak_share, view
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import MARGIN_S, Testbed, build_testbed, build_tracker, exposure_window
+from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.sources.dome.led import lit_moments_s
 from skysim.tracking import factory
 
@@ -27,10 +28,10 @@ LEDS = 12
 HEIGHT_M, PUPIL_M, RING_M = 1.2, 0.4, 0.08  # of a ring of LEDs over the bearing, the pupil, and the ring's radius
 
 
-def ring(arm_m: Floats, offset_m: Floats, testbed: Testbed) -> View:
+def ring(arm_m: Floats, offset_m: Floats, lab: Lab) -> View:
     """Lights at (n, 3) places in camera axes, one pixel accurate each."""
     count, nothing = len(arm_m), np.zeros(len(arm_m))
-    xy_px, gradient = testbed.optics.project(offset_m), image_gradient(testbed.optics, offset_m)
+    xy_px, gradient = lab.camera.optics.project(offset_m), image_gradient(lab.camera.optics, offset_m)
     row, streak = np.arange(count), np.zeros((count, 2))
     depth_m = offset_m[:, 2]
     return View(row, xy_px, offset_m, arm_m, gradient, depth_m, *[nothing] * 4, streak, nothing, streak)
@@ -43,16 +44,16 @@ def around(radius: float, height: float, count: int = LEDS) -> Floats:
 
 
 @pytest.fixture(scope="module")
-def stars() -> Testbed:
-    return build_testbed(loader.load("shefex2"))
+def stars() -> Lab:
+    return build_lab(loader.load("shefex2"))
 
 
 @pytest.fixture(scope="module")
-def leds() -> Testbed:
-    return build_testbed(loader.load("afit_simsat"))
+def leds() -> Lab:
+    return build_lab(loader.load("afit_simsat"))
 
 
-def test_stars_on_a_ring_give_the_textbook_s_errors(stars: Testbed) -> None:
+def test_stars_on_a_ring_give_the_textbook_s_errors(stars: Lab) -> None:
     """Roll sigma / (r sqrt n); cross sqrt(2 / n) sigma / f over sqrt(1 + t^2 + t^4 / 2), t = r / f, both axes."""
     tangent, sigma_px = 0.11, 0.2
     places = around(tangent, 1.0)
@@ -66,7 +67,7 @@ def test_stars_on_a_ring_give_the_textbook_s_errors(stars: Testbed) -> None:
     assert np.sqrt(variance[:2].sum()) == pytest.approx(across, rel=1e-6)
 
 
-def test_weights_favor_the_accurate_lights(stars: Testbed) -> None:
+def test_weights_favor_the_accurate_lights(stars: Lab) -> None:
     """Of two lights on a line through the center the better one decides: variances add as 1 / sum(1 / sigma^2)."""
     tangent, focal_px = 1e-4, stars.scene.camera.focal_px
     places = np.array([[tangent, 0, 1], [-tangent, 0, 1], [0, tangent, 1], [0, -tangent, 1]])
@@ -76,12 +77,12 @@ def test_weights_favor_the_accurate_lights(stars: Testbed) -> None:
     assert np.sqrt(variance[:2]) == pytest.approx(np.full(2, 1 / focal_px / np.sqrt(np.sum(1 / sigma_px**2))), rel=1e-3)
 
 
-def under_ring(testbed: Testbed) -> View:
+def under_ring(lab: Lab) -> View:
     arm_m = around(RING_M, HEIGHT_M)
-    return ring(arm_m, arm_m - [0, 0, PUPIL_M], testbed)
+    return ring(arm_m, arm_m - [0, 0, PUPIL_M], lab)
 
 
-def test_a_survey_s_errors_are_angles_at_the_bearing(leds: Testbed) -> None:
+def test_a_survey_s_errors_are_angles_at_the_bearing(leds: Lab) -> None:
     """Of a narrow ring: LEDs sigma / (R sqrt n) across each axis and sigma / (ring sqrt n) in roll; lever sigma / R."""
     circle, sigma_m = under_ring(leds), 1e-4
     gain = gains(circle, np.ones(LEDS))
@@ -93,7 +94,7 @@ def test_a_survey_s_errors_are_angles_at_the_bearing(leds: Testbed) -> None:
     assert lever[2] < 1e-6 * lever[0]
 
 
-def test_a_rotated_survey_rotates_the_solution_as_much(leds: Testbed) -> None:
+def test_a_rotated_survey_rotates_the_solution_as_much(leds: Lab) -> None:
     """Exactly: it is the rotation that the tracker measures."""
     circle, turn_rad = under_ring(leds), np.array([2e-4, -1e-4, 3e-4])
     shift_px = np.einsum("nij,nj->ni", circle.gradient, np.cross(turn_rad, circle.arm_m))
@@ -101,7 +102,7 @@ def test_a_rotated_survey_rotates_the_solution_as_much(leds: Testbed) -> None:
     np.testing.assert_allclose(matrix, np.outer(turn_rad, turn_rad), rtol=1e-6, atol=1e-16)
 
 
-def test_a_wrong_focal_length_moves_the_solution_by_the_mean_of_the_field(stars: Testbed) -> None:
+def test_a_wrong_focal_length_moves_the_solution_by_the_mean_of_the_field(stars: Lab) -> None:
     """An even ring about the center by nothing, one about a place off it by the relative error of that angle."""
     for aside in (0.0, 0.05):
         places = around(0.02, 1.0) + np.array([aside, 0, 0])
@@ -111,7 +112,7 @@ def test_a_wrong_focal_length_moves_the_solution_by_the_mean_of_the_field(stars:
         assert np.sqrt(cross) == pytest.approx(1e-3 * aside, rel=0.02, abs=1e-9)
 
 
-def test_a_fitted_place_absorbs_the_lever(leds: Testbed) -> None:
+def test_a_fitted_place_absorbs_the_lever(leds: Lab) -> None:
     """`pnp`: the lever's error does nothing, and noise does far more across the boresight."""
     circle = under_ring(leds)
     exact, free = gains(circle, np.ones(LEDS)), gains(circle, np.ones(LEDS), circle.gradient)
@@ -127,12 +128,12 @@ def test_a_fitted_focal_length_has_no_error_in_the_attitude() -> None:
     found = {}
     for identifier, focal_length in (("non_dimensional", 33.25), ("led_pairs", 33.25), ("non_dimensional", 29.75)):
         keys = {"tracker.identifier": identifier, "tracker.assumed_focal_length": f"{focal_length} mm"}
-        testbed = build_testbed(loader.load("afit_simsat", uneven | keys))
-        context = detection.context_of(testbed)
-        samples = plan.sampled(attitudes.of_frames(testbed), context)
+        lab = build_lab(loader.load("afit_simsat", uneven | keys))
+        context = detection.context_of(lab)
+        samples = plan.sampled(attitudes.of_frames(lab), context)
         error = samples.error.total("cross")
         found[identifier, focal_length] = samples.error.cross_rad2["focal length"].max(), error.mean()
-        cam_from_body = testbed.mount.cam_from_body
+        cam_from_body = lab.camera.mount.cam_from_body
         mismatch = expected_error.mismatch(
             samples.used[0], samples.attitudes.lab_from_body[0] * cam_from_body.inv(), context
         )
@@ -159,27 +160,27 @@ def test_the_mean_time_of_pulses_varies_as_their_integral_does() -> None:
     assert timing_sigma_s(np.ones(3), np.ones(3), 0.01).tolist() == [0, 0, 0]
 
 
-def moving(testbed: Testbed, lab_from_body: Rotation, rate_deg_s: Floats) -> Testbed:
+def moving(lab: Lab, lab_from_body: Rotation, rate_deg_s: Floats) -> Lab:
     """The test bed rotating at a constant rate, at that attitude at mid-exposure of frame 0."""
-    window, rows = exposure_window(testbed.scene, 0), testbed.scene.camera.height_px
+    window, rows = exposure_window(lab.scene, 0), lab.scene.camera.height_px
     t_s = np.linspace(window.open_s - MARGIN_S, window.close_s(rows) + MARGIN_S, 9)
     rate = np.radians(rate_deg_s)
     turned = Rotation.from_rotvec(np.outer(t_s - window.middle_s(rows), rate))
-    return replace(testbed, trajectory=Trajectory(t_s, lab_from_body * turned, np.tile(rate, (9, 1))))
+    return replace(lab, trajectory=Trajectory(t_s, lab_from_body * turned, np.tile(rate, (9, 1))))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "rate_deg_s"), [("afit_simsat", 2.0), ("shefex2", 2.0), ("apl_dome", 0.5)])
 def test_positions_electrons_peaks_and_paths_are_the_renderer_s(name: str, rate_deg_s: float) -> None:
     """Peaks are those of centered images: an image between pixels is lower by what a pixel's phase does."""
-    testbed = build_testbed(loader.load(name, {"exposure.frames": "1"}))
-    context = detection.context_of(testbed)
-    lab_from_body, rate = testbed.trajectory.lab_from_body[0], np.array([rate_deg_s, 0.0, 0.0])
-    _, truth = render_frame(moving(testbed, lab_from_body, rate), 0)
-    seen = view(testbed, testbed.sources, lab_from_body, np.radians(rate), context.camera)
-    _, row, other = np.intersect1d(testbed.sources.id[seen.row], truth.sources.id, return_indices=True)
+    lab = build_lab(loader.load(name, {"exposure.frames": "1"}))
+    context = detection.context_of(lab)
+    lab_from_body, rate = lab.start, np.array([rate_deg_s, 0.0, 0.0])
+    _, truth = render_frame(moving(lab, lab_from_body, rate), 0)
+    seen = view(lab, lab.camera.sources, lab_from_body, np.radians(rate), context.camera)
+    _, row, other = np.intersect1d(lab.camera.sources.id[seen.row], truth.sources.id, return_indices=True)
     assert len(row) == len(seen) > 10
-    inside = np.minimum(seen.xy_px, np.array(testbed.canvas.shape[::-1]) - seen.xy_px).min(axis=1)[row] > 30
+    inside = np.minimum(seen.xy_px, np.array(lab.camera.canvas.shape[::-1]) - seen.xy_px).min(axis=1)[row] > 30
     row, other = row[inside], other[inside]
     np.testing.assert_allclose(seen.xy_px[row], truth.sources.xy_px[other], rtol=0, atol=1e-3)
     np.testing.assert_allclose(seen.streak_length_px[row], truth.sources.streak_px[other], rtol=2e-3)
@@ -203,7 +204,7 @@ def test_a_peak_is_that_of_a_disk_behind_a_gaussian() -> None:
     assert peak_share(np.ones(1), *(np.zeros((3, 1))))[0] == pytest.approx(1 / 2 / np.pi, rel=1e-6)
 
 
-def test_a_neighbor_moves_a_fitted_star(stars: Testbed) -> None:
+def test_a_neighbor_moves_a_fitted_star(stars: Lab) -> None:
     """A weighted fit of a Gaussian to the sum of both, by least squares; near stars give their center of light."""
     camera = detection.context_of(stars).camera
     for apart_px, star_e, faint_e in ((1.5, 20_000.0, 300.0), (0.2, 2_000.0, 40.0), (2.5, 3_000.0, 60.0)):
@@ -230,9 +231,9 @@ INSTRUMENT = '{kind: total_station, position: ["3 m", "1 m", "0.2 m"], angle_sig
 def variances_of(survey: dict[str, str]) -> dict[str, Floats]:
     """(2,) cross and roll variances by cause at the frames of AFIT's dome, with only these errors of the survey."""
     none = {"led_sigma": "0 mm", "lever_sigma": "0 mm"}
-    testbed = build_testbed(loader.load("afit_simsat", keyed(none | survey)))
-    context = detection.context_of(testbed)
-    found = plan.sampled(attitudes.of_frames(testbed), context).error
+    lab = build_lab(loader.load("afit_simsat", keyed(none | survey)))
+    context = detection.context_of(lab)
+    found = plan.sampled(attitudes.of_frames(lab), context).error
     return {name: np.array([found.cross_rad2[name].mean(), found.roll_rad2[name].mean()]) for name in found.cross_rad2}
 
 
@@ -265,17 +266,17 @@ def normalized_errors(name: str, count: int, rate_deg_s: float, surveys: bool) -
     """
     rng = np.random.default_rng(4)
     scene = loader.load(name)
-    testbed = build_testbed(scene)
-    frames = attitudes.of_frames(testbed)
-    tracker, context = build_tracker(testbed), detection.context_of(testbed)
+    lab = build_lab(scene)
+    frames = attitudes.of_frames(lab)
+    tracker, context = build_tracker(lab.camera), detection.context_of(lab)
     errors, wanted, failed = [], [], 0
     for n in range(count):
         if surveys:
             seeded = loader.load(name, {"tracker.survey.seed": str(n)})
-            tracker = build_tracker(replace(testbed, scene=seeded))
-        lab_from_body = random_attitude(testbed, frames, rng)
-        rate = testbed.mount.cam_from_body.inv().apply(rate_deg_s * np.array([0.6, 0.8, 0.0]))
-        frame, truth = render_frame(moving(testbed.in_run(n), lab_from_body, rate), 0)
+            tracker = build_tracker(replace(lab, scene=seeded))
+        lab_from_body = random_attitude(lab, frames, rng)
+        rate = lab.camera.mount.cam_from_body.inv().apply(rate_deg_s * np.array([0.6, 0.8, 0.0]))
+        frame, truth = render_frame(moving(lab.in_run(n), lab_from_body, rate), 0)
         solution = factory.solve_frame(tracker, frame).attitude.cam_from_ref
         if solution is None:
             failed += 1
@@ -285,10 +286,10 @@ def normalized_errors(name: str, count: int, rate_deg_s: float, surveys: bool) -
     return np.array(errors), np.array(wanted), failed
 
 
-def random_attitude(testbed: Testbed, frames: Attitudes, rng: np.random.Generator) -> Rotation:
-    if testbed.scene.light.kind == "stars":
+def random_attitude(lab: Lab, frames: Attitudes, rng: np.random.Generator) -> Rotation:
+    if lab.scene.light.kind == "stars":
         return Rotation.random(rng=rng)
-    cosine = np.cos(attitudes.greatest_tilt_rad(testbed.scene, frames))
+    cosine = np.cos(attitudes.greatest_tilt_rad(lab.scene, frames))
     azimuth, yaw = rng.uniform(0, 2 * np.pi, 2)
     return Rotation.from_euler("ZYZ", [azimuth, np.arccos(rng.uniform(cosine, 1)), yaw])
 
@@ -321,22 +322,22 @@ def test_expected_errors_are_those_of_solved_frames(name: str, count: int, rate_
     np.testing.assert_allclose(rms, expectation, rtol=0.3)
 
 
-def test_an_angular_acceleration_shifts_images_by_the_mean_of_its_parabola(stars: Testbed) -> None:
+def test_an_angular_acceleration_shifts_images_by_the_mean_of_its_parabola(stars: Lab) -> None:
     """158 deg/s^2 in 20 ms: a T^2 / 24 is 9.5 arcsec about its axis, in the renderer's pixels and as expected."""
     acceleration_deg_s2, exposure_s = 158.0, 0.02
     scene = stars.scene.model_copy(update={"exposure": stars.scene.exposure.model_copy(update={"time_s": exposure_s})})
     lab_from_body, cam_from_body = stars.trajectory.lab_from_body[0], stars.mount.cam_from_body
     about_body = cam_from_body.inv().apply([0.0, np.radians(acceleration_deg_s2), 0.0])
-    testbed = replace(stars, scene=scene)
+    lab = replace(stars, scene=scene)
     window = exposure_window(scene, 0)
     t_s = np.linspace(window.open_s - MARGIN_S, window.close_s(scene.camera.height_px) + MARGIN_S, 801)
     since_s = t_s - window.middle_s(scene.camera.height_px)
     path = lab_from_body * Rotation.from_rotvec(np.outer(since_s**2 / 2, about_body))
     turning = Trajectory(t_s, path, np.outer(since_s, about_body))
-    _, truth = render_frame(replace(testbed, trajectory=turning), 0)
-    context = detection.context_of(testbed)
+    _, truth = render_frame(replace(lab, trajectory=turning), 0)
+    context = detection.context_of(lab)
     lights = context.beliefs.lights
-    seen = view(testbed, lights, lab_from_body, np.zeros(3), context.camera, about_body)
+    seen = view(lab, lights, lab_from_body, np.zeros(3), context.camera, about_body)
     _, rendered, predicted = np.intersect1d(truth.sources.id, lights.id[seen.row], return_indices=True)
     shift_px = (truth.sources.flux_xy_px - truth.sources.xy_px)[rendered]
     assert len(shift_px) > 20
@@ -346,7 +347,7 @@ def test_an_angular_acceleration_shifts_images_by_the_mean_of_its_parabola(stars
     assert np.sqrt(sampled[0]) / ARCSEC_RAD == pytest.approx(3600 * acceleration_deg_s2 * exposure_s**2 / 24, rel=0.01)
 
 
-def test_an_expected_error_is_no_number_with_two_lights(stars: Testbed) -> None:
+def test_an_expected_error_is_no_number_with_two_lights(stars: Lab) -> None:
     context = detection.context_of(stars)
     at = attitudes.of_frames(stars)
     few = [one.take(np.arange(2)) for one in plan.sampled(at, context).used]

@@ -11,7 +11,7 @@ import pytest
 from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.sources import catalog, stars
 from skysim.sources.orbit.camera_orbit import state_at
 from skysim.sources.orbit.satellites import ID_BASE
@@ -21,33 +21,33 @@ HALF_S = 2838.0  # half a revolution at 500 km: the velocity is reversed
 ORBIT = "{kind: circular, altitude: 500 km, inclination_deg: 90, raan_deg: 0, argument_deg: 0}"
 
 
-def in_orbit(**keys: str) -> Testbed:
+def in_orbit(**keys: str) -> Lab:
     """Two frames, half a revolution apart, of a camera that looks along the orbit's pole or as the keys say."""
     overrides = {
         **{"orbit": ORBIT, "exposure.frames": "2", "exposure.rate_hz": str(1 / HALF_S)},
         **{"motion.start": "{ra_deg: 90, dec_deg: 0, roll_deg: 0}", "camera.detector.noise": "false"},
         **{key.replace("__", "."): value for key, value in keys.items()},
     }
-    testbed = build_testbed(loader.load("shefex2", overrides))
-    return testbed.at_rest(testbed.trajectory.lab_from_body[0], 1)
+    lab = build_lab(loader.load("shefex2", overrides))
+    return lab.at_rest(lab.start, 1)
 
 
 def test_stars_have_the_aberration_of_each_frame_s_velocity() -> None:
     """Against `stars.apparent` with the velocity of mid-exposure, projected by the lens: half a revolution is 10"."""
-    testbed = in_orbit(light__limit_mag="4")
-    scene, known = testbed.scene, catalog.read_for("light.catalog", testbed.scene.light.catalog)
+    lab = in_orbit(light__limit_mag="4")
+    scene, known = lab.scene, catalog.read_for("light.catalog", lab.scene.light.catalog)
     for index in range(2):
-        _, truth = render_frame(testbed, index)
+        _, truth = render_frame(lab, index)
         time = scene.start_time + datetime.timedelta(seconds=truth.t_s)
-        velocity_m_s = state_at(testbed.orbit, truth.t_s).velocity_m_s
+        velocity_m_s = state_at(lab.camera.orbit, truth.t_s).velocity_m_s
         rows = np.searchsorted(known.hip[np.argsort(known.hip)], truth.sources.id)
         chosen = np.argsort(known.hip)[rows]
         exact = stars.apparent(known, time, velocity_m_s)[chosen]
-        xy_px = testbed.optics.project(truth.cam_from_lab.apply(exact))
+        xy_px = lab.camera.optics.project(truth.cam_from_lab.apply(exact))
         off_arcsec = np.linalg.norm(xy_px - truth.sources.xy_px, axis=1) / scene.camera.focal_px * 206265
         # Parallax, proper motion and deflection of half a revolution are below 0.001".
         assert off_arcsec.max() < 0.005
-        still = testbed.optics.project(truth.cam_from_lab.apply(stars.apparent(known, time)[chosen]))
+        still = lab.camera.optics.project(truth.cam_from_lab.apply(stars.apparent(known, time)[chosen]))
         moved = np.linalg.norm(still - truth.sources.xy_px, axis=1) / scene.camera.focal_px * 206265
         assert moved.mean() == pytest.approx(7617 / 299_792_458 * 206265, rel=0.05)
 
@@ -56,10 +56,10 @@ def test_stars_have_the_aberration_of_each_frame_s_velocity() -> None:
 @pytest.mark.parametrize(("knows", "low", "high"), [("true", 0.0, 1.0), ("false", 4.5, 6.0)])
 def test_a_tracker_with_the_orbit_s_velocity_is_free_of_its_aberration(knows: str, low: float, high: float) -> None:
     """Without noise, at the start and half a revolution later. The error without it is 5.2"."""
-    testbed = in_orbit(tracker__orbit_velocity=knows)
-    tracker = build_tracker(testbed)
+    lab = in_orbit(tracker__orbit_velocity=knows)
+    tracker = build_tracker(lab.camera)
     for index in range(2):
-        frame, truth = render_frame(testbed, index)
+        frame, truth = render_frame(lab, index)
         attitude = solve_frame(tracker, frame).attitude
         assert attitude.status == "solved"
         error = (attitude.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec()
@@ -68,9 +68,9 @@ def test_a_tracker_with_the_orbit_s_velocity_is_free_of_its_aberration(knows: st
 
 def test_the_earth_hides_the_stars_behind_it() -> None:
     """Above the equator at RA 0, looking at RA 180 (nadir), and half a revolution later at the zenith."""
-    testbed = in_orbit(motion__start="{ra_deg: 180, dec_deg: 0, roll_deg: 0}")
-    _, hidden = render_frame(testbed, 0)
-    _, seen = render_frame(testbed, 1)
+    lab = in_orbit(motion__start="{ra_deg: 180, dec_deg: 0, roll_deg: 0}")
+    _, hidden = render_frame(lab, 0)
+    _, seen = render_frame(lab, 1)
     assert len(hidden.sources.id) == 0
     assert len(seen.sources.id) > 50
 
@@ -87,11 +87,11 @@ def test_a_satellite_ahead_on_the_same_orbit_is_seen(tmp_path: Path) -> None:
     path.write_text("\n".join(lines), encoding="utf-8")
     keys = {"orbit": f"{{kind: tle, file: {path}, number: 1}}", "light__satellites": f"{{file: {path}}}"}
     keys |= {"start_time": "2012-06-22T00:00:00", "exposure__frames": "1", "exposure__rate_hz": "1"}
-    testbed = in_orbit(**keys)
-    velocity = state_at(testbed.orbit, 0.0).velocity_m_s
+    lab = in_orbit(**keys)
+    velocity = state_at(lab.camera.orbit, 0.0).velocity_m_s
     ra, dec = np.degrees(np.arctan2(velocity[1], velocity[0])) % 360, np.degrees(np.arcsin(velocity[2] / 7.6e3))
-    testbed = in_orbit(**keys, motion__start=f"{{ra_deg: {ra}, dec_deg: {dec}, roll_deg: 0}}")
-    _, truth = render_frame(testbed, 0)
+    lab = in_orbit(**keys, motion__start=f"{{ra_deg: {ra}, dec_deg: {dec}, roll_deg: 0}}")
+    _, truth = render_frame(lab, 0)
     assert [satellite.id for satellite in truth.satellites] == [ID_BASE + 2]
     assert truth.satellites[0].range_km == pytest.approx(60, abs=1.5)
     assert truth.satellites[0].rate_deg_s == pytest.approx(0.063, rel=0.1)  # it turns with the orbit

@@ -12,15 +12,15 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.dynamics import multibody
 from skysim.scene import loader
 from skysim.simulation import exposure, run
 from skysim.simulation.checks import attitudes, check, detection, facts, plan
 from skysim.simulation.checks.facts import Fact, Samples
 from skysim.simulation.checks.sky import claims, depth
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking.factory import solve_frame
 
 SPHERE = "{kind: sphere, apex: 1.2 m, radius: 1.2 m}"
@@ -35,8 +35,8 @@ STATION = (
 )
 
 
-def bed(name: str, **changes: str) -> Testbed:
-    return build_testbed(loader.load(name, {key.replace("__", "."): value for key, value in changes.items()}))
+def bed(name: str, **changes: str) -> Lab:
+    return build_lab(loader.load(name, {key.replace("__", "."): value for key, value in changes.items()}))
 
 
 def fact(result: plan.Check, name: str) -> Fact:
@@ -49,10 +49,10 @@ def afit() -> plan.Check:
     return check(bed("afit_simsat"))
 
 
-def samples_of(testbed: Testbed) -> tuple[detection.Context, Samples]:
-    context = detection.context_of(testbed)
-    frames = attitudes.of_frames(testbed)
-    reach = attitudes.within_reach(testbed.scene, testbed.mount, frames)
+def samples_of(lab: Lab) -> tuple[detection.Context, Samples]:
+    context = detection.context_of(lab)
+    frames = attitudes.of_frames(lab)
+    reach = attitudes.within_reach(lab.scene, lab.camera.mount, frames)
     return context, Samples(plan.sampled(frames, context), plan.sampled(reach, context))
 
 
@@ -62,9 +62,9 @@ def samples_of(testbed: Testbed) -> tuple[detection.Context, Samples]:
 @pytest.mark.slow
 def test_frames_are_checked_where_the_vehicle_will_be() -> None:
     """The reference at mid-exposure; the controller follows it to a hundredth of a degree."""
-    testbed = bed("afit_simsat", exposure__frames="40")
-    flown = run.simulate_motion(testbed)
-    frames = attitudes.of_frames(testbed)
+    lab = bed("afit_simsat", exposure__frames="40")
+    flown = run.simulate_motion(lab)
+    frames = attitudes.of_frames(lab)
     apart = (flown.trajectory.attitude_at(frames.t_s) * frames.lab_from_body.inv()).magnitude()
     assert np.degrees(apart).max() < 0.1
     rates = np.array([flown.trajectory.rate_at(t_s) for t_s in frames.t_s])
@@ -90,9 +90,9 @@ def test_the_reach_is_even_up_to_the_greatest_tilt_and_over_the_whole_sky() -> N
 
 
 def test_without_a_controller_the_bearing_may_tilt_to_its_stop() -> None:
-    testbed = bed("afit_simsat", motion__control="none", motion__maneuver="[]")
-    frames = attitudes.of_frames(testbed)
-    assert math.degrees(attitudes.greatest_tilt_rad(testbed.scene, frames)) == pytest.approx(30)
+    lab = bed("afit_simsat", motion__control="none", motion__maneuver="[]")
+    frames = attitudes.of_frames(lab)
+    assert math.degrees(attitudes.greatest_tilt_rad(lab.scene, frames)) == pytest.approx(30)
 
 
 @pytest.mark.parametrize(
@@ -121,19 +121,19 @@ def test_the_field_and_the_pixel_are_the_pinhole_s(afit: plan.Check) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["afit_simsat", "shefex2", "apl_dome"])
 def test_as_many_lights_are_counted_as_the_tracker_uses(name: str) -> None:
-    testbed = bed(name, exposure__frames="1")
-    flown = run.simulate_motion(testbed)
+    lab = bed(name, exposure__frames="1")
+    flown = run.simulate_motion(lab)
     frame, _ = exposure.render_frame(flown, 0)
     report = solve_frame(build_tracker(flown), frame)
     assert report.attitude.match is not None
-    found = fact(check(testbed), "lights in the field").values["frames"]
+    found = fact(check(lab), "lights in the field").values["frames"]
     assert found["mean"] == pytest.approx(len(report.attitude.match.observed), rel=0.1, abs=1.5)
     assert found["least"] <= found["mean"] <= found["on_chip"]
 
 
 def test_the_least_lights_are_where_it_says() -> None:
-    testbed = bed("afit_simsat")
-    context, samples = samples_of(testbed)
+    lab = bed("afit_simsat")
+    context, samples = samples_of(lab)
     text = facts.lights_in_field(context, samples).values["reach"]["least_at"]
     roll, pitch, yaw = (float(re.search(rf"{name} (\S+)°", text)[1]) for name in ("roll", "pitch", "yaw"))  # type: ignore[index]
     there = attitudes.Attitudes(
@@ -169,33 +169,33 @@ def test_smear_is_the_rate_times_the_exposure() -> None:
 
 def test_the_cap_s_margin_is_the_angle_beyond_the_field() -> None:
     """On a sphere of R about the bearing: half field h at the pupil M above is h - asin(M sin h / R) at the bearing."""
-    testbed = bed(
+    lab = bed(
         "afit_simsat",
         light__surface="{kind: sphere, apex: 48 in, radius: 48 in}",
         light__layout="{kind: fibonacci, count: 900, cap_deg: 27}",
         vehicle__camera="[0 in, 0 in, 15 in]",
         motion__maneuver=TILTED,
     )
-    found = facts.cap_margin(*samples_of(testbed))
+    found = facts.cap_margin(*samples_of(lab))
     assert found is not None
-    half = math.atan(testbed.scene.camera.width_px / 2 / testbed.scene.camera.focal_px)
+    half = math.atan(lab.scene.camera.width_px / 2 / lab.scene.camera.focal_px)
     at_bearing = half - math.asin(15 / 48 * math.sin(half))
     assert found.tilt_deg == pytest.approx(25, abs=1e-3)
     assert found.needed_deg == pytest.approx(25 + math.degrees(at_bearing), abs=1e-3)
-    corner = math.atan(testbed.scene.camera.corner_px / testbed.scene.camera.focal_px)
+    corner = math.atan(lab.scene.camera.corner_px / lab.scene.camera.focal_px)
     at_bearing = corner - math.asin(15 / 48 * math.sin(corner))
     assert found.corner_deg == pytest.approx(25 + math.degrees(at_bearing), abs=1e-3)
 
 
 def test_the_cap_of_listed_leds_ends_at_the_farthest_of_them() -> None:
     """Three LEDs to 20 deg from the zenith in a cap of 50: the row says both; a warning has nothing to change."""
-    testbed = bed(
+    lab = bed(
         "afit_simsat",
         light__surface="{kind: sphere, apex: 48 in, radius: 48 in}",
         light__layout="{kind: listed, directions_deg: [[0, 20], [90, 10], [200, 5]], cap_deg: 50}",
         motion__maneuver=TILTED,
     )
-    planned = check(testbed)
+    planned = check(lab)
     values = fact(planned, "LED cap").values
     assert values["cap_deg"] == pytest.approx(20, abs=1e-6)
     assert values["limit_deg"] == 50
@@ -207,20 +207,20 @@ def test_the_cap_of_listed_leds_ends_at_the_farthest_of_them() -> None:
 @pytest.mark.slow
 def test_the_cap_s_margin_at_the_tilt_stop_is_stated_and_a_study_is_warned_of_it() -> None:
     """The maneuver tilts by 9.6 deg, the stop is at 30: 5 deg of tilt more need 5 deg of LEDs more on a sphere."""
-    testbed = bed(
+    lab = bed(
         "afit_simsat",
         light__surface="{kind: sphere, apex: 48 in, radius: 48 in}",
         light__layout="{kind: fibonacci, count: 900, cap_deg: 30}",
         vehicle__camera="[0 in, 0 in, 15 in]",
     )
-    planned = check(testbed)
+    planned = check(lab)
     cap = fact(planned, "LED cap")
     assert cap.values["stop_deg"] == 30
     beyond_deg = 30 - cap.values["tilt_deg"]
     assert cap.values["stop_margin_deg"] == pytest.approx(cap.values["margin_deg"] - beyond_deg, abs=1e-3)
     assert cap.lines[1].startswith("at the tilt stop, 30°, the field's edge reaches 33.")
     assert not [line for line in planned.findings if "cap_deg" in line]
-    (warned,) = [line for line in check(testbed, 30.0).findings if "cap_deg" in line]
+    (warned,) = [line for line in check(lab, 30.0).findings if "cap_deg" in line]
     assert "at a tilt of 30.0 deg" in warned
     free = check(bed("afit_simsat", motion__control="none", motion__maneuver="[]"))
     assert all("tilt stop" not in line for one in free.facts if one.name == "LED cap" for line in one.lines)
@@ -371,9 +371,9 @@ def test_a_mistake_is_warned_of_with_its_key(scene: str, changes: dict[str, str]
     ],
 )
 def test_following_the_advice_silences_the_warning(changes: dict[str, str], key: str) -> None:
-    (line,) = [one for one in check(build_testbed(loader.load("afit_simsat", changes))).findings if one.startswith(key)]
+    (line,) = [one for one in check(build_lab(loader.load("afit_simsat", changes))).findings if one.startswith(key)]
     value = line.rpartition("change it to ")[2].partition(", or ")[0]
-    again = check(build_testbed(loader.load("afit_simsat", changes | {key: value}))).findings
+    again = check(build_lab(loader.load("afit_simsat", changes | {key: value}))).findings
     assert not [one for one in again if one.startswith(key)]
 
 
@@ -391,7 +391,7 @@ def test_saturation_can_be_cured_by_light_exposure_or_lens(intensity: str, keys:
     direct = {"light.led.drive": "{kind: direct}", "light.led.intensity": intensity}
 
     def warned(**changes: str) -> list[str]:
-        found = check(build_testbed(loader.load("afit_simsat", direct | changes))).findings
+        found = check(build_lab(loader.load("afit_simsat", direct | changes))).findings
         return [one for one in found if "are saturated" in one]
 
     (line,) = warned()
@@ -444,11 +444,11 @@ def test_the_rate_at_which_an_image_is_as_long_as_wide_is_told() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("focal_length", "solved"), [("25.01 mm", 3), ("25.5 mm", 3), ("27 mm", 0)])
 def test_a_wrong_focal_length_is_warned_of_where_the_tracker_refuses(focal_length: str, solved: int) -> None:
-    testbed = bed("shefex2", tracker__assumed_focal_length=focal_length, exposure__frames="3")
-    flown, tracker = run.simulate_motion(testbed), build_tracker(testbed)
+    lab = bed("shefex2", tracker__assumed_focal_length=focal_length, exposure__frames="3")
+    flown, tracker = run.simulate_motion(lab), build_tracker(lab.camera)
     found = [solve_frame(tracker, frame).attitude.solved for frame, _, _ in run.render_frames(flown)]
     assert found.count(True) == solved
-    assert bool(check(testbed).findings) == (solved == 0)
+    assert bool(check(lab).findings) == (solved == 0)
 
 
 @pytest.mark.parametrize(
@@ -462,15 +462,15 @@ def test_a_wrong_focal_length_is_warned_of_where_the_tracker_refuses(focal_lengt
 def test_fields_alike_are_those_that_the_tracker_refuses_as_ambiguous(layout: str) -> None:
     """On rendered frames at the attitudes in reach: none, some three of four, all."""
     changes = {"light__surface": SPHERE, "light__layout": layout, "camera__focus": "0.82 m", "camera__f_number": "11"}
-    testbed = bed("afit_simsat", **changes, motion__maneuver=TILTED)
-    frames = attitudes.of_frames(testbed)
-    reach = attitudes.within_reach(testbed.scene, testbed.mount, frames).lab_from_body
-    tracker, told = build_tracker(testbed), []
+    lab = bed("afit_simsat", **changes, motion__maneuver=TILTED)
+    frames = attitudes.of_frames(lab)
+    reach = attitudes.within_reach(lab.scene, lab.camera.mount, frames).lab_from_body
+    tracker, told = build_tracker(lab.camera), []
     for n, lab_from_body in enumerate(reach):
-        frame, _ = exposure.render_frame(testbed.in_run(n).at_rest(lab_from_body), 0)
+        frame, _ = exposure.render_frame(lab.in_run(n).at_rest(lab_from_body), 0)
         told.append(solve_frame(tracker, frame).attitude.status)
     ambiguous = np.mean([status.startswith("ambiguous") for status in told])
-    assert fact(check(testbed), "fields alike").values["share"] == pytest.approx(ambiguous, abs=0.2)
+    assert fact(check(lab), "fields alike").values["share"] == pytest.approx(ambiguous, abs=0.2)
 
 
 def test_fields_whose_leds_have_names_are_not_alike() -> None:
@@ -484,13 +484,13 @@ def test_fields_whose_leds_have_names_are_not_alike() -> None:
 
 def test_half_of_the_stars_at_the_limit_are_detected() -> None:
     """The limit that `light.catalog` is compared with, on rendered frames: most brighter by half a magnitude are."""
-    testbed = bed("shefex2", exposure__frames="1", motion__rate_deg_s="[0, 0, 0]")
-    limit = depth.detection_limit_mag(*samples_of(testbed))
-    tracker, rng, found, faint = build_tracker(testbed), np.random.default_rng(3), [], []
+    lab = bed("shefex2", exposure__frames="1", motion__rate_deg_s="[0, 0, 0]")
+    limit = depth.detection_limit_mag(*samples_of(lab))
+    tracker, rng, found, faint = build_tracker(lab.camera), np.random.default_rng(3), [], []
     for n in range(6):
-        still = testbed.in_run(n).at_rest(Rotation.random(rng=rng))
+        still = lab.in_run(n).at_rest(Rotation.random(rng=rng))
         frame, truth = exposure.render_frame(still, 0)
-        magnitude = dict(zip(testbed.sources.id.tolist(), testbed.sources.magnitude.tolist(), strict=True))
+        magnitude = dict(zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True))
         near = cKDTree(solve_frame(tracker, frame).centroids.xy_px).query(truth.sources.xy_px)[0] < 1.5
         v_mag = np.array([magnitude[hip] for hip in truth.sources.id.tolist()])
         found += near[np.abs(v_mag - limit + 0.5) < 0.25].tolist()
@@ -501,10 +501,10 @@ def test_half_of_the_stars_at_the_limit_are_detected() -> None:
 
 def test_the_star_of_a_signal_to_noise_of_five_is_that_of_the_truth_table() -> None:
     """V at which the rendered frames' stars pass 5, by their own color, against a star like the Sun: to 0.3 mag."""
-    testbed = bed("shefex2", exposure__frames="1")
-    limit = fact(check(testbed), "faintest star").values["snr_5_v_mag"]
-    magnitude = dict(zip(testbed.sources.id.tolist(), testbed.sources.magnitude.tolist(), strict=True))
-    _, truth = exposure.render_frame(run.simulate_motion(testbed), 0)
+    lab = bed("shefex2", exposure__frames="1")
+    limit = fact(check(lab), "faintest star").values["snr_5_v_mag"]
+    magnitude = dict(zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True))
+    _, truth = exposure.render_frame(run.simulate_motion(lab), 0)
     v_mag = np.array([magnitude[hip] for hip in truth.sources.id.tolist()])
     near = np.abs(truth.sources.snr - 5) < 0.7
     assert near.sum() > 10
@@ -548,12 +548,12 @@ def test_bodies_in_the_field_and_near_it_are_warned_of() -> None:
 def test_a_body_fills_a_pixel_as_in_its_frame(ra_deg: float, dec_deg: float, name: str) -> None:
     """Within a factor of 1.5 of the brightest pixel's electrons: its place in the pixel, and the phase's shape."""
     start = f"{{ra_deg: {ra_deg}, dec_deg: {dec_deg}}}"
-    testbed = bed("shefex2", motion__start=start, exposure__frames="1", **MOON)
-    line = next(line for line in check(testbed).findings if name in line)
+    lab = bed("shefex2", motion__start=start, exposure__frames="1", **MOON)
+    line = next(line for line in check(lab).findings if name in line)
     fill = float(re.search(r"([\d.]+) times saturation", line)[1])
-    _, truth = exposure.render_frame(run.prepare(testbed.scene), 0)
+    _, truth = exposure.render_frame(run.prepare(lab.scene), 0)
     row = list(truth.sources.id).index(next(body.id for body in truth.bodies if body.name == name.lower()))
-    full_e = detection.full_scale_e(testbed.scene.camera.detector)
+    full_e = detection.full_scale_e(lab.scene.camera.detector)
     assert fill == pytest.approx(truth.sources.peak_e[row] / full_e, rel=0.5)
 
 
@@ -566,17 +566,17 @@ def test_a_plan_that_ships_gives_no_warning(name: str) -> None:
 @pytest.mark.long
 def test_only_the_plans_with_saturated_and_too_few_leds_are_warned_of() -> None:
     """AFIT's tests of two and of five LEDs, as they were made, and of nine in a square, which looks alike turned."""
-    warned = {name for name in loader.list_scenes() if check(build_testbed(loader.load(name))).findings}
+    warned = {name for name in loader.list_scenes() if check(build_lab(loader.load(name))).findings}
     assert {name.removesuffix("_ideal") for name in warned} == {"afit_test1", "afit_test2", "afit_test3"}
 
 
 @pytest.mark.slow
 def test_a_check_costs_a_fraction_of_a_second() -> None:
     """Of CPU, after its functions were loaded once: against the time to set up the same scene, twice."""
-    testbed = bed("shefex2")
-    check(testbed)
+    lab = bed("shefex2")
+    check(lab)
     began = time.process_time()
-    check(testbed)
+    check(lab)
     checked = time.process_time()
     for _ in range(2):
         build_tracker(bed("shefex2"))

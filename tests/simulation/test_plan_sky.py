@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.simulation import exposure, run
@@ -17,7 +17,7 @@ from skysim.simulation.checks.dome import reflections
 from skysim.simulation.checks.facts import Samples
 from skysim.simulation.checks.plan import check, sampled
 from skysim.simulation.checks.sky import air, depth, stray
-from skysim.simulation.testbed import build_testbed, build_tracker
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.sources.false_lights import MIRRORED
 from skysim.tracking.factory import solve_frame
 
@@ -40,9 +40,9 @@ DOES_NOT_KNOW = {"tracker__orbit_velocity": "false"}
 
 def plan_of(scene: str, **keys: str) -> tuple[Context, Samples]:
     overrides = {key.replace("__", "."): value for key, value in keys.items()}
-    testbed = build_testbed(loader.load(scene, (SPACE if scene == "shefex2" else {}) | overrides))
-    context = context_of(testbed)
-    frames = sampled(attitudes.of_frames(testbed), context)
+    lab = build_lab(loader.load(scene, (SPACE if scene == "shefex2" else {}) | overrides))
+    context = context_of(lab)
+    frames = sampled(attitudes.of_frames(lab), context)
     return context, Samples(frames, frames)
 
 
@@ -88,9 +88,9 @@ def test_bodies_within_the_exclusion_angles_are_warned_of() -> None:
 @pytest.mark.slow
 def test_a_baffle_replaces_the_advice_to_add_one() -> None:
     keys = {"motion.start": pointing(93.9, -20.0), "light.bodies": "{planets: false}"}
-    without = check(build_testbed(loader.load("shefex2", SPACE | keys))).findings
+    without = check(build_lab(loader.load("shefex2", SPACE | keys))).findings
     assert any("Sun" in line and "add camera.baffle" in line for line in without)
-    lit = check(build_testbed(loader.load("shefex2", SPACE | keys | {"camera.baffle": BAFFLE}))).findings
+    lit = check(build_lab(loader.load("shefex2", SPACE | keys | {"camera.baffle": BAFFLE}))).findings
     assert not any("add camera.baffle" in line for line in lit)
     assert any(line.startswith("camera.baffle.pst") for line in lit)
 
@@ -139,8 +139,8 @@ def test_images_in_the_wall_that_are_detected_are_warned_of() -> None:
         r"light.reflection.specular: the tracker detects up to (\d+) images .* change it to ([\d.]+)$", line
     )
     assert found
-    frame, truth = exposure.render_frame(run.simulate_motion(context.testbed), 0)
-    seen = solve_frame(build_tracker(context.testbed), frame).centroids.xy_px
+    frame, truth = exposure.render_frame(run.simulate_motion(context.lab), 0)
+    seen = solve_frame(build_tracker(context.lab.camera), frame).centroids.xy_px
     mirrored = truth.sources.xy_px[truth.sources.id >= MIRRORED]
     near = (np.linalg.norm(mirrored[:, None] - seen, axis=2).min(axis=1) < 2).sum()
     assert near > 0

@@ -14,17 +14,17 @@ from skysim.core.types import SourceTruth
 from skysim.results.files.frames import write_frame
 from skysim.scene import loader
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.sources.orbit.satellites import ID_BASE
 from skysim.tracking.factory import solve_frame
 
 FRAMES = 6
 
 
-def at_rest(**keys: str) -> Testbed:
+def at_rest(**keys: str) -> Lab:
     overrides = {key.replace("__", "."): value for key, value in keys.items()}
-    testbed = build_testbed(loader.load("shefex2", {"exposure.frames": str(FRAMES), **overrides}))
-    return testbed.at_rest(testbed.trajectory.lab_from_body[0], FRAMES - 1)
+    lab = build_lab(loader.load("shefex2", {"exposure.frames": str(FRAMES), **overrides}))
+    return lab.at_rest(lab.start, FRAMES - 1)
 
 
 def streaks(sources: SourceTruth) -> np.ndarray:
@@ -35,23 +35,23 @@ def streaks(sources: SourceTruth) -> np.ndarray:
 def test_streaks_are_as_long_and_as_bright_as_their_satellites() -> None:
     """Length: rate times exposure, by the scale at the streak. Light: that of a star of the magnitude and color."""
     random = "{per_field: 60, seed: 3, rate_deg_s: [0.5, 3], v_mag: [2, 2]}"
-    testbed = at_rest(light__satellites__random=random, camera__detector__noise="false", light__limit_mag="0")
-    _, truth = render_frame(testbed, 0)
+    lab = at_rest(light__satellites__random=random, camera__detector__noise="false", light__limit_mag="0")
+    _, truth = render_frame(lab, 0)
     rows = truth.sources
     light = {satellite.id: satellite for satellite in truth.satellites}
-    camera = testbed.scene.camera
+    camera = lab.scene.camera
     inside = (np.abs(rows.xy_px - np.array(camera.center_px)) < 100).all(axis=1) & streaks(rows)
     assert np.count_nonzero(inside) >= 2
     for n in np.flatnonzero(inside):
-        expected_px = np.radians(light[rows.id[n]].rate_deg_s) * testbed.scene.exposure.time_s * camera.focal_px
+        expected_px = np.radians(light[rows.id[n]].rate_deg_s) * lab.scene.exposure.time_s * camera.focal_px
         assert rows.streak_px[n] == pytest.approx(expected_px, rel=0.03)
     assert np.ptp(rows.electrons[inside]) < 0.02 * rows.electrons[inside].max()
 
 
 def test_a_satellite_has_its_row_and_its_details_in_the_header(tmp_path: Path) -> None:
-    testbed = at_rest(light__satellites__random="{per_field: 6, seed: 3, v_mag: [1, 3]}")
-    frame, truth = render_frame(testbed, 0)
-    write_frame(tmp_path, frame, truth, testbed.scene)
+    lab = at_rest(light__satellites__random="{per_field: 6, seed: 3, v_mag: [1, 3]}")
+    frame, truth = render_frame(lab, 0)
+    write_frame(tmp_path, frame, truth, lab.scene)
     table = Table.read(tmp_path / "frame_0000.ecsv")
     assert truth.satellites
     assert [entry["id"] for entry in table.meta["satellites"]] == table["id"][table["id"] >= ID_BASE].tolist()
@@ -73,11 +73,11 @@ def test_a_long_streak_is_rejected_as_one_thing(v_mag: float) -> None:
     keys = {"exposure__time": "999 ms", "exposure__rate_hz": "1", "tracker__brightest": "1000"}
     false, streaked = [], 0
     for settings in ({}, {"light__satellites__random": random}):
-        testbed = at_rest(**keys, **settings)
-        tracker = build_tracker(testbed)
+        lab = at_rest(**keys, **settings)
+        tracker = build_tracker(lab.camera)
         counts = []
         for index in range(FRAMES):
-            frame, truth = render_frame(testbed, index)
+            frame, truth = render_frame(lab, index)
             report = solve_frame(tracker, frame)
             assert report.attitude.status == "solved"
             stars = truth.sources.flux_xy_px[~streaks(truth.sources)]

@@ -20,8 +20,8 @@ from skysim.results.files import export, recording
 from skysim.scene import loader
 from skysim.simulation import run
 from skysim.simulation.checks.plan import broken_assumptions
-from skysim.simulation.testbed import Testbed, build_testbed
-from skysim.simulation.user_parts import build_testbed_with
+from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.user_parts import build_lab_with
 from skysim.tracking.external.interface import Answer
 
 ONE = {"exposure": {"time": "10 ms", "rate_hz": 1, "frames": 1, "first": "2 s"}}
@@ -44,8 +44,8 @@ def attitudes(columns: dict[str, np.ndarray]) -> Rotation:
     return Rotation.from_euler("ZYX", np.column_stack([columns[f"{n}_deg"] for n in ("yaw", "pitch", "roll")]), True)
 
 
-def moved(scene: str = "afit_simsat", changes: dict[str, Any] | None = None, **parts: Any) -> Testbed:
-    return run.simulate_motion(build_testbed_with(skysim.load_scene(scene, ONE | (changes or {})), **parts))
+def moved(scene: str = "afit_simsat", changes: dict[str, Any] | None = None, **parts: Any) -> Lab:
+    return run.simulate_motion(build_lab_with(skysim.load_scene(scene, ONE | (changes or {})), **parts))
 
 
 def profile_scene(folder: Path, columns: dict[str, np.ndarray], **changes: Any) -> Path:
@@ -68,13 +68,13 @@ def angle(a: Rotation, b: Rotation) -> np.ndarray:
 
 def test_a_prescribed_motion_is_the_reference_itself() -> None:
     """A slew of a vehicle out of balance, at every step of a millisecond; and the rate is the reference's."""
-    testbed = moved(changes=PRESCRIBED)
-    reference = plan(testbed.scene.motion)
-    path = testbed.trajectory
+    lab = moved(changes=PRESCRIBED)
+    reference = plan(lab.scene.motion)
+    path = lab.trajectory
     assert angle(path.lab_from_body, reference.attitudes(path.t_s)).max() < 1e-15
     np.testing.assert_array_equal(path.rate_body_rad_s[::100], [reference.state_at(t)[1] for t in path.t_s[::100]])
     assert np.degrees(path.lab_from_body.magnitude()).max() > 0.3
-    np.testing.assert_array_equal(testbed.log.torque_nm, 0)
+    np.testing.assert_array_equal(lab.log.torque_nm, 0)
     pushed = moved(changes={"motion.control": "pid"})
     assert angle(pushed.trajectory.lab_from_body, reference.attitudes(path.t_s)).max() > 1e-6
 
@@ -88,9 +88,9 @@ def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
         "filter": None,
         "exposure": {"time": "10 ms", "rate_hz": 1, "frames": 1, "first": "4 s"},
     }
-    testbed = moved("simsat_bump", changes)
-    assert testbed.imu_samples is not None
-    np.testing.assert_allclose(np.degrees(testbed.imu_samples.angle_rad.sum(axis=0)), [0, 0, 8], rtol=0, atol=0.02)
+    lab = moved("simsat_bump", changes)
+    assert lab.imu_samples is not None
+    np.testing.assert_allclose(np.degrees(lab.imu_samples.angle_rad.sum(axis=0)), [0, 0, 8], rtol=0, atol=0.02)
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
 )
 def test_what_a_prescribed_motion_cannot_do_is_refused(changes: dict[str, Any], told: str) -> None:
     with pytest.raises(InputError, match=told):
-        run.simulate_motion(build_testbed(skysim.load_scene("afit_simsat", PRESCRIBED | changes)))
+        run.simulate_motion(build_lab(skysim.load_scene("afit_simsat", PRESCRIBED | changes)))
 
 
 # --- profiles -----------------------------------------------------------------------------------------------
@@ -135,12 +135,12 @@ def test_a_profile_beside_its_scene_starts_the_vehicle_and_ends_in_a_hold(tmp_pa
     columns = swing(np.arange(1.0, 4.05, 0.1))
     columns["t_s"] = columns["t_s"] - 1.0
     path = profile_scene(tmp_path, columns)
-    testbed = run.simulate_motion(build_testbed(loader.load(path, {"exposure.frames": "1", "exposure.first": "3.5 s"})))
-    begin = testbed.trajectory
+    lab = run.simulate_motion(build_lab(loader.load(path, {"exposure.frames": "1", "exposure.first": "3.5 s"})))
+    begin = lab.trajectory
     assert angle(begin.lab_from_body[0], attitudes(columns)[0]) < 1e-9
     assert np.degrees(np.linalg.norm(begin.rate_body_rad_s[0])) > 3
     assert angle(begin.lab_from_body[-1], attitudes(columns)[-1]) < 1e-3
-    assert broken_assumptions(testbed) == broken_assumptions(build_testbed(loader.load("afit_simsat")))
+    assert broken_assumptions(lab) == broken_assumptions(build_lab(loader.load("afit_simsat")))
 
 
 def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> 
     lines = table.read_text().splitlines()
     table.write_text("\n".join([*lines[:9], lines[8], *lines[9:]]))
     with pytest.raises(InputError) as raised:
-        build_testbed(loader.load(path))
+        build_lab(loader.load(path))
     told = loader.with_location(str(raised.value), str(path), {})
     assert re.fullmatch(
         rf"motion.maneuver.0: {table}, line 10: time 0.7 s is not after 0.7 s, by .* at least \({path}, line 7\)",
@@ -192,9 +192,9 @@ def test_what_the_vehicle_cannot_follow_is_refused(
 def test_the_torque_of_a_profile_is_eulers() -> None:
     """Just refused by a limit below it and just allowed above: J alpha + w x J w, largest over the samples."""
     columns = swing(TIMES)
-    testbed = build_testbed_with(skysim.load_scene("afit_simsat", ONE), profile=columns)
-    _, rate, acceleration = testbed.profiles[0].states_at(TIMES)
-    inertia = testbed.vehicle.inertia_kg_m2
+    lab = build_lab_with(skysim.load_scene("afit_simsat", ONE), profile=columns)
+    _, rate, acceleration = lab.profiles[0].states_at(TIMES)
+    inertia = lab.vehicle.inertia_kg_m2
     torque = acceleration @ inertia + np.cross(rate, rate @ inertia)
     for share, fits in ((0.999, False), (1.001, True)):
         limit = {"vehicle.torque_limit": f"{share * float(np.abs(torque).max())!r} N m"}
@@ -365,9 +365,9 @@ def test_a_function_s_attitudes_reach_the_filter_and_the_controller() -> None:
         "filter.latency": "0 s",
     }
     scene = skysim.load_scene("simsat_bump", changes)
-    testbed = build_testbed(scene)
+    lab = build_lab(scene)
     error = Rotation.from_rotvec([0, 0, math.radians(0.5)])
-    believed = testbed.mount.cam_from_body * error
+    believed = lab.camera.mount.cam_from_body * error
 
     def mine(image: np.ndarray) -> Answer:
         return Answer("solved", believed.as_quat(), np.eye(3) * 1e-10)

@@ -7,12 +7,13 @@ import datetime
 import numpy as np
 import pytest
 
+from skysim.core.constants import EARTH_RADIUS_M
+from skysim.core.time import tt_jd
 from skysim.scene.sections.orbit import CircularOrbitConfig, ExclusionConfig
 from skysim.sources.orbit import camera_orbit, earth
 from skysim.sources.orbit.availability import Pointing, place_spline, sample
 from skysim.sources.orbit.camera_orbit import CircularOrbit
 from skysim.sources.solar_system.ephemeris import load_ephemeris
-from skysim.sources.solar_system.observer import tt_jd
 
 START = datetime.datetime(2024, 3, 20, 3)
 POLE = np.array([[0.0, 0.0, 1.0]])
@@ -21,8 +22,8 @@ POLE = np.array([[0.0, 0.0, 1.0]])
 @pytest.fixture
 def sphere(monkeypatch: pytest.MonkeyPatch) -> CircularOrbit:
     """An equatorial orbit of 700 km about a round Earth without J2."""
-    monkeypatch.setattr(camera_orbit, "J2", 0.0)
-    monkeypatch.setattr(earth, "TO_SPHERE", np.full(3, 1 / earth.RADIUS_M))
+    monkeypatch.setattr(camera_orbit, "EARTH_J2", 0.0)
+    monkeypatch.setattr(earth, "TO_SPHERE", np.full(3, 1 / EARTH_RADIUS_M))
     return CircularOrbit(CircularOrbitConfig(kind="circular", altitude="700 km", inclination_deg=0.0))
 
 
@@ -44,14 +45,14 @@ def test_an_inertial_boresight_is_free_of_the_earth_by_trigonometry(
     pointing = Pointing("inertial", np.array([np.sin(tilt), 0.0, np.cos(tilt)]))
     found = sample(sphere, START, revolution_s(sphere), pointing, POLE, 0.1)
     free = found.outside(ExclusionConfig(earth_deg=earth_deg, stars=0))["Earth"].mean()
-    limit = np.cos(np.arcsin(earth.RADIUS_M / (earth.RADIUS_M + 700e3)) + np.radians(earth_deg))
+    limit = np.cos(np.arcsin(EARTH_RADIUS_M / (EARTH_RADIUS_M + 700e3)) + np.radians(earth_deg))
     expected = 1 - np.arccos(np.clip(limit / np.sin(tilt), -1, 1)) / np.pi
     assert free == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_boresight_off_the_zenith_keeps_its_angle_to_the_limb(sphere: CircularOrbit) -> None:
     found = sample(sphere, START, revolution_s(sphere)[::40], Pointing("zenith", POLE[0], 0.6, 1.1), POLE, 0.1)
-    limb_deg = 180 - np.degrees(np.arcsin(earth.RADIUS_M / (earth.RADIUS_M + 700e3)) + 0.6)
+    limb_deg = 180 - np.degrees(np.arcsin(EARTH_RADIUS_M / (EARTH_RADIUS_M + 700e3)) + 0.6)
     assert found.earth_deg == pytest.approx(np.full(500, limb_deg), abs=1e-6)
 
 

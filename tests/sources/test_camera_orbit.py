@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from skysim.core.constants import EARTH_MU_M3_S2, EARTH_RADIUS_M
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene.sections.orbit import CircularOrbitConfig, OemOrbitConfig, TleOrbitConfig
 from skysim.sources.orbit import oem
 from skysim.sources.orbit.camera_orbit import CircularOrbit, build_orbit, state_at
-from skysim.sources.orbit.earth import MU_M3_S2, RADIUS_M
 
 START = datetime.datetime(2024, 4, 10, 3)
 VANGUARD = (
@@ -49,7 +49,7 @@ def oem_text(t_s: Floats, position_m: Floats, velocity_m_s: Floats) -> str:
 def ellipse(t_s: Floats) -> tuple[Floats, Floats]:
     """An orbit of two bodies by Kepler's equation: 7000 km by an eccentricity of 0.05, in a tilted plane."""
     a, e = 7e6, 0.05
-    n = np.sqrt(MU_M3_S2 / a**3)
+    n = np.sqrt(EARTH_MU_M3_S2 / a**3)
     anomaly = n * t_s
     for _ in range(20):
         anomaly = anomaly - (anomaly - e * np.sin(anomaly) - n * t_s) / (1 - e * np.cos(anomaly))
@@ -64,8 +64,8 @@ def ellipse(t_s: Floats) -> tuple[Floats, Floats]:
 def test_a_circular_orbit_has_its_radius_speed_and_plane() -> None:
     states = circular(argument_deg=40.0).states(np.linspace(0, 6000, 50))
     radius_m = np.linalg.norm(states.position_m, axis=1)
-    assert radius_m == pytest.approx(RADIUS_M + 500e3)
-    assert np.linalg.norm(states.velocity_m_s, axis=1) == pytest.approx(np.sqrt(MU_M3_S2 / radius_m[0]), rel=2e-3)
+    assert radius_m == pytest.approx(EARTH_RADIUS_M + 500e3)
+    assert np.linalg.norm(states.velocity_m_s, axis=1) == pytest.approx(np.sqrt(EARTH_MU_M3_S2 / radius_m[0]), rel=2e-3)
     normal = np.cross(states.position_m[0], states.velocity_m_s[0])
     assert normal[2] / np.linalg.norm(normal) == pytest.approx(np.cos(np.radians(97.4)), abs=3e-4)
     start = states.position_m[0] / radius_m[0]
@@ -86,7 +86,7 @@ def test_a_sun_synchronous_orbit_turns_once_a_year() -> None:
 
 def test_an_oem_is_interpolated_between_its_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Kepler's ellipse sampled every two minutes, without J2."""
-    monkeypatch.setattr(oem, "J2", 0.0)
+    monkeypatch.setattr(oem, "EARTH_J2", 0.0)
     t_s = np.arange(-600.0, 6000.0, 120.0)
     path = tmp_path / "orbit.oem"
     path.write_text(oem_text(t_s, *ellipse(t_s)), encoding="utf-8")

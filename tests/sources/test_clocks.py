@@ -8,13 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude
 from estimator.filter.mekf import Update
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Sources
 from skysim.scene import loader
 from skysim.scene.sections.leds import ClockConfig
 from skysim.simulation import exposure
-from skysim.simulation.closed_loop import ClosedLoop
-from skysim.simulation.testbed import build_testbed, exposure_window, time_tag_error_s
+from skysim.simulation.lab import build_lab
+from skysim.simulation.motion import ClosedLoop
+from skysim.simulation.timing import exposure_window, time_tag_error_s
 from skysim.sources.dome.led import lit_moments_s
 from skysim.sources.dome.timing.clocks import Clocks, filtered_share
 
@@ -100,8 +101,8 @@ def test_filtered_leds_do_not_flicker() -> None:
     for low_pass in ("", ", filter: {time_constant: 20 ms, error: {tolerance: 0.1}}"):
         layout = "{kind: poisson_disk, spacing: 60 mm, cap_deg: 20, levels: [0.1], hardware_seed: 5}"
         drive = {"light.led.drive": f"{{kind: pwm{low_pass}}}", "light.layout": layout, "exposure.time": "1.5 ms"}
-        testbed = build_testbed(loader.load("afit_simsat_ideal", AT_REST | drive | {"camera.detector.noise": "false"}))
-        resting = testbed.at_rest(Rotation.identity(), 5)
+        lab = build_lab(loader.load("afit_simsat_ideal", AT_REST | drive | {"camera.detector.noise": "false"}))
+        resting = lab.at_rest(Rotation.identity(), 5)
         electrons = np.array([exposure.render_frame(resting, k)[1].sources.electrons for k in range(6)])
         scatter.append((electrons.std(axis=0) / electrons.mean(axis=0)).mean())
     assert 0.2 < scatter[0] < 0.5
@@ -123,9 +124,9 @@ def test_flicker_differs_from_frame_to_frame_and_from_run_to_run() -> None:
     """10.5 ms of pulses of 1 ms: light varies by up to half a pulse in ten, in every LED that is dimmed."""
     frames = []
     for seed in ("1", "2"):
-        testbed = build_testbed(loader.load("afit_simsat", AT_REST | {"seed": seed}))
+        lab = build_lab(loader.load("afit_simsat", AT_REST | {"seed": seed}))
         for index in (0, 40, 80):
-            at_rest = testbed.at_rest(testbed.trajectory.lab_from_body[0], index)
+            at_rest = lab.at_rest(lab.start, index)
             sources = exposure.render_frame(at_rest, index)[1].sources
             frames.append(dict(zip(sources.id.tolist(), sources.electrons.tolist(), strict=True)))
     ids = sorted(set.intersection(*map(set, frames)))
@@ -150,8 +151,8 @@ def test_exposures_begin_late_by_their_jitter_and_tags_err_as_the_scene_says() -
     assert error_s.mean() == pytest.approx(1e-3, abs=4 * 200e-6 / np.sqrt(2000))
     assert error_s.std() == pytest.approx(200e-6, rel=0.07)
     assert abs(np.corrcoef(late_s, error_s)[0, 1]) < 0.1
-    testbed = build_testbed(scene)
-    frame, truth = exposure.render_frame(testbed.at_rest(testbed.trajectory.lab_from_body[0]), 0)
+    lab = build_lab(scene)
+    frame, truth = exposure.render_frame(lab.at_rest(lab.start), 0)
     assert frame.t_mid_s - truth.t_s == pytest.approx(time_tag_error_s(scene, 0), abs=1e-12)
     assert truth.t_s == pytest.approx(exposure_window(scene, 0).middle_s(scene.camera.height_px), abs=1e-12)
 
@@ -161,7 +162,7 @@ def test_the_filter_allows_for_the_tag_s_error_along_the_motion() -> None:
     overrides = {"filter.time_tag_sigma": "1 ms"}
     covariance = []
     for changes in (overrides, {}):
-        loop = ClosedLoop(build_testbed(loader.load("simsat_bump", {"filter.time_tag_sigma": "0 s"} | changes)))
+        loop = ClosedLoop(build_lab(loader.load("simsat_bump", {"filter.time_tag_sigma": "0 s"} | changes)))
         navigation = loop.navigation
         assert navigation is not None
         assert navigation.filter is not None

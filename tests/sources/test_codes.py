@@ -9,7 +9,7 @@ from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.scene.sections.leds import CyclicCodeConfig, PlainCodeConfig
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 from skysim.sources.dome.timing.clocks import Clocks
 from skysim.sources.dome.timing.codebooks import codebook, light_levels
 from skysim.sources.dome.timing.codes import LedCodes
@@ -69,22 +69,22 @@ def test_a_bit_of_several_levels_fails_to_any_other_level() -> None:
 
 def test_a_run_s_code_begins_anywhere_and_its_clock_is_the_hardware_s() -> None:
     settings = {"light.led.code": "{kind: cyclic, bit_time: 20 ms}", "light.led.clock": "{offset_ppm: 50}"}
-    testbed = build_testbed(loader.load(SCENE, settings))
-    runs = [testbed.in_run(seed).codes for seed in (5, 6)]
+    lab = build_lab(loader.load(SCENE, settings))
+    runs = [lab.in_run(seed).codes for seed in (5, 6)]
     assert runs[0].clock.offset == runs[1].clock.offset
     assert abs(runs[0].clock.on_s - runs[1].clock.on_s) > 1
-    assert build_testbed(loader.load("afit_simsat")).codes is None
+    assert build_lab(loader.load("afit_simsat")).codes is None
 
 
 def test_a_rendered_led_has_the_light_of_its_bits() -> None:
     """The same attitude in frames of different bits; the electrons of the truth, per LED, over those of another."""
     settings = {"light.led.code.depth": "0.25", "motion.control": "null", "motion.maneuver": "[]"}
-    testbed = build_testbed(loader.load(SCENE, settings))
-    at_rest = testbed.at_rest(testbed.trajectory.lab_from_body[0], 9)
+    lab = build_lab(loader.load(SCENE, settings))
+    at_rest = lab.at_rest(lab.start, 9)
     truths = [render_frame(at_rest, frame)[1].sources for frame in (2, 9)]
     assert len(truths[0].id) >= 3
-    row = np.searchsorted(testbed.sources.id, truths[0].id)
-    expected = [np.where(testbed.codes.words[row, bit], 1.0, 0.75) for bit in (2, 9)]
+    row = np.searchsorted(lab.camera.sources.id, truths[0].id)
+    expected = [np.where(lab.camera.codes.words[row, bit], 1.0, 0.75) for bit in (2, 9)]
     assert len(set((expected[0] / expected[1]).tolist())) > 1
     np.testing.assert_array_equal(truths[0].id, truths[1].id)
     np.testing.assert_allclose(truths[0].electrons / truths[1].electrons, expected[0] / expected[1], rtol=1e-6, atol=0)

@@ -16,7 +16,8 @@ from skysim.scene import loader
 from skysim.scene.sections import layouts
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed, build_testbed, exposure_window, light_sources
+from skysim.simulation.lab import Lab, build_lab, light_sources
+from skysim.simulation.timing import exposure_window
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
 from skysim.sources.dome.displays import display
@@ -243,8 +244,8 @@ def light_s(drawn: Sources, exposure_s: float) -> np.ndarray:
 def test_on_the_frame_rows_are_dark_whose_turn_is_not_in_the_exposure() -> None:
     """NPS's stars lit for a quarter of a frame, in an exposure of a quarter: by each row's own turn, or not at all."""
     changes = {"light.led.drive.duty": "0.25", "exposure.time": f"{1000 / 240} ms", "light.led.scatter": "0"}
-    dark = build_testbed(loader.load("nps_tas2", changes))
-    steady = build_testbed(loader.load("nps_tas2", changes | {"light.led.drive": "{kind: direct}"}))
+    dark = build_lab(loader.load("nps_tas2", changes))
+    steady = build_lab(loader.load("nps_tas2", changes | {"light.led.drive": "{kind: direct}"}))
     window = exposure_window(dark.scene, 0)
     assert dark.clocks is not None
     trains = dark.clocks.pulses_at(dark.sources, window.middle_s(dark.scene.camera.height_px))
@@ -311,21 +312,21 @@ def test_a_bench_s_stars_follow_pogson_to_half_a_gray() -> None:
 def test_a_camera_on_a_lever_sees_no_parallax_but_that_of_the_collimation(conjugate_m: float | None) -> None:
     """Stars at D are seen along D d - r, in the light of 1 / |D d - r|^2; r is SimSat's camera, tilted."""
     told = {} if conjugate_m is None else {"light.conjugate": f"{conjugate_m} m"}
-    testbed = build_testbed(
+    lab = build_lab(
         loader.load(
             "collimated_display",
             told | {"vehicle.model": "vehicles/simsat.xml", "motion.start.roll_deg": "6"},
         )
     )
-    central = build_testbed(loader.load("collimated_display", {"motion.start.roll_deg": "6"}))
-    _, moved = exposure.render_frame(testbed, 0)
+    central = build_lab(loader.load("collimated_display", {"motion.start.roll_deg": "6"}))
+    _, moved = exposure.render_frame(lab, 0)
     _, still = exposure.render_frame(central, 0)
     both, ours, theirs = np.intersect1d(moved.sources.id, still.sources.id, return_indices=True)
-    camera_m = moved.lab_from_body.apply(testbed.mount.camera_body_m)
+    camera_m = moved.lab_from_body.apply(lab.camera.mount.camera_body_m)
     direction = central.sources.place[[np.flatnonzero(central.sources.id == n)[0] for n in both], :3]
     ray = direction if conjugate_m is None else conjugate_m * direction - camera_m
     xyz = moved.cam_from_lab.apply(ray)
-    camera = testbed.scene.camera
+    camera = lab.scene.camera
     wanted = np.array(camera.center_px) + camera.focal_px * xyz[:, :2] / xyz[:, 2:]
     np.testing.assert_allclose(moved.sources.xy_px[ours], wanted, rtol=0, atol=1e-6)
     shift_px = np.abs(moved.sources.xy_px[ours] - still.sources.xy_px[theirs]).max()
@@ -344,11 +345,11 @@ def test_a_camera_on_a_lever_sees_no_parallax_but_that_of_the_collimation(conjug
 # Black that glows
 
 
-def glow_e_s(testbed: Testbed) -> np.ndarray:
-    lab_from_body = testbed.trajectory.attitude_at(0.5)
-    camera_m = lab_from_body.apply(testbed.mount.camera_body_m)
-    cam_from_lab = testbed.mount.cam_from_body * lab_from_body.inv()
-    glow = display_glow.black_glow(testbed.scene.light, testbed.optics, cam_from_lab, camera_m, testbed.band)
+def glow_e_s(lab: Lab) -> np.ndarray:
+    lab_from_body = lab.trajectory.attitude_at(0.5)
+    camera_m = lab_from_body.apply(lab.camera.mount.camera_body_m)
+    cam_from_lab = lab.camera.mount.cam_from_body * lab_from_body.inv()
+    glow = display_glow.black_glow(lab.scene.light, lab.camera.optics, cam_from_lab, camera_m, lab.camera.band)
     assert glow is not None
     return glow
 
@@ -371,10 +372,10 @@ def test_a_black_panel_s_glow_is_that_of_all_its_pixels_by_the_contrast() -> Non
         "exposure.time": "100 ms",
         "motion.start": "{roll_deg: 4, pitch_deg: -3, yaw_deg: 10}",
     }
-    white = build_testbed(loader.load("nps_tas2", changes))
+    white = build_lab(loader.load("nps_tas2", changes))
     seen = exposure.render_frame(white, 0)[1].sources
     assert len(seen.id) == 300
-    gray = build_testbed(loader.load("nps_tas2", changes | {"light.layout.contrast": "500"}))
+    gray = build_lab(loader.load("nps_tas2", changes | {"light.layout.contrast": "500"}))
     glow = glow_e_s(gray)
     assert glow.sum() == pytest.approx(seen.electrons.sum() / 0.1 / 500, rel=0.01)
     assert 0.05 < np.mean(glow > 0) < 0.2
@@ -385,15 +386,15 @@ def test_a_black_panel_s_glow_is_that_of_all_its_pixels_by_the_contrast() -> Non
 def test_a_black_bench_s_glow_is_that_of_its_pixels_in_the_chip_s() -> None:
     """A pixel of the chip holds (81.7 / 37.1)^2 of the display's, each 1 / contrast of a white star; none beside it."""
     changes = {"light.contrast": "400", "motion.start": "{roll_deg: 0, pitch_deg: 0, yaw_deg: 0}"}
-    testbed = build_testbed(loader.load("collimated_display", changes))
-    glow, camera = glow_e_s(testbed), testbed.scene.camera
-    white_e_s = float(star_flux_e_s_m2(0.0, *SUN, testbed.band)) * testbed.optics.collecting_m2
+    lab = build_lab(loader.load("collimated_display", changes))
+    glow, camera = glow_e_s(lab), lab.scene.camera
+    white_e_s = float(star_flux_e_s_m2(0.0, *SUN, lab.camera.band)) * lab.camera.optics.collecting_m2
     pixels = (45e-3 / 8.1e-6 / camera.focal_px) ** 2
     assert glow[246, 329] == pytest.approx(white_e_s * pixels / 400, rel=1e-3)
     rows = np.flatnonzero(glow[:, 329] > 0)
     assert len(rows) == 493  # 11.1 of 12.3 deg
     tilted = changes | {"motion.start": "{roll_deg: 4, pitch_deg: 0, yaw_deg: 0}"}
-    seen = np.sum(glow_e_s(build_testbed(loader.load("collimated_display", tilted)))[:, 329] > 0)
+    seen = np.sum(glow_e_s(build_lab(loader.load("collimated_display", tilted)))[:, 329] > 0)
     half_deg = np.degrees(np.arctan(600 * 8.1e-6 / 45e-3))
     wanted = 246.5 + camera.focal_px * np.tan(np.radians(half_deg - 4))
     assert seen == pytest.approx(wanted, abs=1)
@@ -403,8 +404,8 @@ def test_a_black_bench_s_glow_is_that_of_its_pixels_in_the_chip_s() -> None:
 def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None:
     """A noise-free frame with it less one without is the glow by the exposure, but for what is taken off the stars."""
     silent = {"camera.detector.noise": "false"}
-    plain = build_testbed(loader.load("collimated_display", silent))
-    glowing = build_testbed(loader.load("collimated_display", silent | {"light.contrast": "200"}))
+    plain = build_lab(loader.load("collimated_display", silent))
+    glowing = build_lab(loader.load("collimated_display", silent | {"light.contrast": "200"}))
     more = exposure.render_frame(glowing, 0)[0].image_dn - exposure.render_frame(plain, 0)[0].image_dn
     gain, time_s = plain.scene.camera.detector.gain_e_dn, plain.scene.exposure.time_s
     wanted = np.median(glow_e_s(glowing)) * time_s / gain
@@ -433,7 +434,10 @@ def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None
             "light.led.drive: pwm cannot drive an lcd; allowed: direct",
         ),
         ({"light.led.drive.duty": "0"}, "light.led.drive.duty: 0 is not allowed"),
-        ({"light.layout.block": "2000"}, "light.layout.block: 2000 is wider than the display; allowed: up to 1050 pixels"),
+        (
+            {"light.layout.block": "2000"},
+            "light.layout.block: 2000 is wider than the display; allowed: up to 1050 pixels",
+        ),
         ({"light.layout.gray_levels": "1"}, "light.layout.gray_levels: 1 is not allowed"),
         (
             {"light.layout.points.kind": "patch_boards"},

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats, Sources
 from skysim.scene import loader
 from skysim.scene.sections.light import DomeConfig

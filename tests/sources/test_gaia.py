@@ -12,7 +12,7 @@ from skysim.core.errors import InputError
 from skysim.core.paths import CATALOGS
 from skysim.core.types import Floats
 from skysim.scene import loader
-from skysim.simulation.testbed import build_testbed, build_tracker
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.sources import catalog, gaia
 from skysim.sources.catalog import Catalog
 from skysim.sources.stars import varied
@@ -215,12 +215,12 @@ def test_long_period_variables_scatter_and_standard_stars_do_not(sky: Catalog) -
 def test_a_sky_without_variable_stars_refuses_a_seed_of_them() -> None:
     keys = {"light.catalog": "hipparcos_hp6.5", "light.variability_seed": "1"}
     with pytest.raises(InputError, match=r"light\.variability_seed: hipparcos_hp6\.5 has no variable stars"):
-        build_testbed(loader.load("shefex2", keys))
+        build_lab(loader.load("shefex2", keys))
 
 
 def test_the_tracker_does_not_know_how_bright_a_variable_is() -> None:
     """The scene's stars shine as drawn; the tracker's catalog and the stars' places are as before."""
-    steady, varying = (build_testbed(loader.load("shefex2", keys)) for keys in ({}, {"light.variability_seed": "1"}))
+    steady, varying = (build_lab(loader.load("shefex2", keys)) for keys in ({}, {"light.variability_seed": "1"}))
     common = np.isin(varying.sources.id, steady.sources.id)
     places = dict(zip(steady.sources.id.tolist(), steady.sources.place[:, :3].tolist(), strict=True))
     assert [places[n] for n in varying.sources.id[common].tolist()] == varying.sources.place[common, :3].tolist()
@@ -242,9 +242,9 @@ def test_a_scene_takes_a_file_of_its_folder_for_sky_and_tracker(tmp_path: Path) 
     path.write_text(
         "schema: 1\nbase: shefex2\nlight: {catalog: mine.ecsv, limit_mag: 4}\ntracker: {catalog: mine.ecsv}\n"
     )
-    testbed = build_testbed(loader.load(path))
-    assert len(testbed.sources) == np.sum(catalog.read("hipparcos_hp6.5").v_mag <= 4)
-    assert build_tracker(testbed).stars.epoch_yr == 2000.0
+    lab = build_lab(loader.load(path))
+    assert len(lab.camera.sources) == np.sum(catalog.read("hipparcos_hp6.5").v_mag <= 4)
+    assert build_tracker(lab.camera).stars.epoch_yr == 2000.0
 
 
 @pytest.mark.parametrize("key", ["light", "tracker"])
@@ -260,7 +260,7 @@ def test_a_wrong_catalog_is_refused_in_one_line(tmp_path: Path, key: str, value:
     (tmp_path / "map.ecsv").write_text("# %ECSV 1.0\na,b\n1,2\n")
     scene = loader.load("shefex2", {f"{key}.catalog": value.format(path=tmp_path / "map.ecsv")})
     with pytest.raises(InputError) as refusal:
-        build_tracker(build_testbed(scene))
+        build_tracker(build_lab(scene).camera)
     assert str(refusal.value).startswith(f"{key}.catalog: ")
     assert message in str(refusal.value)
     assert "\n" not in str(refusal.value)

@@ -15,7 +15,8 @@ from skysim.core.types import Floats, Sources
 from skysim.scene import loader
 from skysim.scene.sections.leds import AgingConfig, CosineLobeConfig, LedConfig, LobeTableConfig, WarmUpConfig
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import build_testbed, exposure_window
+from skysim.simulation.lab import build_lab
+from skysim.simulation.timing import exposure_window
 from skysim.sources.dome import sources
 from skysim.sources.dome.led import FALLOFF, LOBES, Emitter, aging_factors, irradiance_e_s_m2, warm_up_factor
 from skysim.sources.photometry import Band, led_strength_e_s_sr
@@ -191,10 +192,10 @@ def test_panels_age_as_one() -> None:
     """Their pixels, and the glow of the black ones."""
     keys = {"light.layout.contrast": "500"}
     testbeds = [
-        build_testbed(loader.load("nps_tas2", keys | more))
+        build_lab(loader.load("nps_tas2", keys | more))
         for more in ({}, {"light.led.aging": "{hours: 9000, life_hours: 18000}"})
     ]
-    new, old = (testbed.sources.strength for testbed in testbeds)
+    new, old = (lab.camera.sources.strength for lab in testbeds)
     np.testing.assert_allclose(old / new, math.sqrt(0.7), rtol=1e-12)
     glows = [black_glow(one.scene.light, one.optics, Rotation.identity(), np.zeros(3), one.band) for one in testbeds]
     assert glows[0] is not None
@@ -231,5 +232,5 @@ def test_all_light_of_the_leds_falls_while_they_warm_up(scene: str, keys: dict[s
 
 
 def still(scene: str, keys: dict[str, str], index: int) -> Floats:
-    testbed = build_testbed(loader.load(scene, keys))
-    return render_frame(testbed.at_rest(testbed.trajectory.lab_from_body[0], index), index)[0].image_dn
+    lab = build_lab(loader.load(scene, keys))
+    return render_frame(lab.at_rest(lab.start, index), index)[0].image_dn

@@ -21,7 +21,7 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig, curve_file
 from skysim.scene.sections.leds import LedConfig
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 from skysim.sources import catalog
 from skysim.sources.dome.led import color_factors, full_strength_e_s_sr
 from skysim.sources.photometry import (
@@ -449,8 +449,8 @@ def test_a_gray_curve_gives_the_frame_of_its_number(scene: str, keys: dict[str, 
 
 
 def still_frame(scene: Scene) -> Floats:
-    testbed = build_testbed(scene)
-    return render_frame(testbed.at_rest(testbed.trajectory.lab_from_body[0]), 0)[0].image_dn
+    lab = build_lab(scene)
+    return render_frame(lab.at_rest(lab.start), 0)[0].image_dn
 
 
 def test_a_lens_that_lets_nothing_to_the_chip_is_refused(tmp_path: Path) -> None:

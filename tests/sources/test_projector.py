@@ -13,7 +13,7 @@ from skysim.core.types import Floats, Sources
 from skysim.scene import loader
 from skysim.scene.sections.layouts import ProjectorConfig
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 from skysim.sources import dome
 from skysim.sources.dome.displays import projector
 from skysim.sources.dome.led import full_strength_e_s_sr
@@ -139,20 +139,20 @@ def test_black_glows_as_all_pixels_by_the_contrast() -> None:
     In the frame's middle, and nothing beside the picture.
     """
     changes = {"light.layout.contrast": "500", "light.led.drive": "{kind: direct}", "light.led.lobe.exponent": "1"}
-    testbed = build_testbed(loader.load("projected_dome", changes))
-    scene, lab_from_body = testbed.scene, testbed.trajectory.attitude_at(0.5)
+    lab = build_lab(loader.load("projected_dome", changes))
+    scene, lab_from_body = lab.scene, lab.trajectory.attitude_at(0.5)
     assert isinstance(scene.light, DomeConfig)
     assert isinstance(scene.light.layout, ProjectorConfig)
-    camera_m = lab_from_body.apply(testbed.mount.camera_body_m)
-    cam_from_lab = testbed.mount.cam_from_body * lab_from_body.inv()
-    glow = display_glow.black_glow(scene.light, testbed.optics, cam_from_lab, camera_m, testbed.band)
+    camera_m = lab_from_body.apply(lab.camera.mount.camera_body_m)
+    cam_from_lab = lab.camera.mount.cam_from_body * lab_from_body.inv()
+    glow = display_glow.black_glow(scene.light, lab.camera.optics, cam_from_lab, camera_m, lab.camera.band)
     assert glow is not None
     shell = surface.build_surface(scene.light.surface)
     axis = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
     place_m = shell.meet(camera_m, axis[None])
     per_m2 = projector.white_wall_per_m2(scene.light.layout, place_m, shell.inward(place_m))[0]
-    radiance = full_strength_e_s_sr(scene.light.led, testbed.band) * per_m2 / 500
-    etendue = testbed.optics.collecting_m2 * testbed.optics.throughput(np.ones(1))[0] / scene.camera.focal_px**2
+    radiance = full_strength_e_s_sr(scene.light.led, lab.camera.band) * per_m2 / 500
+    etendue = lab.camera.optics.collecting_m2 * lab.camera.optics.throughput(np.ones(1))[0] / scene.camera.focal_px**2
     x, y = np.rint(scene.camera.center_px).astype(int)
     assert glow[y, x] == pytest.approx(radiance * etendue, rel=2e-3)
     spot = {
@@ -160,7 +160,7 @@ def test_black_glows_as_all_pixels_by_the_contrast() -> None:
         "light.layout.points.count": "10",
         "light.layout.focal_length": "0.1 m",
     }
-    narrow = build_testbed(loader.load("projected_dome", changes | spot | {"light.layout.aim": "[0 m, 0 m, 1.2 m]"}))
+    narrow = build_lab(loader.load("projected_dome", changes | spot | {"light.layout.aim": "[0 m, 0 m, 1.2 m]"}))
     assert isinstance(narrow.scene.light, DomeConfig)
     dark = display_glow.black_glow(narrow.scene.light, narrow.optics, cam_from_lab, camera_m, narrow.band)
     assert dark is not None

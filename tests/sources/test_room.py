@@ -17,7 +17,7 @@ from skysim.scene import loader
 from skysim.scene.sections import light
 from skysim.scene.sections.light import DomeConfig, RoomConfig
 from skysim.simulation import checks
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 from skysim.sources import dome
 from skysim.sources.dome.shell import room as rooms
 from skysim.sources.dome.shell import surface
@@ -111,9 +111,7 @@ def test_the_check_says_how_a_dome_fits_its_room() -> None:
     surface_text = "{kind: sphere, apex: 1.5 m, radius: 1.5 m, rim_height: 0.9 m}"
     layout = "{kind: fibonacci, count: 300, cap_deg: 40}"
     changes = {"light.surface": surface_text, "light.layout": layout, "light.room": room}
-    (fact,) = [
-        one for one in checks.check(build_testbed(loader.load("afit_simsat", changes))).facts if one.name == "room"
-    ]
+    (fact,) = [one for one in checks.check(build_lab(loader.load("afit_simsat", changes))).facts if one.name == "room"]
     sides = " x ".join(
         f"{side:.2f}"
         for side in rooms.largest_part_m(
@@ -130,7 +128,7 @@ def test_the_check_says_how_a_dome_fits_its_room() -> None:
     ]
     assert fact.values["top_m"] == pytest.approx(2.5, abs=1e-9)
     assert fact.values["extent_m"] == pytest.approx([2.4, 2.4, 0.6], abs=1e-9)
-    free = checks.check(build_testbed(loader.load("afit_simsat"))).facts
+    free = checks.check(build_lab(loader.load("afit_simsat"))).facts
     assert "room" not in {one.name for one in free}
 
 

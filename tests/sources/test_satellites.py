@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from skysim.core.constants import EARTH_FLATTENING, EARTH_RADIUS_M
 from skysim.core.errors import InputError
+from skysim.core.time import tt_jd
 from skysim.scene.sections.orbit import RandomSatellitesConfig
 from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.orbit import earth, elements, satellites
 from skysim.sources.orbit.satellites import View
-from skysim.sources.solar_system.observer import GcrsState, site_in_gcrs, tt_jd
+from skysim.sources.solar_system.observer import GcrsState, site_in_gcrs
 
 # Satellite 00005 of Vallado et al. 2006 (AIAA 2006-6753), and its TEME states of tcppver.out, km and km/s.
 VANGUARD = (
@@ -149,7 +151,7 @@ def test_the_shadow_is_a_cone_behind_the_earth() -> None:
     """On a circle about the Earth's axis the umbra ends where the limb hides all of the Sun."""
     sun_m, radius_m = np.array([1.496e11, 0.0, 0.0]), 7e6
     sun_rad = np.arcsin(earth.SUN_RADIUS_M / 1.496e11)
-    limb_rad = np.arccos(earth.RADIUS_M / radius_m)  # beyond 90 degrees from the Sun
+    limb_rad = np.arccos(EARTH_RADIUS_M / radius_m)  # beyond 90 degrees from the Sun
 
     def lit(angle_rad: float) -> float:
         place = radius_m * np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0])
@@ -168,7 +170,7 @@ def test_the_shadow_is_a_cone_behind_the_earth() -> None:
 
 def test_the_earth_hides_what_is_behind_its_ellipsoid() -> None:
     high = np.array([0.0, 0.0, 7e6])
-    pole_m = earth.RADIUS_M * (1 - earth.FLATTENING)
+    pole_m = EARTH_RADIUS_M * (1 - EARTH_FLATTENING)
     limb_rad = np.arcsin(pole_m / 7e6)
     for off, hidden in ((-0.02, True), (0.02, False)):  # from the nadir to the limb
         direction = np.array([np.sin(limb_rad + off), 0.0, -np.cos(limb_rad + off)])
@@ -176,7 +178,7 @@ def test_the_earth_hides_what_is_behind_its_ellipsoid() -> None:
     down = np.array([0.0, 0.0, -1.0])
     assert not earth.hidden_by_earth(high, down, 7e6 - pole_m - 1)
     assert earth.hidden_by_earth(high, down, 7e6 - pole_m + 1)
-    ground = np.array([earth.RADIUS_M, 0.0, 0.0])
+    ground = np.array([EARTH_RADIUS_M, 0.0, 0.0])
     horizon = np.array([[0.001, 1.0, 0.0], [-0.001, 1.0, 0.0]])
     assert earth.hidden_by_earth(ground, horizon).tolist() == [False, True]
 

@@ -16,7 +16,7 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections import light
 from skysim.scene.sections.tracker import SurveyErrorsConfig
 from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.sources.dome.shell import surface
 from skysim.sources.dome.shell.surface import Surface
 from skysim.sources.dome.survey import survey_errors
@@ -39,12 +39,12 @@ def loaded(name: str = "afit_simsat", **changes: str) -> Scene:
     return loader.load(name, {key.replace("__", "."): value for key, value in changes.items()}, refuses_unused=False)
 
 
-def believing(**changes: str) -> tuple[DomeTracker, Testbed]:
+def believing(**changes: str) -> tuple[DomeTracker, Lab]:
     """The tracker of afit_simsat with these changes, and its lab."""
-    testbed = build_testbed(loaded(**changes))
-    eyes = build_tracker(testbed)
+    lab = build_lab(loaded(**changes))
+    eyes = build_tracker(lab.camera)
     assert isinstance(eyes, DomeTracker)
-    return eyes, testbed
+    return eyes, lab
 
 
 def is_chi_square(normal: Floats) -> None:
@@ -63,15 +63,15 @@ def inside_of(**more: Any) -> Surface:
 
 
 def test_every_led_is_believed_off_by_its_own_error_about_each_axis() -> None:
-    eyes, testbed = believing(tracker__survey="{led_sigma: 0.2 mm, seed: 3}")
-    error = (eyes.leds.position_m - testbed.sources.place[:, :3]) / 0.2e-3
+    eyes, lab = believing(tracker__survey="{led_sigma: 0.2 mm, seed: 3}")
+    error = (eyes.leds.position_m - lab.camera.sources.place[:, :3]) / 0.2e-3
     assert len(error) > 1000
     for axis in error.T:
         is_chi_square(axis)
     # The mean is zero, and no two axes or neighbors go together: sums of N independent numbers of variance 1.
     for products in (error, error * np.roll(error, 1, axis=1), error * np.roll(error, 1, axis=0)):
         assert np.abs(products.mean(axis=0)).max() < 5 / np.sqrt(len(error))
-    np.testing.assert_array_equal(eyes.leds.id, testbed.sources.id)
+    np.testing.assert_array_equal(eyes.leds.id, lab.camera.sources.id)
 
 
 def test_over_the_seeds_the_camera_s_place_errs_by_lever_sigma() -> None:
@@ -106,11 +106,11 @@ def test_a_raised_sphere_is_a_greater_sphere_with_its_leds_on_it() -> None:
 
 def test_a_raised_ellipsoid_bears_its_leds_to_within_kantorovich_s_bound() -> None:
     """The LEDs' own believed height is all of the draw, the ellipsoid's at least 2 sqrt(a b) / (a + b) of it."""
-    eyes, testbed = believing(light__surface__error="2 mm", tracker__survey="{seed: 4}")
-    assert testbed.scene.light.kind == "dome"
-    raised_m = survey_errors.surface_offset_m(surface.build_surface(testbed.scene.light.surface), 4)
+    eyes, lab = believing(light__surface__error="2 mm", tracker__survey="{seed: 4}")
+    assert lab.scene.light.kind == "dome"
+    raised_m = survey_errors.surface_offset_m(surface.build_surface(lab.scene.light.surface), 4)
     leds = eyes.leds
-    directions = (testbed.sources.place[:, :3] - leds.center_m) / leds.semi_axes_m**2
+    directions = (lab.camera.sources.place[:, :3] - leds.center_m) / leds.semi_axes_m**2
     normals = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     support = np.linalg.norm(normals * leds.semi_axes_m, axis=1)  # of the plane that touches it with that normal
     true_axes_m = leds.semi_axes_m - raised_m
@@ -119,7 +119,7 @@ def test_a_raised_ellipsoid_bears_its_leds_to_within_kantorovich_s_bound() -> No
     assert share.min() > 2 * np.sqrt(longest * shortest) / (longest + shortest) - 1e-3
     assert share.max() < 1 + 1e-3
     # Patch boards are flat and stand a little off the surface, where the normal is nearly the same.
-    moved_m = np.sum((leds.position_m - testbed.sources.place[:, :3]) * normals, axis=1)
+    moved_m = np.sum((leds.position_m - lab.camera.sources.place[:, :3]) * normals, axis=1)
     np.testing.assert_allclose(moved_m, raised_m, rtol=1e-4, atol=0)
 
 
@@ -127,13 +127,13 @@ def test_a_raised_ellipsoid_bears_its_leds_to_within_kantorovich_s_bound() -> No
 
 
 def test_without_errors_the_map_is_the_truth_bit_for_bit() -> None:
-    eyes, testbed = believing(tracker__survey="{seed: 11}")
-    assert testbed.scene.light.kind == "dome"
-    center_m, semi_axes_m = surface.build_surface(testbed.scene.light.surface).as_ellipsoid()
-    assert eyes.leds.position_m.tobytes() == testbed.sources.place[:, :3].tobytes()
+    eyes, lab = believing(tracker__survey="{seed: 11}")
+    assert lab.scene.light.kind == "dome"
+    center_m, semi_axes_m = surface.build_surface(lab.scene.light.surface).as_ellipsoid()
+    assert eyes.leds.position_m.tobytes() == lab.camera.sources.place[:, :3].tobytes()
     assert eyes.leds.center_m.tobytes() == center_m.tobytes()
     assert eyes.leds.semi_axes_m.tobytes() == semi_axes_m.tobytes()
-    assert eyes.lever.camera_body_m.tobytes() == testbed.mount.camera_body_m.tobytes()
+    assert eyes.lever.camera_body_m.tobytes() == lab.camera.mount.camera_body_m.tobytes()
 
 
 ALL = "{{led_sigma: 0.2 mm, lever_sigma: {lever}, seed: {seed}}}"
@@ -153,18 +153,18 @@ def test_the_survey_is_hardware_the_frames_seed_does_not_touch_it_and_its_own_do
 
 def test_one_error_more_leaves_the_others_as_they_were() -> None:
     alone, _ = believing(tracker__survey=ALL.format(lever="0 m", seed=5))
-    both, testbed = believing(tracker__survey=ALL.format(lever="0.1 mm", seed=5))
+    both, lab = believing(tracker__survey=ALL.format(lever="0.1 mm", seed=5))
     assert alone.leds.position_m.tobytes() == both.leds.position_m.tobytes()
-    assert alone.lever.camera_body_m.tobytes() == testbed.mount.camera_body_m.tobytes()
-    assert both.lever.camera_body_m.tobytes() != testbed.mount.camera_body_m.tobytes()
+    assert alone.lever.camera_body_m.tobytes() == lab.camera.mount.camera_body_m.tobytes()
+    assert both.lever.camera_body_m.tobytes() != lab.camera.mount.camera_body_m.tobytes()
 
 
 def test_the_hardware_does_not_know_how_it_is_surveyed() -> None:
     """Frames are the same whatever is believed."""
     frames = []
     for told in ("{}", ALL.format(lever="5 mm", seed=1)):
-        testbed = build_testbed(loaded(tracker__survey=told, exposure=BARE_CAMERA["exposure"]))
-        frames.append(exposure.render_frame(testbed, 0)[0].image_dn.tobytes())
+        lab = build_lab(loaded(tracker__survey=told, exposure=BARE_CAMERA["exposure"]))
+        frames.append(exposure.render_frame(lab, 0)[0].image_dn.tobytes())
     assert frames[0] == frames[1]
 
 
@@ -178,15 +178,15 @@ def test_a_pupil_believed_aside_turns_the_attitude_by_its_shift_over_the_led_s_d
     Across the boresight, to 5 %: LEDs 4 deg aside, about as many as the field is wide, are not at p.
     """
     told = f"{{lever_sigma: 2 mm, seed: {seed}}}"
-    eyes, testbed = believing(tracker__survey=told, motion__start="{roll_deg: 7}", **BARE_CAMERA)
-    frame, truth = exposure.render_frame(testbed, 0)
+    eyes, lab = believing(tracker__survey=told, motion__start="{roll_deg: 7}", **BARE_CAMERA)
+    frame, truth = exposure.render_frame(lab, 0)
     answer = factory.solve_frame(eyes, frame).attitude
     assert answer.status == "solved"
     assert answer.cam_from_ref is not None
-    shift = eyes.lever.camera_body_m - testbed.mount.camera_body_m
+    shift = eyes.lever.camera_body_m - lab.camera.mount.camera_body_m
     to_body = truth.lab_from_body.inv()
-    middle = to_body.apply(testbed.sources.place[np.isin(testbed.sources.id, truth.sources.id), :3]).mean(axis=0)
-    expected = testbed.mount.cam_from_body.apply(np.cross(middle, shift) / (middle @ middle))
+    middle = to_body.apply(lab.camera.sources.place[np.isin(lab.camera.sources.id, truth.sources.id), :3]).mean(axis=0)
+    expected = lab.camera.mount.cam_from_body.apply(np.cross(middle, shift) / (middle @ middle))
     found = (answer.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec()
     assert np.linalg.norm(expected[:2]) > 1e-3
     np.testing.assert_allclose(found[:2], expected[:2], rtol=0, atol=0.05 * np.linalg.norm(expected[:2]))

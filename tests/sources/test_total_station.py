@@ -16,7 +16,7 @@ from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.scene.sections import light
 from skysim.scene.sections.tracker import SurveyErrorsConfig, TotalStationConfig
-from skysim.simulation.testbed import build_testbed, build_tracker
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.sources.dome.shell import surface
 from skysim.sources.dome.survey import survey_errors, total_station
 
@@ -197,7 +197,7 @@ def test_the_final_match_admits_what_the_identification_admits() -> None:
     beside = {"kind": "total_station", "position": ["1 m", "0 m", "-0.5 m"], "angle_sigma_arcsec": 2}
     survey = {"instrument": beside | {"distance_sigma": "1 mm"}, "seed": 1}
     scene = loader.load("afit_simsat", {"tracker.survey": yaml.safe_dump(survey, default_flow_style=True, width=999)})
-    tracker = build_tracker(build_testbed(scene))
+    tracker = build_tracker(build_lab(scene).camera)
     assert isinstance(tracker, DomeTracker)
     index = build_dome_index(tracker.leds, tracker.lever, tracker.camera)
     assert 0.1e-3 < tracker.leds.sigma_m < 0.6e-3
@@ -268,7 +268,7 @@ def test_over_the_seeds_the_focal_length_errs_as_its_survey_says() -> None:
     ]
     assert np.abs(error).max() <= 20e-6
     assert np.std(error) == pytest.approx(20e-6 / np.sqrt(3), rel=0.1)
-    testbed = build_testbed(loader.load("shefex2", {"tracker.survey": "{focal_length_sigma: 10 um, seed: 4}"}))
-    camera = build_tracker(testbed).camera
+    lab = build_lab(loader.load("shefex2", {"tracker.survey": "{focal_length_sigma: 10 um, seed: 4}"}))
+    camera = build_tracker(lab.camera).camera
     assert camera.focal_sigma == pytest.approx(10e-6 / 0.025, rel=1e-12)
-    assert camera.focal_px != pytest.approx(testbed.scene.camera.focal_px, rel=1e-6)
+    assert camera.focal_px != pytest.approx(lab.scene.camera.focal_px, rel=1e-6)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.scene import loader
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.testbed import build_testbed, build_tracker
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.tracking.factory import solve_frame
 
 LEVELS = {
@@ -26,11 +26,11 @@ LEVELS = {
 @pytest.mark.parametrize("drive", [{}, {"light.led.drive": "{kind: direct}"}])
 def test_measured_fluxes_scatter_about_the_expected_ones_as_leds_do(drive: dict[str, str]) -> None:
     """By 8 % from LED to LED, as the scene has it, and little more; and every attitude of the spiral is found."""
-    testbed = build_testbed(loader.load("coded_spiral", LEVELS | drive))
-    tracker, ratios = build_tracker(testbed), []
+    lab = build_lab(loader.load("coded_spiral", LEVELS | drive))
+    tracker, ratios = build_tracker(lab.camera), []
     for frame in range(6):
         tilt = Rotation.from_euler("zyx", [60 * frame, 4 * frame, -3 * frame], degrees=True)
-        rendered, truth = render_frame(testbed.at_rest(tilt, frame), frame)
+        rendered, truth = render_frame(lab.at_rest(tilt, frame), frame)
         report = solve_frame(tracker, rendered)
         assert report.attitude.solved
         match = report.attitude.match

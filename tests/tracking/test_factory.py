@@ -20,7 +20,7 @@ from skysim.scene import loader
 from skysim.simulation import run
 from skysim.simulation.checks import check
 from skysim.simulation.checks.dome import assumptions
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking import exposure_control
 from skysim.tracking.exposure_control import ExposureController
 from skysim.tracking.navigation import Navigation, build_filter
@@ -35,17 +35,17 @@ SINGLE = {"tracker.detector": "default", "tracker.min_area_px": "1"}
 NO_CONTROL = {"motion.control": "none", "motion.maneuver": "[]", "vehicle.center_of_mass": "[0 m, 0 m, 0 m]"}
 
 
-def flown(until_s: float, **changes: str) -> Testbed:
+def flown(until_s: float, **changes: str) -> Lab:
     """SimSat, balanced and left alone unless the changes say otherwise."""
     until = {"exposure": f"{{time: 10 ms, rate_hz: 1, frames: 1, first: {until_s} s}}"}
     given = NO_CONTROL | until | {key.replace("__", "."): value for key, value in changes.items()}
     return run.prepare(loader.load("afit_simsat", given))
 
 
-def told(testbed: Testbed) -> Telemetry:
-    assert testbed.telemetry is not None
-    assert testbed.telemetry.lab_from_imu is not None
-    return testbed.telemetry
+def told(lab: Lab) -> Telemetry:
+    assert lab.telemetry is not None
+    assert lab.telemetry.lab_from_imu is not None
+    return lab.telemetry
 
 
 def error(telemetry: Telemetry) -> Floats:
@@ -67,8 +67,8 @@ def test_a_perfect_navigator_follows_a_turning_vehicle() -> None:
 
 def test_a_moving_axis_costs_the_navigator_the_coning_within_its_samples() -> None:
     """An increment is no rotation vector, but short of one by w x dw/dt T^3 / 12 in every T: 0.02 arcsec here."""
-    testbed = flown(5.0, vehicle__imu=f"{{{PERFECT}, rate_hz: 100}}", motion__rate_deg_s=TUMBLE)
-    telemetry, step_s = told(testbed), 1 / 100
+    lab = flown(5.0, vehicle__imu=f"{{{PERFECT}, rate_hz: 100}}", motion__rate_deg_s=TUMBLE)
+    telemetry, step_s = told(lab), 1 / 100
     rate = telemetry.rate_body_rad_s
     cone = np.cross(rate, np.gradient(rate, telemetry.t_s, axis=0)) * step_s**2 / 12
     lost = telemetry.lab_from_body.apply(cone)[:-1].sum(axis=0) * 0.01
@@ -79,16 +79,16 @@ def test_a_moving_axis_costs_the_navigator_the_coning_within_its_samples() -> No
 
 def test_uncompensated_earth_rate_makes_the_navigator_drift_by_15_deg_an_hour() -> None:
     """About the Earth's axis in the lab, however the vehicle turns: lab_from_imu = exp(W t) lab_from_body."""
-    testbed = flown(5.0, vehicle__imu=f"{{{PERFECT}, earth_rate: uncompensated}}", motion__rate_deg_s="[0, 0, 30]")
-    telemetry = told(testbed)
+    lab = flown(5.0, vehicle__imu=f"{{{PERFECT}, earth_rate: uncompensated}}", motion__rate_deg_s="[0, 0, 30]")
+    telemetry = told(lab)
     drift = error(telemetry)[-1] / telemetry.t_s[-1]
     assert np.degrees(np.linalg.norm(drift)) * 3600 == pytest.approx(15.041, abs=1e-3)
-    np.testing.assert_allclose(drift, imu.earth_rate_lab_rad_s(testbed.scene.site), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(drift, imu.earth_rate_lab_rad_s(lab.scene.site), rtol=0, atol=1e-9)
 
 
 def test_compensated_earth_rate_is_taken_away_again() -> None:
-    testbed = flown(5.0, vehicle__imu=f"{{{PERFECT}, earth_rate: compensated}}", motion__rate_deg_s="[0, 0, 30]")
-    assert np.abs(error(told(testbed))).max() < 1e-4 * ARCSEC
+    lab = flown(5.0, vehicle__imu=f"{{{PERFECT}, earth_rate: compensated}}", motion__rate_deg_s="[0, 0, 30]")
+    assert np.abs(error(told(lab))).max() < 1e-4 * ARCSEC
 
 
 def test_the_bias_that_is_told_is_what_the_gyros_show_too_much() -> None:
@@ -117,8 +117,8 @@ def test_a_wrong_home_stays_in_the_navigator() -> None:
 def test_steered_by_the_imu_the_vehicle_goes_where_the_navigator_is_wrong() -> None:
     """The navigator is brought to the reference, (0, 0, 0), so the vehicle stands off by the home's error."""
     home = "home_error_deg: [0.5, -1.0, 2.0]"
-    testbed = flown(12.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__control="{feedback: imu}")
-    telemetry = told(testbed)
+    lab = flown(12.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__control="{feedback: imu}")
+    telemetry = told(lab)
     assert telemetry.lab_from_imu is not None
     start = np.degrees(telemetry.lab_from_body[0].magnitude())
     assert start < 1e-12
@@ -135,10 +135,10 @@ def test_steered_by_the_imu_the_vehicle_goes_where_the_navigator_is_wrong() -> N
 def test_the_imu_feels_the_vibration() -> None:
     """The navigator adds up the shaken vehicle's rates: it is where that is, seen from where it was zeroed."""
     shake = "[{kind: line, frequency_hz: 20, rms_arcsec: [200, 0, 0]}]"
-    testbed = flown(2.0, vehicle__imu=f"{{{PERFECT}}}", motion__jitter=shake)
-    telemetry = told(testbed)
+    lab = flown(2.0, vehicle__imu=f"{{{PERFECT}}}", motion__jitter=shake)
+    telemetry = told(lab)
     assert telemetry.lab_from_imu is not None
-    shaken = testbed.trajectory.attitude_at(telemetry.t_s)
+    shaken = lab.trajectory.attitude_at(telemetry.t_s)
     expected = telemetry.lab_from_body[0] * shaken[0].inv() * shaken
     found = (expected.inv() * telemetry.lab_from_imu).as_rotvec()
     assert np.abs(found).max() < 0.01 * ARCSEC
@@ -151,8 +151,8 @@ def test_the_imu_feels_the_vibration() -> None:
 def test_tick_by_tick_it_feels_the_whole_flight(rate_hz: int) -> None:
     """The samples of all ticks together are those of the whole flight at once: as many, and their sum to 1e-9 rad."""
     place = np.array([0.1, 0.1, 0.14])
-    testbed = flown(1.2345, vehicle__imu=f"{{{PERFECT}, rate_hz: {rate_hz}}}", motion__rate_deg_s=TUMBLE, seed="3")
-    telemetry, knots = told(testbed), testbed.trajectory
+    lab = flown(1.2345, vehicle__imu=f"{{{PERFECT}, rate_hz: {rate_hz}}}", motion__rate_deg_s=TUMBLE, seed="3")
+    telemetry, knots = told(lab), lab.trajectory
     last_s = telemetry.t_s[-1]
     ends_s = np.arange(1, round(last_s * rate_hz) + 1) / rate_hz
     whole = imu.ideal_increments(
@@ -162,7 +162,7 @@ def test_tick_by_tick_it_feels_the_whole_flight(rate_hz: int) -> None:
         ends_s,
         1 / rate_hz,
         place,
-        testbed.vehicle.gravity_m_s2,
+        lab.vehicle.gravity_m_s2,
     )
     at_once = imu.Navigator(knots.lab_from_body[0].as_quat(scalar_first=True))
     at_once.add(whole)
@@ -173,10 +173,10 @@ def test_tick_by_tick_it_feels_the_whole_flight(rate_hz: int) -> None:
 
 def test_samples_that_do_not_end_with_a_tick_are_not_lost() -> None:
     """Knots of 1 ms felt 7 ms at a time by a unit of 400 Hz: now two, now three samples, none twice."""
-    testbed = flown(0.1, vehicle__imu=f"{{{PERFECT}}}", motion__rate_deg_s="[0, 0, 30]")
-    there = [testbed.mount], testbed.trajectory.lab_from_body[0], np.zeros(3), 9.8, np.random.default_rng(1)
-    navigation = Navigation(testbed.scene, *there)
-    knots, counts = testbed.trajectory, []
+    lab = flown(0.1, vehicle__imu=f"{{{PERFECT}}}", motion__rate_deg_s="[0, 0, 30]")
+    there = [lab.camera.mount], lab.start, np.zeros(3), 9.8, np.random.default_rng(1)
+    navigation = Navigation(lab.scene, *there)
+    knots, counts = lab.trajectory, []
     for end in range(7, 100, 7):
         begin = max(end - 10, 0)
         piece = slice(begin, end + 1)
@@ -279,15 +279,15 @@ def test_the_keys_of_a_filter_reach_its_states_in_their_units() -> None:
 )
 def test_a_dome_that_no_tracker_can_work_under_is_told_in_one_line(changes: dict[str, str], why: str) -> None:
     """And it is rendered all the same: a lab may light one LED."""
-    testbed = build_testbed(loader.load("afit_simsat_ideal", changes))
+    lab = build_lab(loader.load("afit_simsat_ideal", changes))
     with pytest.raises(InputError, match=f"light: the star tracker cannot use .*: {why}") as refused:
-        build_tracker(testbed)
+        build_tracker(lab.camera)
     assert "\n" not in str(refused.value)
-    assert len(testbed.sources) >= 1
+    assert len(lab.camera.sources) >= 1
 
 
 def doubted_of(name: str, changes: dict[str, str]) -> list[str]:
-    return check(build_testbed(loader.load(name, changes))).findings
+    return check(build_lab(loader.load(name, changes))).findings
 
 
 @pytest.mark.slow
@@ -339,11 +339,11 @@ def test_under_the_stars_there_is_no_surface_to_doubt() -> None:
 )
 def test_what_no_tracker_copes_with_is_doubted(changes: dict[str, str], told: str) -> None:
     """By hand: 8 mm at 33 in, 36.5 mm before pixels of 4 um, is 87 px; focused at 20 in 4.4 mm of pupil blur by 32."""
-    testbed = build_testbed(loader.load("afit_simsat", changes))
-    lines = assumptions.warnings(testbed.scene, testbed.sources, testbed.mount)
+    lab = build_lab(loader.load("afit_simsat", changes))
+    lines = assumptions.warnings(lab.scene, lab.camera.sources, lab.camera.mount)
     assert len(lines) == 1
     assert lines[0].startswith(told)
-    assert lines[0] in check(testbed).findings
+    assert lines[0] in check(lab).findings
 
 
 @pytest.mark.slow

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from skysim.simulation.run import live, prepare, render_frames, run
 
 from skysim.core.errors import InputError
 from skysim.scene.loader import load
-from skysim.simulation.run import live, prepare, render_frames, run
-from skysim.simulation.testbed import build_testbed, build_tracker, exposure_window
+from skysim.simulation.lab import build_lab, build_tracker
+from skysim.simulation.timing import exposure_window
 from skysim.tracking.gyro import latest, rate_of_frame, sigma_rad_s
 
 FLIGHT = {
@@ -25,9 +26,9 @@ FLIGHT = {
 @pytest.mark.parametrize("gyro", [False, True])
 def test_the_tracker_of_a_flight_gets_the_gyro_s_rate(gyro: bool) -> None:
     """An LN-200 tells the rate to a few seconds of arc a second; the frame alone to some hundred."""
-    testbed = prepare(load("shefex2", FLIGHT | {"tracker.gyro": str(gyro).lower()}))
+    lab = prepare(load("shefex2", FLIGHT | {"tracker.gyro": str(gyro).lower()}))
     sigma, error = [], []
-    for result in run(testbed, build_tracker(testbed)):
+    for result in run(lab, build_tracker(lab.camera)):
         rate = result.report.attitude.rate
         assert rate is not None
         sigma.append(np.degrees(np.sqrt(np.trace(rate.covariance_rad2_s2))))
@@ -39,8 +40,8 @@ def test_the_tracker_of_a_flight_gets_the_gyro_s_rate(gyro: bool) -> None:
 @pytest.mark.slow
 def test_frames_during_the_motion_get_the_same_rate() -> None:
     scene = load("shefex2", FLIGHT | {"tracker.gyro": "true"})
-    testbed = build_testbed(scene)
-    during = [one.report for one in live(testbed, build_tracker(testbed)) if one.report]
+    lab = build_lab(scene)
+    during = [one.report for one in live(lab, build_tracker(lab.camera)) if one.report]
     flown = prepare(scene)
     after = [one.report for one in run(flown, build_tracker(flown))]
     assert len(during) == len(after) == 4
@@ -55,27 +56,27 @@ def test_the_rate_is_honest_and_none_if_saturated() -> None:
     """Its error over the units of production: squared, over the claim, 3 in the mean (biases and noise are normal)."""
     nees = []
     for unit in range(40):
-        testbed = prepare(load("shefex2", FLIGHT | {"vehicle.imu": f"{{hardware_seed: {unit}}}", "seed": str(unit)}))
-        config, samples = testbed.scene.vehicle.imu, testbed.imu_samples
+        lab = prepare(load("shefex2", FLIGHT | {"vehicle.imu": f"{{hardware_seed: {unit}}}", "seed": str(unit)}))
+        config, samples = lab.scene.vehicle.imu, lab.imu_samples
         assert config is not None
         assert samples is not None
-        _, truth, _ = next(iter(render_frames(testbed)))
-        window = exposure_window(testbed.scene, 0)
-        rate = rate_of_frame(samples, window, 493, config, testbed.mount)
+        _, truth, _ = next(iter(render_frames(lab)))
+        window = exposure_window(lab.scene, 0)
+        rate = rate_of_frame(samples, window, 493, config, lab.camera.mount)
         assert rate is not None
         error = rate.rate_rad_s - truth.rate_cam_rad_s
         nees.append(error @ np.linalg.solve(rate.covariance_rad2_s2, error))
     assert 1.5 < np.mean(nees) < 4.5
     full = replace(samples, saturated=samples.saturated | (abs(samples.t_s - 0.12) < 0.01))
-    assert rate_of_frame(full, window, 493, config, testbed.mount) is None
-    assert rate_of_frame(full, exposure_window(testbed.scene, 2), 493, config, testbed.mount) is not None
-    assert rate_of_frame(samples, window._replace(open_s=99.0), 493, config, testbed.mount) is None
+    assert rate_of_frame(full, window, 493, config, lab.camera.mount) is None
+    assert rate_of_frame(full, exposure_window(lab.scene, 2), 493, config, lab.camera.mount) is not None
+    assert rate_of_frame(samples, window._replace(open_s=99.0), 493, config, lab.camera.mount) is None
     assert sigma_rad_s(config, 1.0, 0.05) > sigma_rad_s(config, 0.0, 0.05) > sigma_rad_s(config, 0.0, 5.0)
 
 
 def test_old_samples_are_dropped() -> None:
-    testbed = prepare(load("shefex2", FLIGHT))
-    samples = testbed.imu_samples
+    lab = prepare(load("shefex2", FLIGHT))
+    samples = lab.imu_samples
     assert samples is not None
     pieces = [replace(samples, t_s=np.array([t_s])) for t_s in (0.0, 0.5, 1.0)]
     assert latest(pieces, 0.6) == pieces[1:]

@@ -21,10 +21,10 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from skysim.apps.cli import main
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.paths import ROOT
 from skysim.core.plugins.program import ProgramError
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.experiments import tracker_comparison
 from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study import store
@@ -33,7 +33,7 @@ from skysim.experiments.study.execution.engines import Serial
 from skysim.results import metrics
 from skysim.scene import loader
 from skysim.simulation import run
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 from skysim.sources import stars
 from skysim.tracking.external import interface, process
 from skysim.tracking.external.interface import Answer, Leds, Picture, Setup, Stars, check_answer
@@ -290,12 +290,12 @@ def test_a_trial_of_another_release_of_a_tracker_is_another(installed: None, tmp
 def test_a_package_s_tracker_is_scored_by_the_error_that_it_makes(installed: None) -> None:
     """36 arcsec across in frame 0; raised in 1; in 2 a roll of 0.2 deg as well, which is wrong."""
     told = loader.load("shefex2", {"exposure.frames": "3"})
-    testbed = run.prepare(told)
-    truths = [truth.cam_from_lab for _, truth, _ in run.render_frames(testbed)]
+    lab = run.prepare(told)
+    truths = [truth.cam_from_lab for _, truth, _ in run.render_frames(lab)]
     options = {f"q{n}_{i}": float(x) for n, t in enumerate(truths) for i, x in enumerate(t.as_quat())}
     config = told.tracker.model_copy(update={"name": "offset", "options": options | {"roll_deg": 0.2}})
-    testbed = replace(testbed, scene=told.model_copy(update={"tracker": config}))
-    shots = tracker_comparison.compare_frames(testbed, tracker_comparison.build_trackers(testbed, ["offset", "own"]))
+    lab = replace(lab, scene=told.model_copy(update={"tracker": config}))
+    shots = tracker_comparison.compare_frames(lab, tracker_comparison.build_trackers(lab, ["offset", "own"]))
     both = [answers for _, _, answers in shots]
     rows, own = [answers["offset"] for answers in both], [answers["own"] for answers in both]
     assert [(row.status, row.wrong, row.matched > 5) for row in own] == [("solved", False, True)] * 3
@@ -323,7 +323,7 @@ def test_the_list_tells_what_an_entry_needs(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_scene_names_a_tracker_and_never_a_command() -> None:
     told = loader.load("shefex2", {"tracker.name": "mine", "tracker.options": "{command: rm}"})
     with pytest.raises(InputError, match=r"tracker\.name: unknown tracker 'mine'; .*--program mine=COMMAND"):
-        build_testbed(told)
+        build_lab(told)
     for key in ("tracker.command", "tracker.program"):
         with pytest.raises(InputError, match="unknown key"):
             loader.load("shefex2", {key: "x"})

@@ -16,12 +16,12 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.systematic import geometry
 from estimator.catalog.sky_index import SkyIndex
 from estimator.core.arrays import Floats
+from estimator.core.constants import ARCSEC_RAD
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.stars import evidence
 from estimator.identification.stars.detections import Detections, information_of
 from estimator.identification.stars.evidence import Solution
 
-ARCSEC_RAD = np.pi / 180 / 3600
 # Of the entries of Hipparcos to V = 5.75: their distances from the center of light of Gaia's stars within 40".
 SHARE = np.array([0.86, 0.08, 0.04, 0.02])
 ERROR_RAD = np.array([0.0, 0.3, 1.0, 4.0]) * ARCSEC_RAD

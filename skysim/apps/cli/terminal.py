@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from rich.progress import ProgressColumn
     from rich.text import Text
 
-    from skysim.core.types import FrameRow
+    from skysim.core.types import FrameRow, Telemetry
     from skysim.experiments.study.execution.runner import Progress
     from skysim.experiments.tracker_comparison import TrackerScore
     from skysim.simulation.checks.facts import Fact
-    from skysim.simulation.testbed import Testbed
+    from skysim.simulation.lab import Lab
 
 T = TypeVar("T")
 WIDE = 240  # characters in a line of a file
@@ -351,23 +351,22 @@ def print_error(message: str, code: int = 2) -> int:
     return code
 
 
-def write_3d_views(testbed: Testbed, folder: Path) -> list[Path]:
+def write_3d_views(lab: Lab, log: Telemetry, folder: Path) -> list[Path]:
     """Write a still and an animation of the laboratory in 3-D; return their paths.
 
     Without OpenGL print a message and return an empty list, so that the run continues.
     """
     from skysim.core.io import files
     from skysim.dynamics.multibody.view import picture
-    from skysim.simulation.testbed import export_mjcf
 
-    mjcf, joints = export_mjcf(testbed), testbed.log.joints
+    mjcf, joints = lab.export_mjcf(), log.joints
     image_path, animation_path = folder / "scene_3d.png", folder / "scene_3d.gif"
     steps = max(len(joints) // ANIMATION_FRAMES, 1)
     states = joints[::steps]
     try:
         files.write_image(image_path, picture.picture(mjcf, joints[len(joints) // 2])[:, :, ::-1])
         shown = progress(picture.film(mjcf, states), len(states), "rendering the animation")
-        picture.write_film(shown, animation_path, len(states) / float(testbed.log.t_s[-1] + 1e-9))
+        picture.write_film(shown, animation_path, len(states) / float(log.t_s[-1] + 1e-9))
     except picture.NoPicture as error:
         print_error(str(error))
         return []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, overload
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -273,20 +273,18 @@ class FrameRow(NamedTuple):
     innovation_arcsec: float
 
 
-Phase = Literal["motion", "frames", "done"]  # of computing a flight
-
-
 @dataclass(frozen=True, slots=True)
 class FlightStep:
-    """Progress of a flight that is being computed: its motion in seconds, then its frames.
+    """Progress of a flight that is being computed.
 
-    rows : of the frames since the last step;  log : of the motion, in the first step after it has ended
+    t_s, duration_s : how far it is, and how long it lasts
+    rows : of the frames since the last step;  log : of the motion so far, where there are new frames
     residuals : of the lights identified in these frames: time, number, and residual in pixels
     """
 
-    phase: Phase
-    done: float
-    total: float
+    is_done: bool
+    t_s: float
+    duration_s: float
     rows: tuple[FrameRow, ...] = ()
     log: MotionLog | None = None
     residuals: tuple[tuple[float, int, float], ...] = ()

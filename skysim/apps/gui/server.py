@@ -28,6 +28,7 @@ from skysim.apps.gui.page.page import Tab
 from skysim.apps.gui.page.panels.photo import LIMIT_BYTES
 from skysim.apps.gui.worker.session import Workers
 from skysim.apps.gui.worker.study_process import StudyProcess, is_shown
+from skysim.core.constants import DAY_S
 from skysim.scene.loader import find
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
@@ -44,7 +45,7 @@ SECURITY_HEADERS = {"x-frame-options": "DENY", "x-content-type-options": "nosnif
 # Noise is not compressible: gzip at its default level takes half a second for a frame.
 FRAME_HEADERS = {"cache-control": "no-store", "content-encoding": "identity"}
 FILES = f"/_nicegui/{nicegui.__version__}"
-USER, USER_BYTES, YEAR_S = "skysim_user", 8, 365 * 86400  # cookie with the number of a browser
+USER, USER_BYTES, YEAR_S = "skysim_user", 8, 365 * int(DAY_S)  # cookie with the number of a browser
 QUEUED = "This page opens when another one has been closed."
 CONNECT_TIMEOUT_S = 50.0  # for a browser to load the page
 RECONNECT_S = 6.0  # for a lost browser to reconnect, before its work ends

@@ -37,7 +37,7 @@ from estimator.trackers.residuals.refinement import NO_MATCH
 from estimator.trackers.star_tracker import QUAD_SEARCHES, StarTracker
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import CATALOGS
-from skysim.core.quantities.utc import check_year
+from skysim.core.time import check_year
 
 if TYPE_CHECKING:
     from skysim.scene.opencv_calibration import Calibration

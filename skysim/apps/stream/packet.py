@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from skysim.core import quaternion
 from skysim.core.errors import InputError
-from skysim.simulation.closed_loop import CapturedFrame
+from skysim.simulation.flight import Shot
 
 MAX_HEADER_BYTES, MAX_PIXELS = 1 << 16, 1 << 28  # limits for the reader
 
@@ -45,9 +45,9 @@ class Packet(NamedTuple):
         return json.dumps(self.header).encode() + b"\n" + self.pixels.tobytes()
 
 
-def build_packet(captured: CapturedFrame, due_unix_s: float, made_unix_s: float, dropped: int) -> Packet:
-    """Make the packet of a captured frame. Times: due and made, Unix seconds;  dropped : frames dropped before it."""
-    frame, truth = captured.frame, captured.truth
+def build_packet(shot: Shot, due_unix_s: float, made_unix_s: float, dropped: int) -> Packet:
+    """Make the packet of a shot. Times: due and made, Unix seconds;  dropped : frames dropped before it."""
+    frame, truth = shot.frame, shot.truth
     pixels = np.ascontiguousarray(frame.image_dn, frame.image_dn.dtype.newbyteorder("<"))
     height, width = pixels.shape
     header = {

@@ -15,6 +15,7 @@ from skysim.camera.glow.background import (
     moonlight_through_nl,
     scattering,
 )
+from skysim.core.constants import SUN_V_MAG
 from skysim.core.types import Floats
 from skysim.scene.sections.air import AirGlowConfig
 from skysim.sources.air.air import Sky
@@ -23,7 +24,6 @@ from skysim.sources.photometry import sky_radiance_e_s_m2_sr
 from skysim.sources.solar_system.observer import observe_from
 from skysim.sources.solar_system.places import Place, place
 
-SUN_MAG = -26.74
 ERG_NL = 1.02e-15  # erg s^-1 cm^-2 um^-1 arcsec^-2 in a nanolambert (Schaefer 1998)
 V_ZERO_MAG = -11.05  # of the V magnitude in erg s^-1 cm^-2 um^-1 (Schaefer 1998)
 NEAREST_DEG = 0.25  # to the Sun: the scattering functions are those at its limb
@@ -103,7 +103,7 @@ def sunlight_nl(from_sun_deg: Floats, sun_altitude_deg: float, zenith_deg: Float
     with the scattering function f of moonlight, t = 10^(-0.4 k X(sun)) and all angles in degrees.
     """
     off_deg = np.maximum(from_sun_deg, NEAREST_DEG)
-    k, bright_mag = max(extinction_mag, 1e-3), SUN_MAG - V_ZERO_MAG
+    k, bright_mag = max(extinction_mag, 1e-3), SUN_V_MAG - V_ZERO_MAG
     twilight = 10 ** (-0.4 * (bright_mag + 32.5 - sun_altitude_deg - zenith_deg / (360 * k)))
     twilight = twilight * (100 / off_deg) * (1 - 10 ** (-0.4 * k))
     passed = 10 ** (-0.4 * k * float(air_mass(np.radians(sun_altitude_deg))))

@@ -14,11 +14,11 @@ import numpy as np
 
 from skysim.camera.glow.background import angular_separation_deg, transmittance
 from skysim.camera.glow.earth_glow import LAYER, earth_radiance
+from skysim.core.constants import EARTH_RADIUS_M
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import BaffleConfig
 from skysim.scene.sections.orbit import EarthConfig
 from skysim.sources.dome.shell.surface import perpendicular
-from skysim.sources.orbit.earth import RADIUS_M
 from skysim.sources.photometry import Band
 from skysim.sources.solar_system.bodies import BodyLight
 
@@ -47,7 +47,7 @@ def stray_of_earth_e_s_m2(
     of `earth_radiance`.
     """
     distance_m = float(np.linalg.norm(observer_m))
-    edges = [math.sqrt(max(1 - (radius * RADIUS_M / distance_m) ** 2, 0.0)) for radius in (1.0, LAYER[1])]
+    edges = [math.sqrt(max(1 - (radius * EARTH_RADIUS_M / distance_m) ** 2, 0.0)) for radius in (1.0, LAYER[1])]
     in_cone, weights_sr = cone_rule(*edges)
     directions = in_cone @ axes_about(-observer_m / distance_m)
     radiance = earth_radiance(earth, observer_m, directions, sun_m, band)

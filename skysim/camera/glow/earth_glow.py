@@ -10,15 +10,15 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.glow.background import pixel_directions, viewing_geometry
 from skysim.camera.optics import Optics
+from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.core.types import Floats
 from skysim.scene.sections.orbit import EarthConfig
-from skysim.sources.orbit.earth import RADIUS_M, TO_SPHERE
+from skysim.sources.orbit.earth import TO_SPHERE
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
-from skysim.sources.solar_system.magnitudes import SUN_MAG
 
 NODE_PX = 4.0  # spacing of the nodes: the limb is blurred over so many pixels
 AIR_M = 8e3  # scale height of the air
-LAYER = 1 + 85e3 / RADIUS_M, 1 + 95e3 / RADIUS_M  # bottom and top of the airglow, in radii of the Earth
+LAYER = 1 + 85e3 / EARTH_RADIUS_M, 1 + 95e3 / EARTH_RADIUS_M  # bottom and top of the airglow, in radii of the Earth
 
 
 def earth_radiance(config: EarthConfig, observer_m: Floats, toward: Floats, sun_m: Floats, band: Band) -> Floats:
@@ -37,8 +37,8 @@ def earth_radiance(config: EarthConfig, observer_m: Floats, toward: Floats, sun_
     ground, down = (impact < 1) & (inward > 0), inward > 0
     path = inward - np.sqrt(np.maximum(1 - impact**2, 0.0))  # to the ground, or to the tangent point
     mu0 = (place + path[:, None] * along) @ (sun_m / np.linalg.norm(sun_m)) / np.maximum(impact, 1.0)
-    irradiance = float(star_flux_e_s_m2(SUN_MAG, *SUN, band))
-    height_m = np.maximum(impact - 1, 0.0) * RADIUS_M
+    irradiance = float(star_flux_e_s_m2(SUN_V_MAG, *SUN, band))
+    height_m = np.maximum(impact - 1, 0.0) * EARTH_RADIUS_M
     day = down * config.albedo * irradiance / np.pi * np.maximum(mu0, 0.0) * np.exp(-height_m / AIR_M)
     half_chords = [np.sqrt(np.maximum(radius**2 - impact**2, 0.0)) for radius in LAYER]
     layers = (half_chords[1] - half_chords[0]) / (LAYER[1] - LAYER[0]) * np.where(ground, 1, 2) * down
@@ -52,7 +52,7 @@ def earth_light(
     boresight = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
     distance_m = float(np.linalg.norm(observer_m))
     from_nadir_rad = math.acos(max(min(float(-boresight @ observer_m) / distance_m, 1.0), -1.0))
-    reach_rad = math.asin(min(LAYER[1] * RADIUS_M / distance_m, 1.0))
+    reach_rad = math.asin(min(LAYER[1] * EARTH_RADIUS_M / distance_m, 1.0))
     if from_nadir_rad > reach_rad + optics.field_rad:
         return None
     toward, pixel_sr, shape = fine_directions(optics)

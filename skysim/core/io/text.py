@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from skysim.core.errors import InputError, Where, printable
+from skysim.core.time import GPS_MINUS_TAI_S, SCALES
 from skysim.core.types import Floats
 
 MAX_BYTES = 200_000_000  # of a file: a million lines of 200 characters
 MAX_EXCERPT = 40  # characters of a value in a message
 EPOCH = re.compile(r"(?:19|20|21)\d\d-(\d\d-\d\d|\d{3})[T ]\d\d:\d\d:\d\d(\.\d{0,15})?Z?", re.ASCII)
-SCALES = {"UTC": "utc", "TAI": "tai", "TT": "tt", "TDB": "tdb", "GPS": "tai"}  # astropy's, by CCSDS's time systems
-GPS_MINUS_TAI_S = -19.0
 
 Line = tuple[int, str]  # number from 1, and content
 

@@ -15,6 +15,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
+from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
 
 MAX_CHARACTERS = 80  # of a quantity
@@ -61,7 +62,7 @@ def with_unit(si_unit: str, what: str, examples: str) -> BeforeValidator:
 
 # Factors of the units that scenes use most, as astropy has them, to the bit: astropy takes 0.2 s to import.
 COMMON_UNITS = {
-    "m": {"m": 1.0, "cm": 0.01, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "in": 0.025400000000000002, "ft": 0.3048},
+    "m": {"m": 1.0, "cm": 0.01, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "in": math.nextafter(INCH_M, 1), "ft": 0.3048},
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
     "kg": {"kg": 1.0, "g": 1e-3},
     "kg m2": {"kg m2": 1.0},
@@ -99,9 +100,6 @@ def finite(value: float) -> float:
     return value
 
 
-INCH_M = 0.0254
-ARCSEC_RAD = math.pi / 180 / 3600
-RPM_RAD_S = math.pi / 30  # rad/s of one revolution a minute
 Number = Annotated[float, AfterValidator(finite)]
 Length = Annotated[Number, with_unit("m", "length", '"35 mm" or "48 in"')]
 Time = Annotated[Number, with_unit("s", "time", '"40 ms" or "1000 us"')]

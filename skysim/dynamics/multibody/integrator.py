@@ -14,8 +14,8 @@ from mujoco.rollout import Rollout
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import RPM_RAD_S
 from skysim.core.types import Floats, Trajectory
+from skysim.dynamics.multibody.actuators.registry import set_start
 from skysim.dynamics.multibody.mjcf import mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel
 
@@ -61,17 +61,9 @@ class Simulation:
     def set_initial_state(self, lab_from_body: Rotation, rate_body_rad_s: Floats) -> None:
         """Set the initial state; speeds and gimbal angles are those of the scene."""
         vehicle, data = self.vehicle, self.data
-        config = vehicle.config
         data.qpos[:4] = lab_from_body.as_quat(scalar_first=True)
         data.qvel[:3] = rate_body_rad_s
-        if config.wheels:
-            rpm = member_values(config.wheels.start_rpm, len(vehicle.wheels), "vehicle.wheels.start_rpm")
-            data.qvel[vehicle.wheels.dof] = rpm * RPM_RAD_S
-        if config.cmgs:
-            angles = np.radians(member_values(config.cmgs.start_deg, len(vehicle.gimbals), "vehicle.cmgs.start_deg"))
-            data.qpos[vehicle.gimbals.qpos] = angles
-            data.act[self.model.actuator_actadr[vehicle.gimbals.motor]] = angles  # servo set-points
-            data.qvel[vehicle.rotors.dof] = config.cmgs.rotor_rpm * RPM_RAD_S
+        set_start(vehicle.config, self.model, data)
         mujoco.mj_getState(self.model, data, self.states[0], int(STATE))
         mujoco.mj_forward(self.model, data)
 
@@ -195,13 +187,6 @@ class PrescribedMotion(Simulation):
             state[:] = self.states[self.row]
             self.step += 1
             state[1:5], state[rate_column : rate_column + 3] = self.state_at(self.now_s)
-
-
-def member_values(values: tuple[float, ...], count: int, key: str) -> Floats:
-    """One value for each of `count` members; zeros if none are given. Raises InputError for another count."""
-    if values and len(values) != count:
-        raise InputError(key, f"{len(values)} values", f"{count}, one for each, or none")
-    return np.array(values or (0.0,) * count)
 
 
 def simulate(

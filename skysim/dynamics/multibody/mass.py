@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.joints import TRIM, joints
+from skysim.dynamics.multibody.actuators.elements import joints
+from skysim.dynamics.multibody.actuators.registry import TRIM
 from skysim.scene.sections.vehicle import TrimConfig, VehicleConfig, WheelsConfig
 
 CAMERA = "star_camera"

@@ -18,22 +18,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Mount
-from skysim.dynamics.multibody.joints import (
-    FAN,
-    GIMBAL,
-    ROTOR,
+from skysim.dynamics.multibody.actuators.cmgs import GIMBAL, ROTOR
+from skysim.dynamics.multibody.actuators.elements import Hinges, joints
+from skysim.dynamics.multibody.actuators.fans import Fans
+from skysim.dynamics.multibody.actuators.registry import (
+    KINDS,
     TORQUES,
-    WHEEL,
-    Fans,
-    Hinges,
     add_actuators,
-    joints,
     lock_unused,
     locked_joint_hint,
 )
+from skysim.dynamics.multibody.actuators.wheels import WHEEL
 from skysim.dynamics.multibody.mass import (
     CAMERA,
     MassProperties,
@@ -46,7 +45,6 @@ from skysim.dynamics.multibody.mass import (
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings, one_line
 from skysim.scene.sections.vehicle import VehicleConfig
 
-GRAVITY_M_S2 = 9.80665
 STEP_S = 1e-3
 IMU = "imu"
 REQUIRED = f"body bus and camera {CAMERA}"
@@ -159,7 +157,7 @@ def put_at_origin(spec: Any, path: Path) -> Any:
     if bus.parent.name != "world" or bus.frame is not None:
         raise InputError(path, "body bus must be a direct child of worldbody, not of another body or frame")
     for joint in list(bus.joints):
-        if joint.name.startswith((WHEEL, GIMBAL, ROTOR)):
+        if joint.name.startswith(tuple(prefix for kind in KINDS for prefix in kind.joints)):
             raise InputError(path, f"joint {joint.name} must be on a child body of bus")
         spec.delete(joint)
     for key in list(spec.keys):  # keyframes are lists of joint positions, which no longer fit
@@ -201,7 +199,7 @@ def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:
         stiffness=[cable.stiffness_nm_rad if cable else 0.0, 0.0, 0.0],
     )
     on_bearing = vehicle.mount == "air_bearing"
-    spec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2 if on_bearing else 0.0]
+    spec.option.gravity = [0.0, 0.0, -STANDARD_GRAVITY_M_S2 if on_bearing else 0.0]
     spec.option.timestep = STEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     # In units of the mean inertia: MuJoCo's 1e-8 would hide a small wheel's friction in a heavy vehicle. No cost.
@@ -242,9 +240,10 @@ def check_compiled(model: Any, declared: MassProperties, path: Path) -> None:
     """Check that the compiled model is as declared; MuJoCo may change it silently. Raises InputError."""
     bus = model.body("bus").id
     mass = tree_mass(model)
-    fans = [model.site(k).bodyid[0] for k in range(model.nsite) if model.site(k).name.startswith(FAN)]
-    if any(model.body_rootid[body] != bus for body in fans):
-        raise InputError(path, f"sites {FAN}* must be on body bus or its children")
+    for prefix in (prefix for kind in KINDS for prefix in kind.sites):
+        bodies = [model.site(k).bodyid[0] for k in range(model.nsite) if model.site(k).name.startswith(prefix)]
+        if any(model.body_rootid[body] != bus for body in bodies):
+            raise InputError(path, f"sites {prefix}* must be on body bus or its children")
     if (model.body_rootid[model.jnt_bodyid] != bus).any():
         raise InputError(path, "a joint outside body bus", "joints of bus and its children")
     if model.body_rootid[model.cam_bodyid[model.camera(CAMERA).id]] != bus:

@@ -19,8 +19,7 @@ from skysim.core import quaternion
 from skysim.core.jit import jit
 from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Mount
-from skysim.dynamics.multibody.integrator import member_values
-from skysim.dynamics.multibody.joints import lock_unused
+from skysim.dynamics.multibody.actuators.registry import lock_unused, set_start
 from skysim.dynamics.multibody.mass import CAMERA
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount, place_camera, put_at_origin
@@ -64,10 +63,7 @@ def build_obstacles(vehicle: VehicleModel, wall: Surface | None, mount: Mount | 
         lock_unused(spec, vehicle.config, path)
         model = compile_spec(spec, path)
     data = mujoco.MjData(model)
-    if vehicle.config.cmgs:
-        start_deg = member_values(vehicle.config.cmgs.start_deg, len(vehicle.gimbals), "vehicle.cmgs.start_deg")
-        for name, angle_deg in zip(vehicle.gimbals.names, start_deg, strict=True):
-            data.joint(name).qpos[:] = np.radians(angle_deg)
+    set_start(vehicle.config, model, data)
     mujoco.mj_kinematics(model, data)
     camera_body_m = (mount or camera_mount(vehicle)).camera_body_m
     housing = camera_housing(model, data, camera_body_m, is_main=mount is None)

@@ -6,12 +6,12 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError, Where
 from skysim.core.io.text import excerpt
+from skysim.core.time import J2000_JD
 
 ICRF, LAB, CAMERA, BODY = "ICRF", "LAB", "STARTRACKER_1", "SC_BODY_1"  # as skysim writes them
 EME2000 = ("EME2000", "J2000")
 REFERENCES = {ICRF: "icrs", "GCRF": "icrs", LAB: "lab", **dict.fromkeys(EME2000, "icrs")}  # frame of Samples, by name
 VEHICLES = {BODY: "body", "SC_BODY": "body", CAMERA: "cam", "STARTRACKER": "cam"}
-J2000_TT = 2451545.0, 0.0  # as a Julian date in two parts
 
 
 def frame_of(where: Where, name: str) -> str:
@@ -31,5 +31,5 @@ def icrs_from(name: str) -> Rotation:
 
     if name.upper() not in EME2000:
         return Rotation.identity()
-    mean_from_icrs, _, _ = erfa.bp06(*J2000_TT)
+    mean_from_icrs, _, _ = erfa.bp06(J2000_JD, 0.0)
     return Rotation.from_matrix(mean_from_icrs).inv()

@@ -8,7 +8,7 @@ from typing import Any
 
 from skysim.core.errors import InputError
 from skysim.core.io.text import read_lines
-from skysim.core.quantities.utc import in_utc
+from skysim.core.time import in_utc
 from skysim.core.types import Mount
 from skysim.dynamics.profiles import ccsds_aem, stk, table
 from skysim.dynamics.profiles.samples import Samples, check_samples

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration.mass_properties.record import BearingRecord
+from skysim.core.constants import RPM_RAD_S
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import RPM_RAD_S
 from skysim.core.random_streams import BALANCE, random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
@@ -21,8 +21,7 @@ from skysim.experiments.configs import with_config
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.motion import MotionConfig
-from skysim.simulation import run
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.flight import Flight, open_flight
 
 YAWS_DEG = (0.0, 120.0, 240.0)
 AXES_DEG = (0.0, 90.0, 45.0)  # of the tilting at each of these, from body x
@@ -36,7 +35,7 @@ ProgressCallback = Callable[[float, float], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Flight:
+class BalanceFlight:
     """A flight's record, the true vehicle, and how many frames had no attitude or came after a contact.
 
     frames, solved, after_contact : numbers of frames
@@ -122,14 +121,17 @@ def maneuver_s(scene: Scene) -> float:
     return guidance.plan(scene.motion).duration_s
 
 
-def fly(scene: Scene, assumptions: Assumptions, uncertainty: Uncertainty, watch: ProgressCallback | None) -> Flight:
+def fly(
+    scene: Scene, assumptions: Assumptions, uncertainty: Uncertainty, watch: ProgressCallback | None
+) -> BalanceFlight:
     """Simulate a flight, render and solve its frames, and return what was measured.
 
     The frames from the first one near the tilt stop on are left out, because the torque of a contact is unknown.
     """
-    testbed = run.simulate_motion(build_testbed(scene), watch)
-    rows = measured_attitudes(testbed, watch)
-    vehicle, log = testbed.vehicle, testbed.log
+    with open_flight(scene) as flight:
+        rows = measured_attitudes(flight, watch)
+        log = flight.telemetry()
+    vehicle = flight.lab.vehicle
     tilts_deg = np.array([multibody.tilt_deg(attitude) for _, attitude, *_ in rows])
     contact = np.flatnonzero(tilts_deg > scene.vehicle.tilt_stop_deg - STOP_MARGIN_DEG)
     kept = rows[: contact[0]] if len(contact) else rows
@@ -150,25 +152,24 @@ def fly(scene: Scene, assumptions: Assumptions, uncertainty: Uncertainty, watch:
         *vehicle.trims.added(vehicle.trims.position_m),
         np.array(shared),
     )
-    return Flight(record, vehicle, testbed.scene.exposure.frames, len(rows), len(rows) - len(kept))
+    return BalanceFlight(record, vehicle, scene.exposure.frames, len(rows), len(rows) - len(kept))
 
 
-def measured_attitudes(
-    testbed: Testbed, watch: ProgressCallback | None
-) -> list[tuple[float, Rotation, Floats, Floats]]:
+def measured_attitudes(flight: Flight, watch: ProgressCallback | None) -> list[tuple[float, Rotation, Floats, Floats]]:
     """Of every frame that the tracker solved: time, attitude, (3, 3) covariance in body axes, and its shared part."""
-    body_from_cam = testbed.mount.cam_from_body.inv()
-    R_body_from_cam, rows = body_from_cam.as_matrix(), []
-    for result in run.run(testbed, build_tracker(testbed)):
-        attitude = result.report.attitude
+    camera = flight.lab.camera
+    body_from_cam = camera.mount.cam_from_body.inv()
+    R_body_from_cam = body_from_cam.as_matrix()
+    rows = []
+    for shot in flight.shots(cameras=[0], progress=watch):
+        assert shot.report is not None
+        attitude = shot.report.attitude
         if attitude.cam_from_ref is not None and attitude.covariance_rad2 is not None:
             systematic = np.zeros((3, 3)) if attitude.systematic_rad2 is None else attitude.systematic_rad2
             covariance, shared = (
                 R_body_from_cam @ one @ R_body_from_cam.T for one in (attitude.covariance_rad2, systematic)
             )
-            rows.append((result.frame.t_mid_s, (body_from_cam * attitude.cam_from_ref).inv(), covariance, shared))
-        if watch:
-            watch(result.frame.index + 1, testbed.scene.exposure.frames)
+            rows.append((shot.frame.t_mid_s, (body_from_cam * attitude.cam_from_ref).inv(), covariance, shared))
     return rows
 
 

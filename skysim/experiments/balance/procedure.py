@@ -23,7 +23,7 @@ from skysim.dynamics import multibody
 from skysim.dynamics.multibody import VehicleModel
 from skysim.experiments.balance import flight
 from skysim.experiments.balance.assumptions import Assumptions, Uncertainty, draw_assumptions
-from skysim.experiments.balance.flight import Flight
+from skysim.experiments.balance.flight import BalanceFlight
 from skysim.experiments.configs import with_config
 from skysim.scene.scene import Scene
 
@@ -89,7 +89,7 @@ class Iteration:
     next_m   : (n,) where the trim masses go next; where they are if they stay
     """
 
-    flight: Flight
+    flight: BalanceFlight
     estimate: MassEstimate
     gravity_m_s2: float
     next_m: Floats

@@ -13,7 +13,7 @@ from estimator.calibration.mass_properties.record import INERTIA, MOMENT, MassEs
 from skysim.core.io import files
 from skysim.core.types import Floats
 from skysim.experiments.balance.assumptions import Assumptions
-from skysim.experiments.balance.flight import Flight
+from skysim.experiments.balance.flight import BalanceFlight
 from skysim.experiments.balance.observability import largest_tilt_deg
 from skysim.experiments.balance.procedure import Iteration, Plan, filtered
 from skysim.results.report import embed, render_page
@@ -60,7 +60,7 @@ def flight_row(number: int, one: Iteration) -> dict[str, Any]:
     }
 
 
-def true_values(flight: Flight) -> Floats:
+def true_values(flight: BalanceFlight) -> Floats:
     """(9,) inertia and moment of the simulated vehicle with its trim masses at zero."""
     vehicle, record = flight.vehicle, flight.record
     inertia = vehicle.inertia_kg_m2 - record.added_inertia_kg_m2
@@ -68,7 +68,7 @@ def true_values(flight: Flight) -> Floats:
     return np.concatenate([inertia_six(inertia), moment])
 
 
-def estimate_rows(flight: Flight, estimate: MassEstimate) -> list[dict[str, Any]]:
+def estimate_rows(flight: BalanceFlight, estimate: MassEstimate) -> list[dict[str, Any]]:
     """One row per mass property, of the vehicle with its trim masses at zero: offsets in micrometers."""
     scale = np.repeat([1.0, 1e6 / flight.vehicle.mass.mass_kg], [6, 3])
     names = (*INERTIA_NAMES, *(f"offset {axis} um" for axis in MOMENT_NAMES))
@@ -79,7 +79,7 @@ def estimate_rows(flight: Flight, estimate: MassEstimate) -> list[dict[str, Any]
     ]
 
 
-def nees(flight: Flight, estimate: MassEstimate) -> float:
+def nees(flight: BalanceFlight, estimate: MassEstimate) -> float:
     """Squared error of the nine mass properties in units of their covariance: chi-square of 9 if that is honest."""
     nine = slice(INERTIA.start, MOMENT.stop)
     error = estimate.values[nine] - true_values(flight)

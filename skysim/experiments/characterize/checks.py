@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
+from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.characterize.frames import Setting, Stack, describe
@@ -149,7 +150,7 @@ def check_flat(folder: Path, which: str, medians: Floats) -> None:
 
 def spread(image: Floats) -> float:
     """Robust standard deviation of the pixels."""
-    return float(np.median(np.abs(image - np.median(image)))) / 0.6745
+    return float(np.median(np.abs(image - np.median(image)))) / MAD_PER_SIGMA
 
 
 def block_medians(image: Floats) -> Floats:

@@ -21,7 +21,7 @@ from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX
 from skysim.experiments.study.execution.setups import Setup
 from skysim.scene.scene import Scene
-from skysim.simulation.testbed import exposure_window
+from skysim.simulation.timing import exposure_window
 from skysim.tracking.onboard_model import assumed_camera
 from skysim.tracking.settings import assumed_settings
 
@@ -100,7 +100,7 @@ def label_frame(setup: Setup, seed: int, by: Labeller | None = None) -> Labelled
 
     by : of the setup's scene, if there is one already
     """
-    scene = setup.testbed.scene
+    scene = setup.lab.scene
     by = by or labeller(scene)
     added = AddedCharge(by.threshold_e)
     frame, truth, streak_px = trials.render_trial_frame(setup, seed, added)

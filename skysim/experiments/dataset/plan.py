@@ -2,7 +2,7 @@
 
 Keys are varied by the factors of a study file. A dataset has no design: each factor is drawn at random, independently.
 A factor whose keys are all of the trial (rate, attitudes) is drawn in every frame. One that sets a key of the scene
-(camera, background, nuisances) is drawn once a shard, as are the hardware's seeds, because each draw builds a test bed,
+(camera, background, nuisances) is drawn once a shard, as are the hardware's seeds, because each draw builds a lab,
 which takes longer than a frame. A frame depends on the plan and its number alone.
 """
 

@@ -77,13 +77,13 @@ class ShardQueue:
 
 
 def labelled_frames(plan: DatasetPlan, shard: int) -> Iterator[tuple[int, dict[str, Any], Setup, LabelledFrame]]:
-    """The frames of a shard: number, level of each factor, test bed, frame with labels."""
+    """The frames of a shard: number, level of each factor, lab, frame with labels."""
     known = None  # settings of the frame before
     for frame in plan.frames_of(shard):
         levels, settings = plan.draw(shard, frame)
         if known is None:
             setup = prepared_setup(plan.spec, settings)
-            by = labeller(setup.testbed.scene)
+            by = labeller(setup.lab.scene)
         if settings != known:
             setup, known = setup._replace(trial=resolve_trial(plan.spec, settings)), settings
         yield frame, levels, setup, label_frame(setup, plan.seed(frame), by)
@@ -97,7 +97,7 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
         tar = TarWriter(file) if file else None
         for frame, levels, setup, one in labelled_frames(plan, shard):
             numbers = {"frame": frame, "shard": shard, "seed": plan.seed(frame)}
-            row = shards.frame_labels(one, setup.testbed.scene, numbers)
+            row = shards.frame_labels(one, setup.lab.scene, numbers)
             row |= {"pixel_type": one.frame.image_dn.dtype.str, "file": name if tar else ""}
             row["position"] = shards.add_frame(tar, frame, one, row | {"levels": levels}) if tar else -1
             rows.append(row | {"levels": json.dumps(levels, default=str)})

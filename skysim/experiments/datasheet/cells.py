@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.camera import thermal
+from skysim.core.constants import DAY_S, HOUR_S
 from skysim.core.errors import InputError
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.loader import has_survey_errors
@@ -117,7 +118,7 @@ def states_c(scene: Scene, count: int) -> list[float]:
     if config is None:
         return []
     history = config.temperature
-    hours = np.linspace(0, getattr(history, "period_s", 86_400.0) / 3600, count, endpoint=False)
+    hours = np.linspace(0, getattr(history, "period_s", DAY_S) / HOUR_S, count, endpoint=False)
     if history.kind == "table":
         hours = np.linspace(history.hours[0], history.hours[-1], count)
     if history.kind == "steady":

@@ -21,7 +21,7 @@ from skysim.experiments.configs import with_config
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.scene.sections.tracker import SurveyErrorsConfig
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 from skysim.sources.dome.layouts import led_list, registry
 from skysim.sources.dome.shell import surface
 from skysim.tracking import onboard_model
@@ -104,38 +104,38 @@ def survey_uncertainty(
     return SurveyUncertainty(*quantities_within("survey", UNCERTAINTY_RANGES, texts))
 
 
-def calibration_prior(testbed: Testbed) -> CalibrationPrior:
-    """The onboard model of the tracker of a test bed. Raises InputError for a scene without a dome."""
-    light = require_dome(testbed.scene)
-    leds = onboard_model.assumed_dome(testbed.scene, light, testbed.sources)
-    return prior_of(testbed, onboard_model.assumed_camera(testbed.scene), leds)
+def calibration_prior(lab: Lab) -> CalibrationPrior:
+    """The onboard model of the tracker of a lab. Raises InputError for a scene without a dome."""
+    light = require_dome(lab.scene)
+    leds = onboard_model.assumed_dome(lab.scene, light, lab.camera.sources)
+    return prior_of(lab, onboard_model.assumed_camera(lab.scene), leds)
 
 
-def listed_prior(testbed: Testbed, camera: Camera) -> CalibrationPrior:
+def listed_prior(lab: Lab, camera: Camera) -> CalibrationPrior:
     """The model of a dome as its list has it, without the errors of the scene's simulation, and this camera."""
-    light = require_dome(testbed.scene)
-    inside, design = surface.build_surface(light.surface), design_of(testbed)
+    light = require_dome(lab.scene)
+    inside, design = surface.build_surface(light.surface), design_of(lab)
     board = registry.board_of(light.layout, design.id)
     leds = LedMap(design.id, design.place[:, :3], *inside.as_ellipsoid(), board)
-    return prior_of(testbed, camera, leds)
+    return prior_of(lab, camera, leds)
 
 
-def prior_of(testbed: Testbed, camera: Camera, leds: LedMap) -> CalibrationPrior:
+def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
     """The prior with these LEDs, their nominal brightness and code, and the lever that the tracker assumes."""
-    scene, design = testbed.scene, design_of(testbed)
+    scene, design = lab.scene, design_of(lab)
     order = np.argsort(design.id)
     levels = design.strength[order][np.searchsorted(design.id[order], leds.id)]
-    lever = onboard_model.assumed_lever(scene, testbed.mount)
+    lever = onboard_model.assumed_lever(scene, lab.camera.mount)
     light = require_dome(scene)
-    code = onboard_model.assumed_code(light, testbed.sources, leds) if light.led.code else None
+    code = onboard_model.assumed_code(light, lab.camera.sources, leds) if light.led.code else None
     floor_px, disk_m = scene.tracker.centroid_sigma_px, light.led.disk_diameter_m
     return CalibrationPrior(camera, leds, lever, floor_px, disk_m, levels / levels.max(), code)
 
 
-def design_of(testbed: Testbed) -> Sources:
+def design_of(lab: Lab) -> Sources:
     """The LEDs of the dome as designed."""
-    light = require_dome(testbed.scene)
-    return led_list.design_leds(light, surface.build_surface(light.surface), testbed.band)
+    light = require_dome(lab.scene)
+    return led_list.design_leds(light, surface.build_surface(light.surface), lab.camera.band)
 
 
 def require_dome(scene: Scene) -> DomeConfig:

@@ -39,7 +39,7 @@ from skysim.experiments.dome_survey.results.report import led_errors
 from skysim.experiments.dome_survey.survey_run import SurveyRun
 from skysim.results.files import frames as frame_files
 from skysim.scene.scene import Scene
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.lab import Lab, build_lab
 
 PLANNED, RANDOM = "plan", "random"
 
@@ -69,21 +69,21 @@ class Plan:
 
 def plan_survey(
     scene: Scene, uncertainty: SurveyUncertainty, count: int, tilt_deg: float, kind: str = PLANNED
-) -> tuple[Testbed, CalibrationPrior, Plan]:
-    """The test bed with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
-    testbed = build_testbed(with_survey_errors(scene, uncertainty))
-    before = calibration_prior(testbed)
-    return testbed, before, make_plan(testbed, before, uncertainty, count, tilt_deg, kind)
+) -> tuple[Lab, CalibrationPrior, Plan]:
+    """The lab with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
+    lab = build_lab(with_survey_errors(scene, uncertainty))
+    before = calibration_prior(lab)
+    return lab, before, make_plan(lab, before, uncertainty, count, tilt_deg, kind)
 
 
 def make_plan(
-    testbed: Testbed, prior: CalibrationPrior, uncertainty: SurveyUncertainty, count: int, tilt_deg: float, kind: str
+    lab: Lab, prior: CalibrationPrior, uncertainty: SurveyUncertainty, count: int, tilt_deg: float, kind: str
 ) -> Plan:
     """The attitudes of a survey: by the plan, or random. Raises InputError for a tilt beyond the vehicle's stop."""
-    random = stops.stop_attitudes(testbed.scene, "attitudes", count, tilt_deg)
-    model = survey_model(prior, uncertainty, centroid_noise_px(testbed, tilt_deg))
+    random = stops.stop_attitudes(lab.scene, "attitudes", count, tilt_deg)
+    model = survey_model(prior, uncertainty, centroid_noise_px(lab, tilt_deg))
     margin_px = image_sizes(prior).margin_px
-    held = random if kind == RANDOM else stops.planned_stops(testbed.scene, model, margin_px, count, tilt_deg)
+    held = random if kind == RANDOM else stops.planned_stops(lab.scene, model, margin_px, count, tilt_deg)
     return Plan(held, model.visible(held.inv(), margin_px), model, margin_px)
 
 
@@ -94,16 +94,16 @@ def write_plan(path: Path, plan: Plan) -> None:
 
 
 def simulated_frames(
-    testbed: Testbed, uncertainty: SurveyUncertainty, lab_from_body: Rotation, folder: Path | None = None
+    lab: Lab, uncertainty: SurveyUncertainty, lab_from_body: Rotation, folder: Path | None = None
 ) -> Iterator[SurveyFrame]:
     """The frames of a simulated survey. A folder gets each as FITS, and the IMU's attitudes, for `images`."""
-    measured = imu_attitudes(testbed.scene, lab_from_body, uncertainty.imu_sigma_rad)
+    measured = imu_attitudes(lab.scene, lab_from_body, uncertainty.imu_sigma_rad)
     if folder is not None:
         names = [FRAME.format(n) for n in range(len(lab_from_body))]
         write_attitudes(files.make_folder(folder) / ATTITUDES, names, measured.inv())
-    for (frame, truth, lights), body_from_lab in zip(take_frames(testbed, lab_from_body), measured, strict=True):
+    for (frame, truth, lights), body_from_lab in zip(take_frames(lab, lab_from_body), measured, strict=True):
         if folder is not None:
-            frame_files.write_fits(folder / FRAME.format(frame.index), frame, truth, testbed.scene)
+            frame_files.write_fits(folder / FRAME.format(frame.index), frame, truth, lab.scene)
         yield SurveyFrame(lights, body_from_lab, frame.index)
 
 
@@ -157,15 +157,13 @@ class Errors:
     false_alarms: int
 
 
-def repeat_survey(
-    testbed: Testbed, uncertainty: SurveyUncertainty, plan: Plan, repeats: int
-) -> Iterator[Errors | InputError]:
+def repeat_survey(lab: Lab, uncertainty: SurveyUncertainty, plan: Plan, repeats: int) -> Iterator[Errors | InputError]:
     """The errors of simulated surveys at the attitudes of a plan, each with its own noise, IMU errors and list.
 
     Of a survey that does not determine the dome, why.
     """
     for n in range(repeats):
-        again = in_survey(testbed, n)
+        again = in_survey(lab, n)
         prior = calibration_prior(again)
         frames = list(simulated_frames(again, uncertainty, plan.lab_from_body))
         try:
@@ -174,21 +172,21 @@ def repeat_survey(
             yield error
 
 
-def in_survey(testbed: Testbed, n: int) -> Testbed:
-    """The test bed in another survey: other noise, and other errors of the list, the lever and the IMU."""
-    scene = testbed.scene
-    again = testbed.in_run(scene.seed + n)
+def in_survey(lab: Lab, n: int) -> Lab:
+    """The lab in another survey: other noise, and other errors of the list, the lever and the IMU."""
+    scene = lab.scene
+    again = lab.in_run(scene.seed + n)
     return replace(again, scene=with_config(again.scene, "tracker.survey", seed=scene.tracker.survey.seed + n))
 
 
-def survey_errors(run: SurveyRun, prior: CalibrationPrior, testbed: Testbed) -> Errors:
+def survey_errors(run: SurveyRun, prior: CalibrationPrior, lab: Lab) -> Errors:
     """The errors of one survey against the truth."""
     survey = run.survey
-    lever_m = survey.lever.camera_body_m - testbed.mount.camera_body_m
+    lever_m = survey.lever.camera_body_m - lab.camera.mount.camera_body_m
     return Errors(
-        float(np.mean(led_errors(survey, prior, testbed).after_m ** 2)),
+        float(np.mean(led_errors(survey, prior, lab).after_m ** 2)),
         float(np.mean(lever_m**2)),
-        (survey.camera.focal_px - testbed.scene.camera.focal_px) ** 2,
+        (survey.camera.focal_px - lab.scene.camera.focal_px) ** 2,
         int(survey.surveyed.sum()),
         find_faults(run).count,
     )

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.utc import in_utc
+from skysim.core.time import in_utc
 from skysim.core.types import Floats
 from skysim.dynamics.profiles.frames import BODY, CAMERA, ICRF, LAB
 

@@ -7,11 +7,11 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from skysim.core.constants import FWHM_PER_SIGMA
 from skysim.core.errors import InputError
 from skysim.core.quantities.units import Ascending, ConfigModel, Fraction, Length, Number, check_table
 
 NEGLIGIBLE_PX = 0.02  # a blur of this sigma makes an image of 0.7 px wider by 0.0003 px
-SIGMA_FROM_FWHM = 1 / math.sqrt(8 * math.log(2))
 Altitude = Annotated[Number, Field(ge=0, lt=90)]
 
 
@@ -71,5 +71,5 @@ class AirConfig(ConfigModel):
 
     def seeing_px(self, focal_px: float) -> float:
         """Standard deviation of a star's image at the zenith by the seeing; 0 where it is too small to matter."""
-        sigma_px = math.radians(self.seeing_arcsec / 3600) * SIGMA_FROM_FWHM * focal_px
+        sigma_px = math.radians(self.seeing_arcsec / 3600) * (1 / FWHM_PER_SIGMA) * focal_px
         return sigma_px if sigma_px > NEGLIGIBLE_PX else 0.0

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, field_validator, model_validator
 
+from skysim.core.constants import SUN_V_MAG
 from skysim.core.errors import InputError
 from skysim.core.quantities.tolerance import LengthError
 from skysim.core.quantities.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
@@ -390,7 +391,7 @@ class StrayLightConfig(ConfigModel):
     kind: Literal["stray"]
     ra_deg: Annotated[Number, Field(ge=0, lt=360)]
     dec_deg: Annotated[Number, Field(ge=-90, le=90)]
-    v_mag: Number = -26.74
+    v_mag: Number = SUN_V_MAG
     angle_deg: Ascending
     pst: Annotated[tuple[Fraction, ...], Field(min_length=2)]
 

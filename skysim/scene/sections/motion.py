@@ -9,6 +9,7 @@ from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag,
 from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import existing_file
 from skysim.core.quantities.units import ConfigModel, Momentum, NotNegative, Number, Positive, Spin, Time
+from skysim.scene.sections.vehicle import ActuatorsName
 
 Duration = Annotated[Time, Field(gt=0)]
 Acceleration = Positive
@@ -246,7 +247,7 @@ class ControlConfig(ConfigModel):
     law: LawName = "pid"
     options: dict[str, bool | int | Number | str] = Field(default_factory=dict)
     time_limit_s: Annotated[Time, Field(ge=1e-3, le=3600)] = 10.0
-    actuators: Literal["ideal", "wheels", "fans", "cmgs"] = "ideal"
+    actuators: ActuatorsName = "ideal"
     feedback: Literal["truth", "imu", "filter"] = "truth"
     rate_hz: Annotated[Number, Field(ge=1, le=1000)] = 100.0
     bandwidth_rad_s: Positive = 3.0

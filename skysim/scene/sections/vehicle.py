@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -27,11 +27,18 @@ from skysim.core.quantities.units import (
     Triple,
 )
 
+ActuatorsName = Literal["ideal", "wheels", "fans", "cmgs"]  # a key of `vehicle`, but for the ideal torques
 TorqueLimit = Annotated[Torque, Field(gt=0)]
 TorqueLevel = Annotated[Torque, Field(ge=0)]
 
 
-class WheelsConfig(ConfigModel):
+class ActuatorsConfig(ConfigModel):
+    """A set of actuators that a controller can command."""
+
+    stores_momentum: ClassVar[bool] = False
+
+
+class WheelsConfig(ActuatorsConfig):
     """Reaction wheels: every hinge joint `wheel_*` of the model.
 
     coulomb, viscous   : bearing friction, T = coulomb sign(speed) + viscous speed
@@ -40,6 +47,7 @@ class WheelsConfig(ConfigModel):
     start_rpm          : speed of each at the start; at rest if left out
     """
 
+    stores_momentum: ClassVar[bool] = True
     torque_limit_nm: TorqueLimit = 0.5
     speed_limit_rpm: Positive = 3000.0
     coulomb_nm: TorqueLevel = 0.0
@@ -55,7 +63,7 @@ class WheelsConfig(ConfigModel):
         return self
 
 
-class FansConfig(ConfigModel):
+class FansConfig(ActuatorsConfig):
     """Fans: every site `fan_*` of the model exerts a thrust along its own z, in both directions.
 
     time_constant : of the first-order lag between command and thrust
@@ -65,14 +73,15 @@ class FansConfig(ConfigModel):
     time_constant_s: Annotated[Time, Field(ge=5e-3)] = 0.2
 
 
-class CmgsConfig(ConfigModel):
+class CmgsConfig(ActuatorsConfig):
     """Control moment gyroscopes: hinge joints `gimbal_*`, each with the joint `rotor_*` of the same suffix.
 
-    steering           : method that computes gimbal rates; see `actuators.STEERING`
+    steering           : method that computes gimbal rates; a key of STEERING
     start_deg          : gimbal angles at the start; those of the model if left out
     rotor_torque_limit : None keeps the rotor speeds constant; a torque makes them variable-speed CMGs
     """
 
+    stores_momentum: ClassVar[bool] = True
     rotor_rpm: Annotated[Number, Field(gt=0, le=60_000)] = 2600.0
     gimbal_rate_limit_deg_s: Positive = 60.0
     gimbal_time_constant_s: Annotated[Time, Field(ge=5e-3)] = 0.01

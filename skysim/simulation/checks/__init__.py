@@ -1,6 +1,6 @@
 """Check a plan before its run: facts about field, lights, images and expected errors, and warnings.
 
-`plan.check` computes all of it from a test bed whose motion is not simulated yet: `attitudes` samples directions,
+`plan.check` computes all of it from a lab whose motion is not simulated yet: `attitudes` samples directions,
 `views` projects the lights, `detection` and `expected_error` predict the tracker, `facts` and `findings` say it.
 """
 

@@ -12,17 +12,17 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount
 from skysim.dynamics import guidance, multibody
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 
 MAX_FRAMES = 400  # frames at which the reference is evaluated to find the fastest and the most tilted one
 FRAMES = 16  # frames that are checked
 DIRECTIONS = 48  # attitudes that the motion could reach
-GOLDEN_RAD = math.pi * (3 - math.sqrt(5))  # between successive azimuths of a Fibonacci spiral
 GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
 
 
@@ -46,13 +46,13 @@ class Attitudes(NamedTuple):
         return np.zeros_like(self.rate_body_rad_s) if given is None else given
 
 
-def of_frames(testbed: Testbed) -> Attitudes:
+def of_frames(lab: Lab) -> Attitudes:
     """Attitudes at mid-exposure of some frames: evenly spaced ones, the fastest and the most tilted."""
-    scene, count = testbed.scene, testbed.scene.exposure.frames
+    scene, count = lab.scene, lab.scene.exposure.frames
     exposure = scene.exposure
     index = np.unique(np.linspace(0, count - 1, min(count, MAX_FRAMES)).astype(int))
     t_s = exposure.first_s + index / exposure.rate_hz + exposure.time_s / 2
-    every = attitudes_at(testbed, t_s)
+    every = attitudes_at(lab, t_s)
     chosen = set(np.linspace(0, len(index) - 1, min(len(index), FRAMES)).astype(int))
     chosen |= {int(np.linalg.norm(every.rate_body_rad_s, axis=1).argmax()), int(tilts_rad(every).argmax())}
     rows = np.array(sorted(chosen))
@@ -76,13 +76,13 @@ def check_stop(scene: Scene, t_s: Floats, tilt_deg: Floats) -> None:
         )
 
 
-def attitudes_at(testbed: Testbed, t_s: Floats) -> Attitudes:
+def attitudes_at(lab: Lab, t_s: Floats) -> Attitudes:
     """The commanded attitudes at (N,) times; without a controller those of the initial rate, kept constant."""
-    scene, lab_from_start = testbed.scene, testbed.trajectory.lab_from_body[0]
+    scene, lab_from_start = lab.scene, lab.start
     if scene.motion.control is None:
         rate = np.radians(scene.motion.rate_deg_s)
         return Attitudes(lab_from_start * Rotation.from_rotvec(np.outer(t_s, rate)), np.tile(rate, (len(t_s), 1)), t_s)
-    reference = guidance.plan(scene.motion, lab_from_start, testbed.profiles)
+    reference = guidance.plan(scene.motion, lab_from_start, lab.profiles)
     states = [reference.state_at(float(t)) for t in t_s]
     lab_from_body = Rotation.from_quat(np.array([state[0] for state in states]), scalar_first=True)
     rates, accelerations = (np.array([state[k] for state in states]) for k in (1, 2))
@@ -112,13 +112,13 @@ def within_reach(scene: Scene, mount: Mount, frames: Attitudes, tilt_deg: float 
     turn_rad = 2 * np.pi * np.mod(n / GOLDEN_RATIO, 1.0)
     if isinstance(scene.light, StarsConfig):
         zenith_rad = np.arccos(1 - 2 * (n + 0.5) / DIRECTIONS)
-        lab_from_cam = Rotation.from_euler("ZYZ", np.column_stack([n * GOLDEN_RAD, zenith_rad, turn_rad]))
+        lab_from_cam = Rotation.from_euler("ZYZ", np.column_stack([n * GOLDEN_ANGLE_RAD, zenith_rad, turn_rad]))
         lab_from_body = lab_from_cam * mount.cam_from_body
     else:
         greatest_rad = greatest_tilt_rad(scene, frames) if tilt_deg is None else math.radians(tilt_deg)
         cosine = math.cos(greatest_rad)
         tilt_rad = np.arccos(1 - n / (DIRECTIONS - 1) * (1 - cosine))  # the last one is the greatest tilt
-        azimuth_rad = n * GOLDEN_RAD
+        azimuth_rad = n * GOLDEN_ANGLE_RAD
         # With a yaw of minus the azimuth, the tilt is about a horizontal axis.
         angles = np.column_stack([azimuth_rad, tilt_rad, turn_rad - azimuth_rad])
         lab_from_body = Rotation.from_euler("ZYZ", angles)

@@ -26,7 +26,7 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.simulation.checks.views import CameraModel
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 from skysim.sources.dome.displays import display
 from skysim.sources.dome.survey.survey_errors import led_covariance_m2
 from skysim.tracking import dome_map_file
@@ -69,15 +69,15 @@ class Beliefs:
     epoch_jyear: float
 
 
-def of(testbed: Testbed, camera: CameraModel) -> Beliefs:
-    """The beliefs of a test bed's tracker. Raises InputError for a map or a catalog that cannot be read."""
-    scene = testbed.scene
+def of(lab: Lab, camera: CameraModel) -> Beliefs:
+    """The beliefs of a lab's tracker. Raises InputError for a map or a catalog that cannot be read."""
+    scene = lab.scene
     tracker, believed = scene.tracker, assumed_camera(scene)
-    lights, direction_error, faintest_mag, epoch_jyear = known_lights(testbed, camera)
+    lights, direction_error, faintest_mag, epoch_jyear = known_lights(lab, camera)
     config = scene.camera.model_copy(update={"distortion": believed.distortion})
     focal_error = believed.focal_px / scene.camera.focal_px - 1
     assumed_m = tracker.assumed_camera_body_m
-    lever_error_m = np.zeros(3) if assumed_m is None else np.array(assumed_m) - testbed.mount.camera_body_m
+    lever_error_m = np.zeros(3) if assumed_m is None else np.array(assumed_m) - lab.camera.mount.camera_body_m
     if tracker.map:
         mapped = dome_map_file.read_dome_map(Path(tracker.map))
         return Beliefs(
@@ -113,22 +113,22 @@ def of(testbed: Testbed, camera: CameraModel) -> Beliefs:
     )
 
 
-def known_lights(testbed: Testbed, camera: CameraModel) -> tuple[Sources, Floats, float, float]:
+def known_lights(lab: Lab, camera: CameraModel) -> tuple[Sources, Floats, float, float]:
     """The sources that the tracker knows, (N, 3) errors of their directions, the faintest star, the catalog's epoch."""
-    scene, sources = testbed.scene, testbed.sources
+    scene, sources = lab.scene, lab.camera.sources
     if isinstance(scene.light, DomeConfig):
         if scene.tracker.map:
             known = np.isin(sources.id, dome_map_file.read_dome_map(Path(scene.tracker.map)).id)
             sources = sources.take(known)
         return sources, np.zeros((len(sources), 3)), math.inf, math.nan
-    stars = believed_stars(testbed)
-    lights, error = known_stars(testbed, stars, camera)
+    stars = believed_stars(lab)
+    lights, error = known_stars(lab, stars, camera)
     return lights, error, float(stars.v_mag.max(initial=-math.inf)), stars.epoch_yr
 
 
-def believed_stars(testbed: Testbed) -> StarCatalog:
+def believed_stars(lab: Lab) -> StarCatalog:
     """The tracker's stars at their believed directions in lab axes, unresolved ones merged. Raises InputError."""
-    scene = testbed.scene
+    scene = lab.scene
     stars = catalog.brighter_than(onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag)
     directions = catalog.apparent(stars, assumed_observer(scene, assumed_orbit(scene)))
     if isinstance(scene.light, CollimatedDisplayConfig):
@@ -137,12 +137,12 @@ def believed_stars(testbed: Testbed) -> StarCatalog:
     return catalog.merge_doubles(replace(stars, vectors=directions), merge_rad)
 
 
-def known_stars(testbed: Testbed, stars: StarCatalog, camera: CameraModel) -> tuple[Sources, Floats]:
+def known_stars(lab: Lab, stars: StarCatalog, camera: CameraModel) -> tuple[Sources, Floats]:
     """The sources that the tracker knows, and (N, 3) measured minus believed direction of each, in lab axes."""
-    sources = testbed.sources
+    sources = lab.camera.sources
     row, star = common(sources.id, stars.id)
     place = sources.place[:, :3] / np.linalg.norm(sources.place[:, :3], axis=1, keepdims=True)
-    shift = neighbor_shift(place, sources.strength * testbed.optics.collecting_m2, row, camera)
+    shift = neighbor_shift(place, sources.strength * lab.camera.optics.collecting_m2, row, camera)
     return sources.take(row), place[row] + shift - stars.vectors[star]
 
 

@@ -15,7 +15,7 @@ from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks import beliefs
 from skysim.simulation.checks.beliefs import Beliefs
 from skysim.simulation.checks.views import CameraModel, View, peak_share
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 from skysim.sources.dome.shell.surface import Surface, build_surface
 from skysim.tracking.settings import assumed_settings
 
@@ -28,12 +28,12 @@ MAX_PULSES = 500  # in an exposure; with more the mean time of the light does no
 
 
 class Context(NamedTuple):
-    """What all checks share: the test bed, the tracker's settings and beliefs, the camera, and the dome's surface.
+    """What all checks share: the lab, the tracker's settings and beliefs, the camera, and the dome's surface.
 
     timing_s : (N,) standard deviation of the mean time of each light that the tracker knows within an exposure
     """
 
-    testbed: Testbed
+    lab: Lab
     settings: Settings
     beliefs: Beliefs
     camera: CameraModel
@@ -41,21 +41,21 @@ class Context(NamedTuple):
     timing_s: Floats
 
 
-def context_of(testbed: Testbed) -> Context:
-    """The context of a test bed. Raises InputError for a map or a catalog that cannot be read."""
-    camera = CameraModel.of(testbed)
-    believed = beliefs.of(testbed, camera)
-    light, lights = testbed.scene.light, believed.lights
+def context_of(lab: Lab) -> Context:
+    """The context of a lab. Raises InputError for a map or a catalog that cannot be read."""
+    camera = CameraModel.of(lab)
+    believed = beliefs.of(lab, camera)
+    light, lights = lab.scene.light, believed.lights
     surface = build_surface(light.surface) if isinstance(light, DomeConfig) else None
-    timing_s = timing_sigma_s(lights.period_s, lights.on_s, testbed.scene.exposure.time_s)
-    return Context(testbed, assumed_settings(testbed.scene), believed, camera, surface, timing_s)
+    timing_s = timing_sigma_s(lights.period_s, lights.on_s, lab.scene.exposure.time_s)
+    return Context(lab, assumed_settings(lab.scene), believed, camera, surface, timing_s)
 
 
 def threshold_e(context: Context) -> float:
     """Electrons above the background from which a pixel, filtered by the binomial, belongs to a detection."""
     settings, camera = context.settings, context.camera
     if settings.detector == "thesis":
-        full_e = full_scale_e(context.testbed.scene.camera.detector)
+        full_e = full_scale_e(context.lab.scene.camera.detector)
         return max(THESIS_THRESHOLD * full_e - camera.background_e, 1.0)
     return settings.threshold_sigma * FILTERED_NOISE * camera.noise_e
 
@@ -81,7 +81,7 @@ def detected_area_px(view: View, context: Context) -> Floats:
 
 def usable(view: View, context: Context) -> View:
     """The lights that the tracker detects whole on the chip, at most `tracker.brightest` of them."""
-    settings, config = context.settings, context.testbed.scene.camera
+    settings, config = context.settings, context.lab.scene.camera
     edge = np.minimum(view.xy_px, np.array([config.width_px, config.height_px]) - 1 - view.xy_px).min(axis=1)
     area = detected_area_px(view, context)
     found = np.flatnonzero((area >= settings.min_area_px) & (edge > np.sqrt(area / np.pi)))
@@ -96,7 +96,7 @@ def centroid_variance(view: View, context: Context, prnu: float | None = None) -
     varies by p from pixel to pixel, p^2 sum(I^2 x^2) / N^2, which is p^2 / (8 pi) for a Gaussian and p^2 / (4 pi) for a
     disk; the mean time of pulsed light, timing^2 v v'; and the plateau of a saturated image.
     """
-    testbed, camera = context.testbed, context.camera
+    lab, camera = context.lab, context.camera
     noise_e2, n_e = camera.noise_e**2, np.maximum(view.electrons, 1e-9)
     along2 = view.sigma_px**2 + view.streak_length_px**2 / 12
     if context.settings.centroider == "cog":
@@ -107,12 +107,12 @@ def centroid_variance(view: View, context: Context, prnu: float | None = None) -
         loss = fit_loss(2 * np.pi * np.sqrt(along2) * view.sigma_px * noise_e2 / n_e)
         along, across = along2 / n_e * loss, view.sigma_px**2 / n_e * loss
     disk = (view.disk_px**2 + view.defocus_px**2) / 4 / view.sigma_px**2
-    varies = testbed.scene.camera.detector.prnu if prnu is None else prnu
+    varies = lab.scene.camera.detector.prnu if prnu is None else prnu
     pattern = varies**2 / (8 * np.pi) * (1 + disk)
-    plateau = SATURATED_SIGMA_PX**2 * (view.peak_e >= full_scale_e(testbed.scene.camera.detector))
+    plateau = SATURATED_SIGMA_PX**2 * (view.peak_e >= full_scale_e(lab.scene.camera.detector))
     unit = view.streak_px / np.maximum(view.streak_length_px, 1e-12)[:, None]
     along_path = unit[:, :, None] * unit[:, None, :]
-    moved = (view.streak_px / testbed.scene.exposure.time_s) * context.timing_s[view.row, None]
+    moved = (view.streak_px / lab.scene.exposure.time_s) * context.timing_s[view.row, None]
     return np.asarray(
         (across + pattern + plateau)[:, None, None] * np.eye(2)
         + (along - across)[:, None, None] * along_path

@@ -43,7 +43,7 @@ from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
 from estimator.identification.stars.search import WRONG_FOCAL
 from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY
 from skysim.camera.optics import Optics
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import RollingShutterConfig
 from skysim.scene.sections.light import StarsConfig
@@ -94,7 +94,7 @@ def mean_root(variance_rad2: Floats) -> float:
 
 
 def led_survey(view: View, lab_from_cam: Rotation, context: Context) -> Independent | None:
-    sigma_m, survey = context.beliefs.led_sigma_m, context.testbed.scene.tracker.survey
+    sigma_m, survey = context.beliefs.led_sigma_m, context.lab.scene.tracker.survey
     place_m = context.beliefs.lights.place[view.row, :3]
     own_m2 = survey_errors.led_covariance_m2(place_m, survey)
     if own_m2 is not None:
@@ -105,7 +105,7 @@ def led_survey(view: View, lab_from_cam: Rotation, context: Context) -> Independ
 
 def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
     """Errors of the instrument's set-up, common to all LEDs."""
-    instrument = context.testbed.scene.tracker.survey.instrument
+    instrument = context.lab.scene.tracker.survey.instrument
     if instrument is None:
         return None
     shifts_m = total_station.common_displacements_m(instrument, context.beliefs.lights.place[view.row, :3])
@@ -137,7 +137,7 @@ def assumed_lever(view: View, lab_from_cam: Rotation, context: Context) -> Commo
     error_m = context.beliefs.lever_error_m
     if not error_m.any() or context.surface is None:
         return None
-    return Common(-(view.gradient @ context.testbed.mount.cam_from_body.apply(error_m))[:, :, None])
+    return Common(-(view.gradient @ context.lab.camera.mount.cam_from_body.apply(error_m))[:, :, None])
 
 
 def focal_length(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
@@ -164,12 +164,12 @@ def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Com
     camera = context.camera.optics.camera
     if not isinstance(camera.shutter, RollingShutterConfig):
         return None
-    assumed_s = context.testbed.scene.tracker.assumed_row_time_s
+    assumed_s = context.lab.scene.tracker.assumed_row_time_s
     error_s = 0.0 if assumed_s is None else camera.shutter.row_time_s - assumed_s
     if not error_s:
         return None
     delay_s = error_s * (view.xy_px[:, 1] - (camera.height_px - 1) / 2)
-    return Common((view.streak_px / context.testbed.scene.exposure.time_s * delay_s[:, None])[:, :, None])
+    return Common((view.streak_px / context.lab.scene.exposure.time_s * delay_s[:, None])[:, :, None])
 
 
 def angular_acceleration(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
@@ -258,7 +258,7 @@ def fits_focal_length(context: Context) -> bool:
 
 def finds_focal_length(context: Context) -> bool:
     """Whether the tracker solves with the right focal length instead: the default identifier does under the stars."""
-    scene = context.testbed.scene
+    scene = context.lab.scene
     if fits_focal_length(context):
         return abs(context.beliefs.focal_error) < FOCAL_UNCERTAINTY
     under_stars = isinstance(scene.light, StarsConfig) and (scene.tracker.identifier or "default") == "default"
@@ -294,28 +294,28 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
 
 def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """(3,) rotation vector in camera axes by which the dome's solver errs for exact rays; None if it is exact."""
-    testbed = context.testbed
+    lab = context.lab
     name, surface = context.settings.solver, context.surface
     if surface is None or name in EXACT_SOLVERS:
         return None
     place_m = context.beliefs.lights.place[view.row, :3]
     center_m, semi_axes_m = surface.as_ellipsoid()
     leds = LedMap(view.row, place_m, center_m, semi_axes_m, None, 0.0)
-    lever = Lever(testbed.mount.camera_body_m, testbed.mount.cam_from_body, 0.0)
+    lever = Lever(lab.camera.mount.camera_body_m, lab.camera.mount.cam_from_body, 0.0)
     rays = view.offset_m / np.linalg.norm(view.offset_m, axis=1, keepdims=True)
-    body_from_lab = testbed.mount.cam_from_body.inv() * lab_from_cam.inv()
+    body_from_lab = lab.camera.mount.cam_from_body.inv() * lab_from_cam.inv()
     try:
         solved, _ = SOLVERS[name](rays, np.full(len(rays), 1e-5), place_m, leds, lever, body_from_lab)
     except (ValueError, np.linalg.LinAlgError):
         return None
-    cam_from_body = testbed.mount.cam_from_body
+    cam_from_body = lab.camera.mount.cam_from_body
     return np.asarray((cam_from_body * solved * body_from_lab.inv() * cam_from_body.inv()).as_rotvec())
 
 
 def expected(views: list[View], attitudes: Attitudes, context: Context) -> Expected:
     """The expected errors at some attitudes with the lights that the tracker uses there."""
     cross, roll = ({name: np.zeros(len(views)) for name in (CENTROIDS, *CAUSES, SOLVER)} for _ in range(2))
-    cam_from_body = context.testbed.mount.cam_from_body
+    cam_from_body = context.lab.camera.mount.cam_from_body
     for a, view in enumerate(views):
         variances = causes_at(view, attitudes.lab_from_body[a] * cam_from_body.inv(), context)
         for name, variance in variances.items():

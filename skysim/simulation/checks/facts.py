@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.psf.otf import blur_radius_px
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, beliefs
@@ -76,7 +76,7 @@ def field_of_view(context: Context, samples: Samples) -> Fact:
 
 def lights_in_field(context: Context, samples: Samples) -> Fact:
     """How many lights the tracker knows and detects in the field: mean and least, and where the least are."""
-    scene, mount = context.testbed.scene, context.testbed.mount
+    scene, mount = context.lab.scene, context.lab.camera.mount
     lines, values = [], {}
     reach = "in the whole sky" if isinstance(scene.light, StarsConfig) else reached(context, samples)
     for key, what, sampled in (("frames", "at the frames", samples.frames), ("reach", reach, samples.reach)):
@@ -104,7 +104,7 @@ def spot(context: Context, samples: Samples) -> Fact:
     if not len(sigma):
         return Fact("image size", [f"lens {lens_px:.1f} px; no light in the field"], {"lens_px": lens_px})
     width, disk_px, defocus_px = (float(np.median(one)) for one in (GAUSSIAN_WIDTH * sigma, 2 * disk, 2 * defocus))
-    led = f", LED {disk_px:.1f}" if isinstance(context.testbed.scene.light, DomeConfig) else ""
+    led = f", LED {disk_px:.1f}" if isinstance(context.lab.scene.light, DomeConfig) else ""
     text = f"{width:.1f} px wide (D4σ): lens {lens_px:.1f}{led}, defocus {defocus_px:.1f} px"
     values = {"width_px": width, "lens_px": lens_px, "led_px": disk_px, "defocus_px": defocus_px}
     return Fact("image size", [text], values)
@@ -112,12 +112,12 @@ def spot(context: Context, samples: Samples) -> Fact:
 
 def fill(context: Context, samples: Samples) -> Floats:
     """Peaks of all lights at the frames over the full well, or over the converter's range if that is less."""
-    return samples.frames.joined("peak_e") / full_scale_e(context.testbed.scene.camera.detector)
+    return samples.frames.joined("peak_e") / full_scale_e(context.lab.scene.camera.detector)
 
 
 def peak(context: Context, samples: Samples) -> Fact:
     """Mean electrons in the brightest pixel of a centered image over the full well."""
-    ratio, full_e = fill(context, samples), full_scale_e(context.testbed.scene.camera.detector)
+    ratio, full_e = fill(context, samples), full_scale_e(context.lab.scene.camera.detector)
     if not len(ratio):
         return Fact("peak", ["no light in the field"], {"full_e": full_e})
     full = float((ratio >= 1).mean())
@@ -177,14 +177,14 @@ def cap_margin(context: Context, samples: Samples, tilt_deg: float | None = None
     from the pupil, at the tilt to all sides; their angle from the zenith, as seen from the bearing, is what
     `light.layout.cap_deg` is compared with.
     """
-    light, camera = context.testbed.scene.light, context.camera.optics.camera
+    light, camera = context.lab.scene.light, context.camera.optics.camera
     if not isinstance(light, DomeConfig) or context.surface is None:
         return None
     points = getattr(light.layout, "points", light.layout)
     if getattr(points, "boards", ()):
         return None
     listed = points.kind == "listed"
-    cap_deg = max_tilt_deg(context.testbed.sources.place[:, :3]) if listed else float(points.cap_deg)
+    cap_deg = max_tilt_deg(context.lab.camera.sources.place[:, :3]) if listed else float(points.cap_deg)
     if tilt_deg is None:
         tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
     size_px = (camera.width_px, camera.height_px)
@@ -194,7 +194,7 @@ def cap_margin(context: Context, samples: Samples, tilt_deg: float | None = None
 
 def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> float:
     """Greatest angle from the zenith, at the bearing, at which a circle of the field meets the dome at a tilt."""
-    mount, surface, azimuth = context.testbed.mount, context.surface, 2 * np.pi * np.arange(SIDES) / SIDES
+    mount, surface, azimuth = context.lab.camera.mount, context.surface, 2 * np.pi * np.arange(SIDES) / SIDES
     assert surface is not None
     radius, tilt_rad = radius_px / context.camera.optics.camera.focal_px, math.radians(tilt_deg)
     rays_cam = np.column_stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.ones(SIDES)])
@@ -210,7 +210,7 @@ def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> floa
 
 def cap(context: Context, samples: Samples) -> Fact | None:
     """Margin of the LED cap over the tilt plus half the field, at the greatest tilt in reach and at the tilt stop."""
-    found, vehicle = cap_margin(context, samples), context.testbed.scene.vehicle
+    found, vehicle = cap_margin(context, samples), context.lab.scene.vehicle
     if found is None:
         return None
     wider = f", shell and wires to cap_deg, {found.limit_deg:.3g}°" if found.limit_deg > found.cap_deg else ""
@@ -226,7 +226,7 @@ def cap(context: Context, samples: Samples) -> Fact | None:
 
 def room(context: Context, samples: Samples) -> Fact | None:
     """How the dome fits into the room where it is to be built, which a scene that does not fit refuses."""
-    light, surface = context.testbed.scene.light, context.surface
+    light, surface = context.lab.scene.light, context.surface
     if not isinstance(light, DomeConfig) or light.room is None or surface is None:
         return None
     limits, values = light.room, fit(light.room, surface, light.layout.cap_deg)
@@ -277,12 +277,12 @@ def tracker_beliefs(context: Context, samples: Samples) -> Fact:
         "distortion": list(believed.camera.distortion),
         "catalog_epoch_jyear": believed.epoch_jyear,
     }
-    return Fact(TRACKER_KNOWS, beliefs.describe(believed, context.testbed.scene), values)
+    return Fact(TRACKER_KNOWS, beliefs.describe(believed, context.lab.scene), values)
 
 
 def expected_error(context: Context, samples: Samples) -> Fact:
     """Expected cross and roll error, 1 sigma, and the causes in the order of their share."""
-    scene, mount = context.testbed.scene, context.testbed.mount
+    scene, mount = context.lab.scene, context.lab.camera.mount
     lines: list[str] = []
     values: dict[str, Any] = {}
     for key, what, sampled in (("frames", "at the frames", samples.frames), ("reach", "in reach", samples.reach)):

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.camera import thermal
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig, TwoStopsConfig
@@ -45,7 +45,7 @@ MAX_TAG_RATIO, MAX_TAG_ARCSEC = 1.3, 1.0  # error of frames' times over the filt
 
 def saturation(context: Context, samples: Samples) -> str:
     """Warn where many lights are saturated."""
-    ratio, scene = fill(context, samples), context.testbed.scene
+    ratio, scene = fill(context, samples), context.lab.scene
     full = float((ratio >= 1).mean()) if len(ratio) else 0.0
     if full <= MAX_SATURATED or bright_background(context, samples):
         return ""
@@ -68,7 +68,7 @@ def dimmer(context: Context, factor: float) -> dict[str, str]:
     An exposure is no shorter than SHORTEST_S and than the LED drive's cycle, in which each LED is lit once; a lens is
     not stopped down beyond LARGEST_F_NUMBER.
     """
-    scene, sources, cures = context.testbed.scene, context.testbed.sources, dict[str, str]()
+    scene, sources, cures = context.lab.scene, context.lab.camera.sources, dict[str, str]()
     led = getattr(scene.light, "led", None)
     if led is not None and led.intensity_cd is not None:
         cures["light.led.intensity"] = f"{short(1e3 * factor * led.intensity_cd, 2)} mcd"
@@ -84,7 +84,7 @@ def dimmer(context: Context, factor: float) -> dict[str, str]:
 
 def bright_background(context: Context, samples: Samples) -> str:
     """Warn where extended light alone fills the pixels."""
-    scene, camera = context.testbed.scene, context.camera
+    scene, camera = context.lab.scene, context.camera
     full_e = full_scale_e(scene.camera.detector)
     if camera.background_e < MAX_BACKGROUND * full_e:
         return ""
@@ -109,7 +109,7 @@ def dark_corners(context: Context, samples: Samples) -> str:
 
 def few_lights(context: Context, samples: Samples) -> str:
     """Warn where the tracker has too few lights: at the frames, or in reach."""
-    scene, mount = context.testbed.scene, context.testbed.mount
+    scene, mount = context.lab.scene, context.lab.camera.mount
     needed = least_lights(scene)
     if cap_too_small(context, samples) or dark_corners(context, samples):
         return ""  # more LEDs where there are some would not help
@@ -169,7 +169,7 @@ def denser(layout: Layout, mean: float) -> str:
 
 def undetected(context: Context, samples: Samples) -> str:
     """Warn where most of the lights on the chip are too faint or too small for the detector."""
-    scene, settings = context.testbed.scene, context.settings
+    scene, settings = context.lab.scene, context.settings
     # As many as the tracker takes from a frame, if more are there.
     seen = sum(min(len(view), settings.max_blobs) for view in samples.frames.seen)
     used = sum(map(len, samples.frames.used))
@@ -207,8 +207,8 @@ def brighter(scene: Scene, factor: float, text: str) -> str:
 
 def not_where_expected(context: Context, samples: Samples) -> str:
     """Warn where errors that the tracker does not know of displace images beyond its matching radius."""
-    frames, scene = samples.frames, context.testbed.scene
-    cam_from_body = context.testbed.mount.cam_from_body
+    frames, scene = samples.frames, context.lab.scene
+    cam_from_body = context.lab.camera.mount.cam_from_body
     found = [
         one
         for view, lab_from_body in zip(frames.used, frames.attitudes.lab_from_body, strict=True)
@@ -270,7 +270,7 @@ CHANGES: dict[str, Callable[[Scene, float], str]] = {
 
 def cap_too_small(context: Context, samples: Samples) -> str:
     """Warn where the field reaches beyond the LEDs at the greatest tilt."""
-    found, light = cap_margin(context, samples), context.testbed.scene.light
+    found, light = cap_margin(context, samples), context.lab.scene.light
     if found is None or not isinstance(light, DomeConfig) or found.needed_deg <= found.cap_deg:
         return ""
     if getattr(light.layout, "points", light.layout).kind == "listed":
@@ -302,7 +302,7 @@ def out_of_focus(context: Context, samples: Samples) -> str:
 
 def long_smear(context: Context, samples: Samples) -> str:
     """Warn where images move by more than some pixels and than their own width."""
-    frames, scene = samples.frames, context.testbed.scene
+    frames, scene = samples.frames, context.lab.scene
     length_px, sigma = frames.joined("streak_length_px"), frames.joined("sigma_px")
     if not len(length_px):
         return ""
@@ -320,7 +320,7 @@ def long_smear(context: Context, samples: Samples) -> str:
 
 def unknown_tag_error(context: Context, samples: Samples) -> str:
     """Warn where frames' times err by more than the filter assumes, and the vehicle turns in that time."""
-    scene = context.testbed.scene
+    scene = context.lab.scene
     sigma_s = float(scene.exposure.time_tag_jitter_s)
     if scene.filter is None or sigma_s <= MAX_TAG_RATIO * scene.filter.time_tag_sigma_s:
         return ""
@@ -337,7 +337,7 @@ def unknown_tag_error(context: Context, samples: Samples) -> str:
 
 def thermal_drift(context: Context, samples: Samples) -> str:
     """Warn where dome, mount and lens drift so far that solutions err by more than expected."""
-    thermal_config, frames = context.testbed.scene.thermal, samples.frames
+    thermal_config, frames = context.lab.scene.thermal, samples.frames
     if thermal_config is None:
         return ""
     at = frames.attitudes
@@ -359,9 +359,9 @@ def thermal_drift(context: Context, samples: Samples) -> str:
 def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context) -> Floats:
     """(3,) rotation in camera axes by which a solution errs, to first order, after the hardware's drift with the
     temperature; NaN with too few lights."""
-    testbed, config = context.testbed, context.testbed.scene.thermal
+    lab, config = context.lab, context.lab.scene.thermal
     assert config is not None
-    hardware = thermal.Hardware(context.beliefs.lights.take(view.row), testbed.mount, context.camera.optics)
+    hardware = thermal.Hardware(context.beliefs.lights.take(view.row), lab.camera.mount, context.camera.optics)
     sources, mount, optics = thermal.at_time(config, hardware, t_s)
     if len(view) < MIN_LIGHTS:
         return np.full(3, np.nan)

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.camera import wcs
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
 from skysim.scene.sections.light import DomeConfig, StarsConfig
@@ -22,8 +22,8 @@ from skysim.simulation.checks.facts import ARCSEC, FACTS, Fact, Sampled, Samples
 from skysim.simulation.checks.findings import FINDINGS
 from skysim.simulation.checks.sky import air, bodies, claims, depth, stray
 from skysim.simulation.checks.views import views
+from skysim.simulation.lab import Lab
 from skysim.simulation.reference_limits import check_reference
-from skysim.simulation.testbed import Testbed
 from skysim.sources.dome.placement.ambiguity import Ambiguity
 
 OWN_KEYS = ("camera.", "tracker.", "exposure.")  # of a head; a finding about any other key is one about the scene
@@ -43,24 +43,24 @@ class Check(NamedTuple):
         return {"facts": numbers, "findings": self.findings}
 
 
-def check(testbed: Testbed, tilt_deg: float | None = None, rate_body_rad_s: Floats | None = None) -> Check:
-    """Check the plan of a test bed whose motion need not be simulated.
+def check(lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | None = None) -> Check:
+    """Check the plan of a lab whose motion need not be simulated.
 
     tilt_deg : greatest tilt under a dome, if it is not that of the scene's motion (random attitudes of a study)
     rate_body_rad_s : (3,) rate of all frames in body axes, in place of the motion's, for trials of single frames
 
     Raises InputError for unreadable files, and for a maneuver that a run would refuse.
     """
-    scene = testbed.scene
-    first = [line for line in [assumptions.camera_outside_warning(scene, testbed.mount)] if line]
+    scene = lab.scene
+    first = [line for line in [assumptions.camera_outside_warning(scene, lab.camera.mount)] if line]
     if first:
         return Check([], first)  # all else assumes that the camera is inside
-    context = context_of(testbed)
-    frames = attitudes.of_frames(testbed)
+    context = context_of(lab)
+    frames = attitudes.of_frames(lab)
     if rate_body_rad_s is not None:
         rates = np.tile(rate_body_rad_s, (len(frames.t_s), 1))
         frames = frames._replace(rate_body_rad_s=rates, acceleration_body_rad_s2=None)
-    check_reference(guidance.plan(scene.motion, testbed.trajectory.lab_from_body[0], testbed.profiles), testbed)
+    check_reference(guidance.plan(scene.motion, lab.start, lab.profiles), scene, lab.vehicle, lab.duration_s)
     samples = samples_of(context, frames, tilt_deg)
     facts = [
         fact for build in (*FACTS, depth.faintest_star, claims.fact) if (fact := build(context, samples)) is not None
@@ -74,22 +74,23 @@ def check(testbed: Testbed, tilt_deg: float | None = None, rate_body_rad_s: Floa
     if alike is not None and isinstance(scene.light, DomeConfig):
         facts.insert(2, lookalike.fact(alike))
         findings += [line for line in [lookalike.finding(alike, scene.light)] if line]
-    findings += broken_assumptions(testbed)
-    checked = [check(head, tilt_deg, rate_body_rad_s) for head in testbed.heads]
+    findings += broken_assumptions(lab)
+    heads = [lab.of_camera(number) for number in range(1, len(lab.cameras))]
+    checked = [check(head, tilt_deg, rate_body_rad_s) for head in heads]
     if checked:
-        facts.append(heads_fact(testbed, [facts, *(head.facts for head in checked)]))
+        facts.append(heads_fact(lab, [facts, *(head.facts for head in checked)]))
     for n, head in enumerate(checked):
         findings += head_findings(n, head.findings, findings)
     return Check(facts, findings)
 
 
-def ambiguity_map(testbed: Testbed) -> tuple[Ambiguity, float]:
+def ambiguity_map(lab: Lab) -> tuple[Ambiguity, float]:
     """The most similar other field of the field about each LED within the greatest tilt, and what coincides, m.
 
     The LEDs are numbered by their rows in the tracker's map. Raises InputError where fields are not compared.
     """
-    context = context_of(testbed)
-    samples = samples_of(context, attitudes.of_frames(testbed), None)
+    context = context_of(lab)
+    samples = samples_of(context, attitudes.of_frames(lab), None)
     if reason := lookalike.why_not_compared(context, samples):
         raise InputError("", reason)
     return lookalike.compared(context, samples, LEAST_ALIKE, MAP_WORK)
@@ -97,25 +98,25 @@ def ambiguity_map(testbed: Testbed) -> tuple[Ambiguity, float]:
 
 def samples_of(context: Context, frames: Attitudes, tilt_deg: float | None) -> Samples:
     """What the camera sees at the frames and within reach."""
-    reach = attitudes.within_reach(context.testbed.scene, context.testbed.mount, frames, tilt_deg)
+    reach = attitudes.within_reach(context.lab.scene, context.lab.camera.mount, frames, tilt_deg)
     return Samples(sampled(frames, context), sampled(reach, context))
 
 
 def sampled(at: Attitudes, context: Context) -> Sampled:
     """What the camera sees at some attitudes, and the expected errors there."""
-    seen = views(context.testbed, context.beliefs.lights, at, context.camera)
+    seen = views(context.lab, context.beliefs.lights, at, context.camera)
     used = [usable(view, context) for view in seen]
     return Sampled(at, seen, used, expected(used, at, context))
 
 
-def broken_assumptions(testbed: Testbed) -> list[str]:
+def broken_assumptions(lab: Lab) -> list[str]:
     """Warnings where the scene breaks an assumption of its tracker, of the renderer or of the frames' WCS."""
-    scene = testbed.scene
+    scene = lab.scene
     if isinstance(scene.light, StarsConfig):
         return [line for line in [wcs.accuracy_warning(scene.camera)] if line]
     if not isinstance(scene.light, DomeConfig):
         return []
-    return assumptions.warnings(scene, testbed.sources, testbed.mount)
+    return assumptions.warnings(scene, lab.camera.sources, lab.camera.mount)
 
 
 def errors_arcsec(facts: Sequence[Fact]) -> tuple[float, float]:
@@ -132,14 +133,14 @@ def information(cross: float, roll: float) -> Floats:
     return np.diag([1 / across2, 1 / across2, 1 / along2])
 
 
-def together_arcsec(testbed: Testbed, errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
+def together_arcsec(lab: Lab, errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
     """Expected cross and roll error about the main boresight of all cameras together.
 
     Solutions of independent errors have the sum of their information: P^-1 = sum R_n P_n^-1 R_n^T with R_n the rotation
     from the axes of camera n to those of the main one.
     """
-    total, main = np.zeros((3, 3)), testbed.mount.cam_from_body
-    for camera, error in zip(testbed.cameras, errors, strict=True):
+    total, main = np.zeros((3, 3)), lab.camera.mount.cam_from_body
+    for camera, error in zip(lab.cameras, errors, strict=True):
         R_main_from_cam = (main * camera.mount.cam_from_body.inv()).as_matrix()
         total += R_main_from_cam @ information(*error) @ R_main_from_cam.T
     if not total.any():
@@ -148,12 +149,12 @@ def together_arcsec(testbed: Testbed, errors: Sequence[tuple[float, float]]) -> 
     return float(np.sqrt(variance[:2].sum())), float(np.sqrt(variance[2]))
 
 
-def heads_fact(testbed: Testbed, facts: Sequence[Sequence[Fact]]) -> Fact:
+def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
     """The expected errors of each head at the frames, and of all cameras together; facts : of each camera."""
     errors = [errors_arcsec(own) for own in facts]
-    names = [head.name for head in testbed.scene.heads]
+    names = [head.name for head in lab.scene.heads]
     lines = [f"{name}: {errors_text(*error)}" for name, error in zip(names, errors[1:], strict=True)]
-    combined = together_arcsec(testbed, errors)
+    combined = together_arcsec(lab, errors)
     lines.append(f"with the main camera: {errors_text(*combined)}, about its axes, without errors of the mounts")
     values = [
         {"name": name, "cross_arcsec": cross, "roll_arcsec": roll}

@@ -34,7 +34,7 @@ from skysim.core.types import Floats, Sources
 from skysim.dynamics import multibody
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.exposure import stray_light_e_s
-from skysim.simulation.testbed import Testbed, bodies_during, sky_during
+from skysim.simulation.lab import Lab, bodies_during, sky_during
 from skysim.sources.dome.led import irradiance_e_s_m2
 
 STEP = 1e-6  # relative displacement of a light, for the numerical derivative of its image
@@ -118,32 +118,34 @@ class CameraModel(NamedTuple):
     exposure_s: float
 
     @classmethod
-    def of(cls, testbed: Testbed) -> CameraModel:
-        """The camera of a test bed, with the background at its initial attitude."""
-        camera, detector = testbed.scene.camera, testbed.scene.camera.detector
-        cam_from_lab = testbed.mount.cam_from_body * testbed.trajectory.lab_from_body[0].inv()
-        first_s, glows = testbed.scene.exposure.first_s, testbed.scene.background
-        lit = sky_light(sky_during(testbed, first_s))
-        stray_e_s = sum(stray_light_e_s(testbed, bodies_during(testbed, first_s), cam_from_lab, first_s).values())
-        glow_e_s = float(background.glow_map(glows, testbed.optics, cam_from_lab, testbed.band, lit).mean()) + stray_e_s
+    def of(cls, lab: Lab) -> CameraModel:
+        """The camera of a lab, with the background at its initial attitude."""
+        camera, detector = lab.scene.camera, lab.scene.camera.detector
+        cam_from_lab = lab.camera.mount.cam_from_body * lab.start.inv()
+        first_s, glows = lab.scene.exposure.first_s, lab.scene.background
+        lit = sky_light(sky_during(lab.camera, first_s))
+        stray_e_s = sum(stray_light_e_s(lab.camera, bodies_during(lab.camera, first_s), cam_from_lab, first_s).values())
+        glow_e_s = (
+            float(background.glow_map(glows, lab.camera.optics, cam_from_lab, lab.camera.band, lit).mean()) + stray_e_s
+        )
         dark_e_s = detector.dark_e_s * 2.0**detector.doublings
-        background_e = (glow_e_s + dark_e_s) * testbed.scene.exposure.time_s
-        pattern_e2 = (detector.dsnu * dark_e_s * testbed.scene.exposure.time_s) ** 2 + detector.column_offset_e**2
+        background_e = (glow_e_s + dark_e_s) * lab.scene.exposure.time_s
+        pattern_e2 = (detector.dsnu * dark_e_s * lab.scene.exposure.time_s) ** 2 + detector.column_offset_e**2
         read_e2 = detector.read_noise_e**2 + detector.reset_noise_e**2 + detector.gain_e_dn**2 / 12 + pattern_e2
         lens_px = float(1 / np.sqrt(2 * np.pi * build_kernel(camera.psf, camera).peak))
         noise_e = float(np.sqrt(background_e + read_e2))
-        exposure_s = testbed.scene.exposure.time_s
-        return cls(testbed.optics, lens_px, background_e, stray_e_s * exposure_s, noise_e, exposure_s)
+        exposure_s = lab.scene.exposure.time_s
+        return cls(lab.camera.optics, lens_px, background_e, stray_e_s * exposure_s, noise_e, exposure_s)
 
 
-def views(testbed: Testbed, lights: Sources, attitudes: Attitudes, camera: CameraModel) -> list[View]:
+def views(lab: Lab, lights: Sources, attitudes: Attitudes, camera: CameraModel) -> list[View]:
     """The view at each attitude, of the lights that no obstacle hides."""
     rows = zip(attitudes.lab_from_body, attitudes.rate_body_rad_s, attitudes.accelerations(), strict=True)
-    return [view(testbed, lights, at, rate, camera, acceleration) for at, rate, acceleration in rows]
+    return [view(lab, lights, at, rate, camera, acceleration) for at, rate, acceleration in rows]
 
 
 def view(
-    testbed: Testbed,
+    lab: Lab,
     lights: Sources,
     lab_from_body: Rotation,
     rate_body_rad_s: Floats,
@@ -155,7 +157,7 @@ def view(
     At the time t from mid-exposure the lights are rotated by -(rate t + acceleration t^2 / 2); the mean over the
     exposure T is -acceleration T^2 / 24.
     """
-    mount, optics, exposure_s = testbed.mount, camera.optics, testbed.scene.exposure.time_s
+    mount, optics, exposure_s = lab.camera.mount, camera.optics, lab.scene.exposure.time_s
     cam_from_lab = mount.cam_from_body * lab_from_body.inv()
     camera_m = lab_from_body.apply(mount.camera_body_m)
     near = np.flatnonzero(in_cone(lights, cam_from_lab.inv().apply([0.0, 0.0, 1.0]), camera_m, optics.field_rad))
@@ -163,16 +165,16 @@ def view(
     xy_px, distance_m, cos_out, cos_in = (one[0] for one in project(lights.take(near), optics, poses))
     size = np.array([optics.camera.width_px, optics.camera.height_px])
     on_chip = ((xy_px > -0.5) & (xy_px < size - 0.5)).all(axis=1)
-    if testbed.obstacles is not None:
+    if lab.camera.obstacles is not None:
         seen = np.flatnonzero(on_chip)
-        on_chip[seen[multibody.occluded(testbed.obstacles, lab_from_body, lights.place[near[seen]])]] = False
+        on_chip[seen[multibody.occluded(lab.camera.obstacles, lab_from_body, lights.place[near[seen]])]] = False
     row = near[on_chip]
     chosen, is_led = lights.take(row), lights.place[row, 3] > 0
     xy_px, distance_m, cos_out, cos_in = (one[on_chip] for one in (xy_px, distance_m, cos_out, cos_in))
     throughput = optics.throughput(cos_in)
     rate_e_s = optics.collecting_m2 * np.where(
         is_led,
-        irradiance_e_s_m2(chosen.strength, testbed.emitter, cos_out, throughput, distance_m),
+        irradiance_e_s_m2(chosen.strength, lab.camera.emitter, cos_out, throughput, distance_m),
         chosen.strength * throughput,
     )
     electrons = rate_e_s * np.minimum(chosen.on_s / chosen.period_s, 1.0) * exposure_s

@@ -10,6 +10,7 @@ import erfa
 import numpy as np
 from numpy.typing import NDArray
 
+from skysim.core.time import tt_jd, ut1_jd
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.air import AirConfig, HorizonConfig
 from skysim.scene.sections.vehicle import SiteConfig
@@ -19,7 +20,6 @@ from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import SUN, Band, black_body_v0, complete_colors, temperature_k
 from skysim.sources.solar_system.bodies import BodyLight
 from skysim.sources.solar_system.colors import ALBEDO
-from skysim.sources.solar_system.observer import tt_jd, ut1_jd
 
 
 @dataclass(frozen=True, slots=True)

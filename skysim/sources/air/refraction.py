@@ -9,14 +9,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from skysim.core.constants import STANDARD_PRESSURE_HPA, STANDARD_TEMPERATURE_K, ZERO_CELSIUS_K
 from skysim.core.types import Floats
 
+# The model's own numbers (Hohenkerk & Sinclair 1985): gas constant, molar masses, radius and lapse rate.
 GAS_J_KMOL_K = 8314.32
 DRY_KG_KMOL, WATER_KG_KMOL = 28.9644, 18.0152
-LAPSE_K_M = 0.0065
 EARTH_M, TROPOPAUSE_M, TOP_M = 6_378_120.0, 11_000.0, 80_000.0
+LAPSE_K_M = 0.0065  # ISO 2533's, too
 VAPOR_EXPONENT = 18.36  # of the water vapor's pressure in the temperature
-KELVIN = 273.15
 NODES = 24  # of the Gauss-Legendre rule in each layer
 LOWEST_RAD = np.radians(90.0)  # apparent zenith distance of the last ray
 RAYS = 181
@@ -37,7 +38,7 @@ class Weather(NamedTuple):
 
 def standard_pressure_hpa(height_m: float) -> float:
     """Pressure of the International Standard Atmosphere (ISO 2533) in the troposphere."""
-    return float(1013.25 * (1 - 0.0065 * height_m / 288.15) ** 5.25588)
+    return float(STANDARD_PRESSURE_HPA * (1 - LAPSE_K_M * height_m / STANDARD_TEMPERATURE_K) ** 5.25588)
 
 
 def standard_temperature_c(height_m: float) -> float:
@@ -64,11 +65,11 @@ class Atmosphere:
     @classmethod
     def from_weather(cls, weather: Weather) -> Atmosphere:
         """The atmosphere above a site."""
-        t_c, t0_k, p_hpa = weather.temperature_c, weather.temperature_c + KELVIN, weather.pressure_hpa
+        t_c, t0_k, p_hpa = weather.temperature_c, weather.temperature_c + ZERO_CELSIUS_K, weather.pressure_hpa
         gravity = 9.784 * (1 - 0.0026 * np.cos(2 * weather.latitude_rad) - 2.8e-7 * weather.height_m)
         scale_per_k = gravity * DRY_KG_KMOL / GAS_J_KMOL_K
         gamma, um2 = scale_per_k / LAPSE_K_M, (weather.wavelength_m * 1e6) ** 2
-        per_hpa = (287.6155 + (1.62887 + 0.0136 / um2) / um2) * 1e-6 * KELVIN / 1013.25
+        per_hpa = (287.6155 + (1.62887 + 0.0136 / um2) / um2) * 1e-6 * ZERO_CELSIUS_K / STANDARD_PRESSURE_HPA
         saturated_hpa = 10 ** ((0.7859 + 0.03477 * t_c) / (1 + 0.00412 * t_c))
         saturated_hpa *= 1 + p_hpa * (4.5e-6 + 6e-10 * t_c**2)
         humidity = weather.humidity

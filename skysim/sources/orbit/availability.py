@@ -12,15 +12,17 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
+from skysim.core.constants import DAY_S, HOUR_S
+from skysim.core.time import tt_jd
 from skysim.core.types import Floats
 from skysim.scene.sections.orbit import ExclusionConfig
 from skysim.sources.orbit.camera_orbit import CameraOrbit
 from skysim.sources.orbit.earth import limb_elevation_rad
 from skysim.sources.solar_system.ephemeris import load_ephemeris
-from skysim.sources.solar_system.observer import DAY_S, GcrsState, tt_jd
+from skysim.sources.solar_system.observer import GcrsState
 
 CHUNK = 20_000  # times that are computed at once
-NODE_S = 3600.0  # of the Sun's and the Moon's places, between which a cubic spline is right to 0.01"
+NODE_S = HOUR_S  # of the Sun's and the Moon's places, between which a cubic spline is right to 0.01"
 
 Law = Literal["inertial", "zenith"]
 

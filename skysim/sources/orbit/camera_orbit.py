@@ -9,13 +9,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from skysim.core.constants import DAY_S, EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene.sections.orbit import CircularOrbitConfig, OemOrbitConfig, TleOrbitConfig
-from skysim.sources.orbit.earth import J2, MU_M3_S2, RADIUS_M
 from skysim.sources.orbit.elements import Elements, gcrs_states, read_elements
 from skysim.sources.orbit.oem import Ephemeris, read_oem
-from skysim.sources.solar_system.observer import DAY_S, GcrsState
+from skysim.sources.solar_system.observer import GcrsState
 
 
 class CameraOrbit(Protocol):
@@ -45,8 +45,8 @@ class CircularOrbit:
     @property
     def rates_rad_s(self) -> tuple[float, float]:
         """Of the argument of latitude and of the node."""
-        radius_m, inclination = RADIUS_M + self.config.altitude_m, np.radians(self.config.inclination_deg)
-        n, k = np.sqrt(MU_M3_S2 / radius_m**3), 1.5 * J2 * (RADIUS_M / radius_m) ** 2
+        radius_m, inclination = EARTH_RADIUS_M + self.config.altitude_m, np.radians(self.config.inclination_deg)
+        n, k = np.sqrt(EARTH_MU_M3_S2 / radius_m**3), 1.5 * EARTH_J2 * (EARTH_RADIUS_M / radius_m) ** 2
         return float(n * (1 + k * (3 - 4 * np.sin(inclination) ** 2))), float(-k * n * np.cos(inclination))
 
     def states(self, after_s: Floats) -> GcrsState:
@@ -57,7 +57,7 @@ class CircularOrbit:
         toward_node = np.stack([np.cos(node), np.sin(node), np.zeros_like(node)], axis=-1)
         ahead = np.stack([-np.sin(node) * np.cos(inclination), np.cos(node) * np.cos(inclination)], axis=-1)
         ahead = np.column_stack([ahead, np.full(len(node), np.sin(inclination))])
-        radius_m, cosine, sine = RADIUS_M + config.altitude_m, np.cos(along)[:, None], np.sin(along)[:, None]
+        radius_m, cosine, sine = EARTH_RADIUS_M + config.altitude_m, np.cos(along)[:, None], np.sin(along)[:, None]
         position_m = radius_m * (cosine * toward_node + sine * ahead)
         velocity_m_s = radius_m * rate * (cosine * ahead - sine * toward_node)
         return GcrsState(position_m, velocity_m_s + np.cross([0.0, 0.0, node_rate], position_m))

@@ -10,16 +10,13 @@ import erfa
 import numpy as np
 from numpy.typing import NDArray
 
+from skysim.core.constants import EARTH_FLATTENING, EARTH_RADIUS_M
 from skysim.core.types import Floats
 from skysim.sources.solar_system.bodies import BODIES
 from skysim.sources.solar_system.ephemeris import load_ephemeris
 
-RADIUS_M = 6_378_137.0  # of the equator, WGS 84
-FLATTENING = 1 / 298.257223563
-MU_M3_S2 = 3.986004418e14  # WGS 84
-J2 = 1.08262668e-3  # EGM2008
 SUN_RADIUS_M = 1e3 * BODIES["sun"].radius_km
-TO_SPHERE = np.array([1.0, 1.0, 1 / (1 - FLATTENING)]) / RADIUS_M  # per meter
+TO_SPHERE = np.array([1.0, 1.0, 1 / (1 - EARTH_FLATTENING)]) / EARTH_RADIUS_M  # per meter
 
 
 def sun_m(tt_jd: float) -> Floats:

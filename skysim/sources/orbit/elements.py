@@ -21,11 +21,11 @@ import erfa
 import numpy as np
 from numpy.typing import NDArray
 
+from skysim.core.constants import DAY_S
 from skysim.core.errors import InputError, Where
 from skysim.core.io.text import excerpt, read_lines
-from skysim.core.quantities.utc import in_utc
+from skysim.core.time import J2000_JD, tt_jd, ut1_jd, utc_days
 from skysim.core.types import Floats
-from skysim.sources.solar_system.observer import DAY_S, J2000, JD_2000, tt_jd, ut1_jd
 
 MAX_SATELLITES = 100_000  # of a file
 REQUIRED = (
@@ -152,13 +152,8 @@ def usable(path: str, n: int, name: str, record: Any) -> tuple[int, str, Any]:
 
 def age_days(elements: Elements, time: datetime.datetime) -> Floats:
     """(N,) days from the elements' epochs to a time; SGP4's error grows by 1 to 3 km a day in low orbits."""
-    epochs = [record.jdsatepoch - JD_2000 + record.jdsatepochF for record in elements.records]
-    return days_since_j2000(time) - np.array(epochs)
-
-
-def days_since_j2000(time: datetime.datetime) -> float:
-    """UTC days from J2000.0; in one number with the Julian date a satellite would be off by 0.3 m."""
-    return (in_utc(time) - J2000) / datetime.timedelta(days=1)
+    epochs = [record.jdsatepoch - J2000_JD + record.jdsatepochF for record in elements.records]
+    return utc_days(time) - np.array(epochs)
 
 
 def gcrs_states(
@@ -167,8 +162,9 @@ def gcrs_states(
     """Positions (N, K, 3) in m and velocities in m/s in GCRS axes at K times after a time, and SGP4's errors (N, K)."""
     from sgp4.api import SatrecArray
 
-    days = days_since_j2000(time) + np.asarray(after_s, float) / DAY_S
-    errors, place_km, velocity_km_s = SatrecArray(list(elements.records)).sgp4(np.full(len(days), JD_2000), days)
+    # In one number with the Julian date a satellite would be off by 0.3 m.
+    days = utc_days(time) + np.asarray(after_s, float) / DAY_S
+    errors, place_km, velocity_km_s = SatrecArray(list(elements.records)).sgp4(np.full(len(days), J2000_JD), days)
     matrix = gcrs_from_teme(time)
     return 1e3 * place_km @ matrix.T, 1e3 * velocity_km_s @ matrix.T, errors.astype(np.int64)
 

@@ -14,11 +14,12 @@ import erfa
 import numpy as np
 from scipy.interpolate import BPoly
 
+from skysim.core.constants import EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
 from skysim.core.errors import InputError, Where
 from skysim.core.io.ccsds import Segment, check_version, keyword_value, one_of
-from skysim.core.io.text import SCALES, read_lines, seconds_since, to_numbers
+from skysim.core.io.text import read_lines, seconds_since, to_numbers
+from skysim.core.time import J2000_JD, SCALES
 from skysim.core.types import Floats
-from skysim.sources.orbit.earth import J2, MU_M3_S2, RADIUS_M
 
 VERSION, VERSIONS = "CCSDS_OEM_VERS", ("1.0", "2.0", "3.0")
 FRAMES = ("ICRF", "GCRF", "EME2000", "J2000")
@@ -75,10 +76,10 @@ def read_oem(path: str, start: datetime.datetime) -> Ephemeris:
 def gravity_m_s2(position_m: Floats) -> Floats:
     """(N, 3) acceleration by the Earth's mass and J2 at (N, 3). Source: Vallado 2013, section 8.7.1."""
     r = np.linalg.norm(position_m, axis=1, keepdims=True)
-    flattened = 1.5 * J2 * (RADIUS_M / r) ** 2
+    flattened = 1.5 * EARTH_J2 * (EARTH_RADIUS_M / r) ** 2
     polar = 5 * (position_m[:, 2:] / r) ** 2
     factors = 1 + flattened * (np.array([1.0, 1.0, 3.0]) - polar)
-    return np.asarray(-MU_M3_S2 / r**3 * position_m * factors)
+    return np.asarray(-EARTH_MU_M3_S2 / r**3 * position_m * factors)
 
 
 def split_segments(path: str) -> list[Segment]:
@@ -122,6 +123,6 @@ def segment_samples(path: str, segment: Segment, start: datetime.datetime) -> tu
     if width == 6:
         numbers = np.column_stack([numbers, np.full((len(numbers), 3), np.nan)])
     if frame in ("EME2000", "J2000"):
-        bias, _, _ = erfa.bp06(erfa.DJ00, 0.0)
+        bias, _, _ = erfa.bp06(J2000_JD, 0.0)
         numbers = (numbers.reshape(-1, 3) @ bias).reshape(-1, 9)
     return t_s, numbers

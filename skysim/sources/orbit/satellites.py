@@ -11,14 +11,16 @@ import erfa
 import numpy as np
 from numpy.typing import NDArray
 
+from skysim.core.constants import SPEED_OF_LIGHT_M_S
 from skysim.core.random_streams import SATELLITES, random_stream
+from skysim.core.time import tt_jd
 from skysim.core.types import Floats, SatelliteTruth, Sources
 from skysim.scene.sections.orbit import RandomSatellitesConfig
 from skysim.sources.orbit.earth import hidden_by_earth, sun_m, sunlit_fraction, to_astronomical
 from skysim.sources.orbit.elements import Elements, gcrs_states
 from skysim.sources.photometry import Band
 from skysim.sources.solar_system.colors import WHITE, reflected_chromatic, reflected_flux_e_s_m2
-from skysim.sources.solar_system.observer import GcrsState, tt_jd
+from skysim.sources.solar_system.observer import GcrsState
 from skysim.sources.stars import steady_points
 
 ID_BASE = 1_000_000_000  # a satellite's number is this + its catalog number
@@ -121,9 +123,9 @@ def path(
     from_m, delay_s = np.array([state.position_m for state in states]), np.zeros(3)
     for _ in range(3):
         to_m = gcrs_states(one, time, after_s - delay_s)[0][0] - from_m
-        delay_s = np.linalg.norm(to_m, axis=1) / erfa.CMPS
+        delay_s = np.linalg.norm(to_m, axis=1) / SPEED_OF_LIGHT_M_S
     range_m = np.linalg.norm(to_m, axis=1, keepdims=True)
-    toward = to_m / range_m + np.array([state.velocity_m_s for state in states]) / erfa.CMPS
+    toward = to_m / range_m + np.array([state.velocity_m_s for state in states]) / SPEED_OF_LIGHT_M_S
     before, place, after = toward / np.linalg.norm(toward, axis=1, keepdims=True) * range_m / range_m[1]
     motion = np.stack([(after - before) / (2 * half_s), (after + before - 2 * place) / half_s**2])
     return place, motion

@@ -15,11 +15,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from skysim.core.constants import AU_KM, JULIAN_YEAR_DAY, SUN_V_MAG
+from skysim.core.time import J2000_JD
 from skysim.core.types import Floats
-from skysim.sources.solar_system.observer import JD_2000
-from skysim.sources.solar_system.places import AU_KM, Place
+from skysim.sources.solar_system.places import Place
 
-SUN_MAG = -26.74  # V at 1 au, as in the stray light of a scene
 MOON_KM = 384400.0  # mean distance
 FULL_MOON_MAG = -12.73  # at this distance, the Sun at 1 au
 EARTH = (-3.99, -1.060e-3, 2.054e-4)
@@ -30,7 +30,7 @@ URANUS_FLATTENING = 0.0022927
 def magnitude(name: str, place: Place, tt_jd: float) -> float:
     """V of a body above the atmosphere. Phase angles that the Earth never sees are extrapolated."""
     if name == "sun":
-        return float(SUN_MAG + 5 * np.log10(place.distance_km / AU_KM))
+        return float(SUN_V_MAG + 5 * np.log10(place.distance_km / AU_KM))
     sun_au, phase_deg = place.sun_distance_km / AU_KM, float(np.degrees(place.phase_rad))
     if name == "moon":
         return moon_magnitude(place.distance_km, sun_au, phase_deg)
@@ -58,7 +58,7 @@ def earthshine_fraction(moon: Place) -> float:
     sun_au, moon_au = moon.sun_distance_km / AU_KM, moon.distance_km / AU_KM
     phase_deg = float(np.degrees(moon.phase_rad))
     earth_mag = polynomial(180 - phase_deg, EARTH) + 5 * np.log10(moon_au * sun_au)
-    fainter = earth_mag - (SUN_MAG + 5 * np.log10(sun_au))
+    fainter = earth_mag - (SUN_V_MAG + 5 * np.log10(sun_au))
     full, sunlit = (moon_magnitude(moon.distance_km, sun_au, angle_deg) for angle_deg in (0.0, phase_deg))
     return float(10 ** (-0.4 * (full + fainter - sunlit)))
 
@@ -102,7 +102,7 @@ def uranus(phase_deg: float, place: Place, _tt_jd: float) -> float:
 
 def neptune(phase_deg: float, _place: Place, tt_jd: float) -> float:
     """It brightened from 1980 to 2000."""
-    year = 2000 + (tt_jd - JD_2000) / 365.25
+    year = 2000 + (tt_jd - J2000_JD) / JULIAN_YEAR_DAY
     at_full = min(max(-6.89 - 0.0054 * (year - 1980), -7.0), -6.89)
     return at_full + (polynomial(phase_deg, (0.0, 7.944e-3, 9.617e-5)) if phase_deg > 1.9 else 0.0)
 

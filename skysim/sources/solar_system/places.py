@@ -7,12 +7,11 @@ from typing import NamedTuple
 import erfa
 import numpy as np
 
+from skysim.core.constants import AU_KM, DAY_S, SPEED_OF_LIGHT_KM_S
 from skysim.core.types import Floats
 from skysim.sources.solar_system.ephemeris import load_ephemeris
-from skysim.sources.solar_system.observer import DAY_S, Observer
+from skysim.sources.solar_system.observer import Observer
 
-AU_KM = erfa.DAU / 1e3
-C_KM_S = erfa.CMPS / 1e3
 DEFLECTION_LIMIT = 1e-6  # of `erfa.ld`: within 3' of the Sun's center its deflection is reduced
 
 
@@ -54,7 +53,7 @@ def place(name: str, observer: Observer) -> Place:
     for _ in range(3):
         left_jd = observer.tt_jd - delay_s / DAY_S
         to_body_km = ephemeris.barycentric_km(name, left_jd) - observer.position_km
-        delay_s = float(np.linalg.norm(to_body_km)) / C_KM_S
+        delay_s = float(np.linalg.norm(to_body_km)) / SPEED_OF_LIGHT_KM_S
     sun_km = ephemeris.position_km("sun", left_jd)
     from_sun_km = to_body_km + observer.position_km - sun_km
     astrometric = to_body_km / np.linalg.norm(to_body_km)
@@ -65,7 +64,7 @@ def place(name: str, observer: Observer) -> Place:
         body_from_sun = from_sun_km / np.linalg.norm(from_sun_km)
         au = sun_km_away / AU_KM
         deflected = erfa.ld(1.0, astrometric, body_from_sun, sun_to_observer_km / sun_km_away, au, DEFLECTION_LIMIT)
-    beta = observer.velocity_km_s / C_KM_S
+    beta = observer.velocity_km_s / SPEED_OF_LIGHT_KM_S
     direction = erfa.ab(deflected, beta, sun_km_away / AU_KM, np.sqrt(1 - beta @ beta))
     return lit_place(direction / np.linalg.norm(direction), from_sun_km, to_body_km)
 

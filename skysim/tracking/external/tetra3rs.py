@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from skysim.core.quantities.utc import in_utc
+from skysim.core.constants import JULIAN_YEAR_DAY
+from skysim.core.time import in_utc
 from skysim.tracking.external.interface import SOLVED, Answer, Picture, Setup
 
 FIELD_MARGIN = 1.1  # field of the pattern database over that of the camera
@@ -43,7 +44,7 @@ class Tetra3rs:
         self.database: Any = tetra3rs.SolverDatabase.generate_from_gaia(
             max_fov_deg=self.camera.fov_deg * FIELD_MARGIN,
             star_max_magnitude=setup.options.get("limit_mag"),
-            epoch_proper_motion_year=moment.year + moment.timetuple().tm_yday / 365.25,
+            epoch_proper_motion_year=moment.year + moment.timetuple().tm_yday / JULIAN_YEAR_DAY,
         )
 
     def solve(self, picture: Picture) -> Answer:

@@ -430,10 +430,7 @@ def test_a_scene_file_s_slip_is_told_with_its_line(skysim: Skysim, tmp_path: Pat
     path.write_text((SCENES / "afit_simsat.yaml").read_text().replace("inverse_square", "cubic"))
     line = path.read_text()[: path.read_text().index("falloff:")].count("\n") + 1
     said = skysim("render", path).one_line()
-    assert (
-        said
-        == f"skysim: light.led.falloff: 'cubic' is not allowed; allowed: 'inverse_square' ({path}, line {line})"
-    )
+    assert said == f"skysim: light.led.falloff: 'cubic' is not allowed; allowed: 'inverse_square' ({path}, line {line})"
 
 
 def test_what_is_not_yaml_is_one_line(skysim: Skysim, tmp_path: Path) -> None:

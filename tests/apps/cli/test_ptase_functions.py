@@ -22,9 +22,9 @@ from estimator.core.arrays import Ints
 from estimator.core.types import ra_dec_roll_rad
 from estimator.identification.published.fialho import VERSIONS, MagnitudeMatch, fialho_2, fialho_4
 from estimator.identification.registry import IDENTIFIERS
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.io import files, images
 from skysim.core.paths import CATALOGS, ROOT
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.experiments.papers.ptase.monte_carlo import (
     SIGMA_MAG,

@@ -33,7 +33,7 @@ from skysim.apps.gui.page.panels import lights, strips
 from skysim.apps.gui.worker import playback
 from skysim.apps.gui.worker.scene import geometry
 from skysim.scene import loader
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 
 pytest_plugins = ["labpage"]
 in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
@@ -59,19 +59,19 @@ def test_the_table_has_every_light_with_its_detection_then_the_false_ones() -> N
 
 @pytest.mark.slow
 def test_an_led_without_current_is_dark_and_the_views_look_where_they_say() -> None:
-    testbed = build_testbed(loader.load("afit_simsat", {}))
-    strength = testbed.sources.strength.copy()
+    lab = build_lab(loader.load("afit_simsat", {}))
+    strength = lab.camera.sources.strength.copy()
     strength[5] = 0.0
-    dark = testbed.sources.id[5]
-    sources = replace(testbed.sources, strength=strength)
+    dark = lab.camera.sources.id[5]
+    sources = replace(lab.camera.sources, strength=strength)
     ids, places_m, radius_m, lit = geometry.lights(sources)
     assert ids[~lit].tolist() == [dark]
     assert radius_m[lit].min() > 0
     np.testing.assert_array_equal(places_m[ids == dark][0], sources.place[5, :3])
-    views = geometry.lab_geometry(testbed).views
-    boresight = testbed.mount.cam_from_body.inv().apply([0.0, 0.0, 1.0])
+    views = geometry.lab_geometry(lab).views
+    boresight = lab.camera.mount.cam_from_body.inv().apply([0.0, 0.0, 1.0])
     eye, target = np.array(views["camera"].eye_m), np.array(views["camera"].target_m)
-    np.testing.assert_allclose(eye, testbed.mount.camera_body_m, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(eye, lab.camera.mount.camera_body_m, rtol=0, atol=1e-12)
     np.testing.assert_allclose(target - eye, boresight, rtol=0, atol=1e-12)
     assert views["top"].eye_m[2] > places_m[:, 2].max()
     assert views["outside"].eye_m[2] < places_m[:, 2].max()

@@ -42,7 +42,7 @@ from skysim.experiments.study import loader as study_loader
 from skysim.results import scoring, stretch
 from skysim.scene import loader
 from skysim.simulation import exposure, run
-from skysim.simulation.testbed import build_tracker
+from skysim.simulation.lab import build_tracker
 from skysim.sources import catalog, stars
 
 
@@ -52,8 +52,8 @@ def test_a_body_has_its_name_and_magnitude() -> None:
     assert [Sensor.name(sensor, id) for id in (9_000_599, 32349, 20)] == ["Jupiter", "Sirius", "HIP 20"]
     settings = {"light.bodies": "{}", "start_time": "2012-06-24T21:00:00", "exposure.frames": "1"}
     settings |= {"motion.start": "{ra_deg: 154.9, dec_deg: 4.8}", "motion.rate_deg_s": "[0, 0, 0]"}
-    testbed = run.prepare(loader.load("shefex2", settings))
-    lights = workbench.true_lights(exposure.render_frame(testbed, 0)[1], workbench.magnitude_by_id(testbed))
+    lab = run.prepare(loader.load("shefex2", settings))
+    lights = workbench.true_lights(exposure.render_frame(lab, 0)[1], workbench.magnitude_by_id(lab))
     assert lights[0].id == 9_000_301
     assert lights[0].magnitude == pytest.approx(-8.84, abs=0.01)
 
@@ -291,10 +291,10 @@ def test_other_numbers_are_rounded_to_a_65535th_of_their_range() -> None:
 def test_a_frame_s_pose_and_lens_lead_from_a_light_s_pixel_to_the_light() -> None:
     """Under the dome by the depth at which its ray meets the surface; under the stars by the rotation alone."""
     for scene, within_rad in (("afit_simsat", 2e-4), ("shefex2", 2e-5)):
-        testbed = run.prepare(loader.load(scene, {"exposure.frames": "1", "motion.rate_deg_s": "[0, 0, 0]"}))
-        lens, (_, truth) = lenses.scene_lens(testbed), exposure.render_frame(testbed, 0)
-        pose = lenses.scene_pose(testbed, lens, truth)
-        camera = testbed.scene.camera
+        lab = run.prepare(loader.load(scene, {"exposure.frames": "1", "motion.rate_deg_s": "[0, 0, 0]"}))
+        lens, (_, truth) = lenses.scene_lens(lab), exposure.render_frame(lab, 0)
+        pose = lenses.scene_pose(lab, lens, truth)
+        camera = lab.scene.camera
         nodes_px = [np.linspace(-0.5, size - 0.5, lens.n) for size in (camera.width_px, camera.height_px)]
 
         def table(values: tuple[float, ...], nodes_px: list[np.ndarray] = nodes_px, n: int = lens.n) -> Any:
@@ -307,8 +307,8 @@ def test_a_frame_s_pose_and_lens_lead_from_a_light_s_pixel_to_the_light() -> Non
         if pose.depth_m:
             pointed = np.array(pose.place_m) + table(pose.depth_m)(xy[:, ::-1])[:, None] * pointed
         pointed /= np.linalg.norm(pointed, axis=1, keepdims=True)
-        rows = [testbed.sources.id.tolist().index(id) for id in truth.sources.id[:20].tolist()]
-        wanted = testbed.sources.place[rows, :3]
+        rows = [lab.camera.sources.id.tolist().index(id) for id in truth.sources.id[:20].tolist()]
+        wanted = lab.camera.sources.place[rows, :3]
         wanted = wanted / np.linalg.norm(wanted, axis=1, keepdims=True)
         assert np.linalg.norm(pointed - wanted, axis=1).max() < within_rad, scene
 
@@ -616,8 +616,8 @@ def test_a_flight_is_that_of_the_command_line_and_its_frames_are_kept() -> None:
             assert set(log.curves) >= {"momentum", "pointing"}
             # They are the frames of the command line: the same truth, errors and lights.
             scene = loader.load("simsat_slew", {"exposure.frames": "4"})
-            testbed = run.prepare(scene)
-            expected = [scoring.row(one, scene, testbed.mount) for one in run.run(testbed, build_tracker(testbed))]
+            lab = run.prepare(scene)
+            expected = [scoring.row(one, scene, lab.camera.mount) for one in run.run(lab, build_tracker(lab.camera))]
             np.testing.assert_array_equal([row.cross_arcsec for row in rows], [one.cross_arcsec for one in expected])
             np.testing.assert_array_equal([row.roll_arcsec for row in rows], [one.roll_arcsec for one in expected])
             assert len(rows) == 4
@@ -625,7 +625,7 @@ def test_a_flight_is_that_of_the_command_line_and_its_frames_are_kept() -> None:
             assert view.t_s == rows[2].t_s
             assert view.result.solved
             files = await session.run("export")
-            frame, _ = exposure.render_frame(testbed, 2)
+            frame, _ = exposure.render_frame(lab, 2)
             np.testing.assert_array_equal(fits.getdata(BytesIO(files["frame.fits"])), frame.image_dn)
             assert view.pixels.data == pixels.levels_of(frame.image_dn).data()
             with pytest.raises(InputError, match="the flight has no frame 4"):

@@ -31,7 +31,7 @@ from skysim.dynamics import guidance
 from skysim.experiments.dome_survey import stops
 from skysim.scene import loader
 from skysim.simulation import checks
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 from skysim.tracking import dome_map_file
 
 pytest_plugins = ["labpage"]
@@ -39,8 +39,8 @@ ANGLES = ((5.0, -3.0, 20.0), (-4.0, 2.0, 140.0))
 
 
 def test_a_check_is_that_of_the_command() -> None:
-    testbed = build_testbed(loader.load("afit_simsat", {"exposure.time": "50 ms"}))
-    found, expected = planning.check(testbed), checks.check(testbed)
+    lab = build_lab(loader.load("afit_simsat", {"exposure.time": "50 ms"}))
+    found, expected = planning.check(lab), checks.check(lab)
     assert [name for name, _ in found.facts] == [fact.name for fact in expected.facts]
     assert list(found.findings) == expected.findings
     assert found.findings  # all LEDs saturate
@@ -52,9 +52,9 @@ def test_a_regular_dome_is_ambiguous_and_a_random_one_is_not() -> None:
     shares = {}
     for kind, size in (("geodesic", "frequency: 32"), ("poisson_disk", "count: 800")):
         settings = {"light.layout": f"{{kind: {kind}, {size}, cap_deg: 40}}"}
-        testbed = build_testbed(loader.load("afit_simsat_ideal", settings))
-        found = planning.ambiguity(testbed)
-        assert set(found.ids) <= set(testbed.sources.id)
+        lab = build_lab(loader.load("afit_simsat_ideal", settings))
+        found = planning.ambiguity(lab)
+        assert set(found.ids) <= set(lab.camera.sources.id)
         assert np.all((found.fraction >= found.least) & (found.fraction <= 1))
         shares[kind] = np.mean(found.fraction > 0.9)
     assert shares["geodesic"] > 0.5
@@ -63,7 +63,7 @@ def test_a_regular_dome_is_ambiguous_and_a_random_one_is_not() -> None:
 
 def test_stars_have_no_ambiguity_map() -> None:
     with pytest.raises(InputError, match=r"light\.kind: stars: .*; allowed: dome"):
-        planning.ambiguity(build_testbed(loader.load("shefex2")))
+        planning.ambiguity(build_lab(loader.load("shefex2")))
 
 
 def test_the_most_similar_fields_are_named() -> None:
@@ -175,7 +175,7 @@ def check_map(worker: Worker, found: SurveyFound) -> None:
         path.write_bytes(worker.survey_map())
         dome = dome_map_file.read_dome_map(path)
     assert set(dome.id) == set(found.ids[found.known > 0])
-    sources = worker.workbench.testbed.sources
+    sources = worker.workbench.lab.camera.sources
     place_m = dict(zip(sources.id.tolist(), sources.place[:, :3], strict=True))
     error_m = dome.position_m - np.array([place_m[led] for led in dome.id.tolist()])
     error_mm = 1e3 * float(np.sqrt(np.mean(error_m**2)))

@@ -15,7 +15,8 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 from skysim.apps.gui.worker.scene.push import PULL_RAD_S, Grip, Push, pull_torque_nm
 from skysim.core.errors import InputError
 from skysim.scene import loader
-from skysim.simulation.testbed import Testbed, build_testbed, exposure_window
+from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.timing import exposure_window
 
 pytest_plugins = ["labpage"]
 INERTIA = np.array([6.0, 6.5, 9.0])
@@ -23,8 +24,8 @@ SPHERE_KG_M2 = 120.0  # of shefex2's vehicle, which is free
 
 
 @pytest.fixture(scope="module")
-def free() -> Testbed:
-    return build_testbed(loader.load("shefex2", {"light.limit_mag": "3"}))
+def free() -> Lab:
+    return build_lab(loader.load("shefex2", {"light.limit_mag": "3"}))
 
 
 def test_a_small_pull_is_a_spring_and_a_long_one_has_a_limit() -> None:
@@ -42,7 +43,7 @@ def test_a_small_pull_is_a_spring_and_a_long_one_has_a_limit() -> None:
     np.testing.assert_array_equal(pull_torque_nm(None, turned, np.diag(INERTIA)), np.zeros(3))
 
 
-def test_a_free_vehicle_gains_the_torque_times_the_time_and_keeps_it(free: Testbed) -> None:
+def test_a_free_vehicle_gains_the_torque_times_the_time_and_keeps_it(free: Lab) -> None:
     """L = int T dt in the lab, where T turns with the vehicle; then nothing changes L."""
     push = Push(free, Rotation.from_rotvec([0.2, 0.5, -0.3]))
     grip = Grip((0.5, 0.1, 0.2), (0.1, 0.6, 0.4))
@@ -65,7 +66,7 @@ def test_a_free_vehicle_gains_the_torque_times_the_time_and_keeps_it(free: Testb
     assert push.simulation.now_s == pytest.approx(2.0)
 
 
-def test_a_vehicle_without_gravity_swings_about_where_it_is_pulled(free: Testbed) -> None:
+def test_a_vehicle_without_gravity_swings_about_where_it_is_pulled(free: Lab) -> None:
     """A sphere held a little off its place is a pendulum of the angular frequency PULL_RAD_S."""
     push = Push(free, Rotation.identity())
     offset = math.radians(2)
@@ -78,7 +79,7 @@ def test_a_vehicle_without_gravity_swings_about_where_it_is_pulled(free: Testbed
     assert turned[len(turned) // 2] == pytest.approx(offset, rel=0.05)
 
 
-def test_a_frame_sees_the_motion_of_its_exposure(free: Testbed) -> None:
+def test_a_frame_sees_the_motion_of_its_exposure(free: Lab) -> None:
     push = Push(free, Rotation.identity())
     window = exposure_window(free.scene, 0)
     still = push.seen(free).trajectory
@@ -95,9 +96,9 @@ def test_a_frame_sees_the_motion_of_its_exposure(free: Testbed) -> None:
 
 @pytest.mark.parametrize(("scene", "reason"), [("collimated_display", "no vehicle"), ("two_heads", "prescribed")])
 def test_what_is_no_moving_vehicle_is_not_pushed(scene: str, reason: str) -> None:
-    testbed = build_testbed(loader.load(scene, {}))
+    lab = build_lab(loader.load(scene, {}))
     with pytest.raises(InputError, match=reason):
-        Push(testbed, testbed.trajectory.lab_from_body[0])
+        Push(lab, lab.start)
 
 
 @pytest.mark.browser

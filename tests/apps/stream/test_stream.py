@@ -31,8 +31,8 @@ from skysim.apps.stream.packet import Packet, unpack
 from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.simulation import run
-from skysim.simulation.closed_loop import CapturedFrame, ClosedLoop, OnboardCamera
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.motion import CapturedFrame, ClosedLoop, OnboardCamera
 
 FRAMES = 4
 OVERRIDES = {"exposure.frames": str(FRAMES), "light.limit_mag": "5"}
@@ -41,12 +41,12 @@ OVERRIDES = {"exposure.frames": str(FRAMES), "light.limit_mag": "5"}
 @pytest.fixture(scope="module")
 def frames() -> list[np.ndarray]:
     """The frames of a run of the scene."""
-    testbed = run.prepare(loader.load("shefex2", OVERRIDES))
-    return [frame.image_dn for frame, _, _ in run.render_frames(testbed)]
+    lab = run.prepare(loader.load("shefex2", OVERRIDES))
+    return [frame.image_dn for frame, _, _ in run.render_frames(lab)]
 
 
-def unsimulated_testbed() -> Testbed:
-    return build_testbed(loader.load("shefex2", OVERRIDES))
+def unsimulated_testbed() -> Lab:
+    return build_lab(loader.load("shefex2", OVERRIDES))
 
 
 def packet(index: int, dropped: int = 0, pixels: Any = None) -> Packet:
@@ -314,24 +314,24 @@ def test_head_answers_like_get_without_the_body(hub: tuple[http.FrameHub, str], 
 
 def test_an_endless_stream_continues_beyond_the_scene_s_frames_and_a_day() -> None:
     """The clock is set forward by ten days; the free rotation does not depend on it."""
-    testbed = replace(unsimulated_testbed(), endless=True)
-    loop = ClosedLoop(testbed, discards_history=True)
+    lab = replace(unsimulated_testbed(), endless=True)
+    loop = ClosedLoop(lab, discards_history=True)
     size_bytes = loop.simulation.states.nbytes
     camera, offset_s = OnboardCamera(loop, None), 10 * 86_400
     loop.simulation.step = loop.simulation.first_step = round(offset_s / loop.simulation.step_s)
-    camera.index = round(offset_s * testbed.scene.exposure.rate_hz)
+    camera.index = round(offset_s * lab.scene.exposure.rate_hz)
     packets: list[CapturedFrame] = []
     while len(packets) < FRAMES + 1:
         loop.tick(10)
         packets += camera.capture_due()
     mids_s = [captured.frame.t_mid_s - offset_s for captured in packets]
-    first_s = testbed.scene.exposure.first_s + testbed.scene.exposure.time_s / 2
+    first_s = lab.scene.exposure.first_s + lab.scene.exposure.time_s / 2
     np.testing.assert_allclose(
-        mids_s, first_s + np.arange(len(packets)) / testbed.scene.exposure.rate_hz, rtol=0, atol=1e-8
+        mids_s, first_s + np.arange(len(packets)) / lab.scene.exposure.rate_hz, rtol=0, atol=1e-8
     )
     assert loop.simulation.states.nbytes == size_bytes
     rotation = packets[-1].truth.cam_from_lab * packets[0].truth.cam_from_lab.inv()
-    rate_rad_s = np.radians(np.linalg.norm(testbed.scene.motion.rate_deg_s))
+    rate_rad_s = np.radians(np.linalg.norm(lab.scene.motion.rate_deg_s))
     assert rotation.magnitude() == pytest.approx(rate_rad_s * (mids_s[-1] - mids_s[0]), rel=1e-6)
 
 

@@ -13,7 +13,7 @@ from skysim.scene import loader
 from skysim.scene.sections.light import UniformGlowConfig
 from skysim.simulation import exposure
 from skysim.simulation import run as simulation
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 
 CONTROL = Control(mean_dn=100.0)
 GOOD = Observation(mean_dn=40.0, stars=12, overexposed=0)
@@ -111,31 +111,31 @@ def test_boxes_beyond_the_image_are_refused() -> None:
 
 
 @pytest.fixture(scope="module")
-def testbed() -> Testbed:
+def lab() -> Lab:
     """A field without bright stars, which a glare hides altogether."""
     coma = {"motion.start": "{ra_deg: 190, dec_deg: 25}", "motion.rate_deg_s": "[0, 0, 0]"}
     return simulation.prepare(loader.load("shefex2", coma | {"exposure.frames": "34"}))
 
 
-def lit(testbed: Testbed, glare_e_s: float) -> Testbed:
+def lit(lab: Lab, glare_e_s: float) -> Lab:
     """The lab with light from a body at the baffle's edge on the whole chip."""
     glow = [UniformGlowConfig(kind="uniform", e_s=glare_e_s)] if glare_e_s else []
-    return replace(testbed, scene=testbed.scene.model_copy(update={"background": glow}))
+    return replace(lab, scene=lab.scene.model_copy(update={"background": glow}))
 
 
-def exposed(testbed: Testbed, time_s: float) -> Testbed:
-    told = testbed.scene.exposure.model_copy(update={"time_s": time_s})
-    return replace(testbed, scene=testbed.scene.model_copy(update={"exposure": told}))
+def exposed(lab: Lab, time_s: float) -> Lab:
+    told = lab.scene.exposure.model_copy(update={"time_s": time_s})
+    return replace(lab, scene=lab.scene.model_copy(update={"exposure": told}))
 
 
 def flown(
-    testbed: Testbed, glare_e_s: list[float], start_s: float, control: Control
+    lab: Lab, glare_e_s: list[float], start_s: float, control: Control
 ) -> tuple[list[Exposure], list[Observation]]:
     """Frame after frame: taken with the exposure that the chart asked for, under the glare of its moment."""
     state, states, seen = Exposure(start_s), [], []
-    saturation = saturation_dn(testbed.scene.camera.detector)
+    saturation = saturation_dn(lab.scene.camera.detector)
     for index, glare in enumerate(glare_e_s):
-        frame, _ = exposure.render_frame(exposed(lit(testbed, glare), state.time_s), index)
+        frame, _ = exposure.render_frame(exposed(lit(lab, glare), state.time_s), index)
         blobs = DETECTORS["local"](frame.image_dn, 5.0, 3, 100)
         seen.append(observe(frame.image_dn, blobs.box_px, saturation, control))
         state = step(state, seen[-1], control)
@@ -148,10 +148,10 @@ GLARE_E_S = 4e5
 
 
 @pytest.mark.slow
-def test_an_intruder_shortens_the_exposure_and_its_leaving_restores_the_stars(testbed: Testbed) -> None:
+def test_an_intruder_shortens_the_exposure_and_its_leaving_restores_the_stars(lab: Lab) -> None:
     glare = [0.0] * 3 + [GLARE_E_S] * 19 + [0.0] * 12
     control = Control(mean_dn=150.0)
-    states, seen = flown(testbed, glare, 0.04, control)
+    states, seen = flown(lab, glare, 0.04, control)
     times = np.array([state.time_s for state in states])
     assert ((times >= control.shortest_s) & (times <= control.longest_s)).all()
     # Before: stars, and no reason to change.
@@ -168,25 +168,25 @@ def test_an_intruder_shortens_the_exposure_and_its_leaving_restores_the_stars(te
     assert not few[-5:].any()
 
 
-def test_without_the_mean_the_same_intruder_would_lengthen_it(testbed: Testbed) -> None:
+def test_without_the_mean_the_same_intruder_would_lengthen_it(lab: Lab) -> None:
     # What the reference mean is for: glare hides the stars, and the other flag alone would expose longer.
-    states, seen = flown(testbed, [GLARE_E_S] * 6, 0.01, Control(mean_dn=np.inf))
+    states, seen = flown(lab, [GLARE_E_S] * 6, 0.01, Control(mean_dn=np.inf))
     assert all(one.stars < 4 for one in seen)
     assert states[-1].time_s > 0.01
-    guarded, _ = flown(testbed, [GLARE_E_S] * 6, 0.01, Control(mean_dn=150.0))
+    guarded, _ = flown(lab, [GLARE_E_S] * 6, 0.01, Control(mean_dn=150.0))
     assert guarded[-1].time_s < 0.0021
 
 
 @pytest.mark.slow
-def test_one_planet_shortens_nothing_and_four_do(testbed: Testbed) -> None:
+def test_one_planet_shortens_nothing_and_four_do(lab: Lab) -> None:
     # Strengths multiplied until the brightest stars of the field saturate: one of them, then many.
-    truth = exposure.render_frame(testbed, 0)[1]
-    inside = np.flatnonzero(np.isin(testbed.sources.id, truth.sources.id))
-    brightest = inside[np.argsort(testbed.sources.strength[inside])[::-1]]
+    truth = exposure.render_frame(lab, 0)[1]
+    inside = np.flatnonzero(np.isin(lab.camera.sources.id, truth.sources.id))
+    brightest = inside[np.argsort(lab.camera.sources.strength[inside])[::-1]]
     for count, expected in ((1, 0.04), (6, 0.038)):
-        strength = testbed.sources.strength.copy()
+        strength = lab.camera.sources.strength.copy()
         strength[brightest[:count]] = 1e4 * strength[brightest[5]]
-        planets = replace(testbed, sources=replace(testbed.sources, strength=strength))
+        planets = replace(lab, sources=replace(lab.camera.sources, strength=strength))
         states, seen = flown(planets, [0.0], 0.04, Control(mean_dn=150.0))
         assert seen[0].overexposed >= count
         assert states[0].time_s == pytest.approx(expected, abs=1e-9)

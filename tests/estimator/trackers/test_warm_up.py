@@ -60,10 +60,10 @@ assert solved > 80 and followed > 60, (solved, followed)
 DOME = """
 import skysim
 from skysim.scene import loader
-from skysim.simulation.testbed import build_testbed, build_tracker
+from skysim.simulation.lab import build_lab, build_tracker
 
 scene = loader.load("afit_simsat_ideal")
-tracker = build_tracker(build_testbed(scene))
+tracker = build_tracker(build_lab(scene).camera)
 tracker.warm_up()
 before, solved = compiled(), 0
 for n in range(3):

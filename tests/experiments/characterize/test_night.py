@@ -25,7 +25,7 @@ from skysim.experiments.characterize.sensor.photon_transfer import Transfer
 from skysim.experiments.dome_survey.frames import render_stops
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 from skysim.tracking.onboard_model import calibration
 
 SIDE_PX, GAIN_DN_E, READ_DN = 700, 0.4, 2.0
@@ -153,8 +153,8 @@ def rendered(folder: Path, camera: dict[str, Any], seed: int) -> list[tuple[Fram
     path = folder / f"camera_{seed}.yaml"
     path.write_text(yaml.safe_dump({"camera": camera}), encoding="utf-8")
     overrides = {"camera.preset": str(path), "exposure.time": f"{EXPOSURE_S} s", "seed": seed, "exposure.frames": 1}
-    testbed = build_testbed(loader.load_scene("shefex2", overrides))
-    return list(render_stops(testbed, Rotation.random(FRAMES, rng=np.random.default_rng(3))))
+    lab = build_lab(loader.load_scene("shefex2", overrides))
+    return list(render_stops(lab, Rotation.random(FRAMES, rng=np.random.default_rng(3))))
 
 
 @pytest.mark.slow

@@ -63,7 +63,7 @@ def test_streak_vectors_are_those_of_the_turning_camera() -> None:
     """Stars' directions from mid-exposure pixels by the estimator's camera, turned by the rate over the exposure."""
     setup = setup_with(trial={"rate_deg_s": 3.0})
     one = labels.label_frame(setup, 5)
-    camera: Camera = assumed_camera(setup.testbed.scene)
+    camera: Camera = assumed_camera(setup.lab.scene)
     rows, rate, half_s = one.sources, one.truth.rate_cam_rad_s, one.frame.exposure_s / 2
     assert len(rows) > 5
     middle = camera.rays(np.column_stack([rows["x_px"], rows["y_px"]]))
@@ -149,7 +149,7 @@ def test_particles_are_masked_where_a_frame_without_them_differs() -> None:
     with_, without = (labels.label_frame(setup_with(more), 4) for more in (PARTICLE, {}))
     assert PARTICLES not in without.masks
     mask = decoded(with_.masks[PARTICLES], (HEIGHT, WIDTH))
-    config = setup_with().testbed.scene.camera.detector
+    config = setup_with().lab.scene.camera.detector
     added_e = (with_.frame.image_dn.astype(float) - without.frame.image_dn) * config.gain_e_dn
     free = with_.frame.image_dn < with_.frame.saturation_dn
     assert 20 < mask.sum() < 4000
@@ -174,7 +174,7 @@ def test_saturated_pixels_are_those_whose_charge_exceeds_the_well() -> None:
     well_e = 1500
     shallow = labels.label_frame(setup_with(base | {"camera.detector.full_well_e": well_e}), 5)
     deep = setup_with(base)
-    mask, config = decoded(shallow.masks[labels.SATURATED], (HEIGHT, WIDTH)), deep.testbed.scene.camera.detector
+    mask, config = decoded(shallow.masks[labels.SATURATED], (HEIGHT, WIDTH)), deep.lab.scene.camera.detector
     charge_e = (labels.label_frame(deep, 5).frame.image_dn.astype(float) - config.offset_dn) * config.gain_e_dn
     noise_e = config.read_noise_e
     assert mask.sum() > 3

@@ -23,7 +23,7 @@ from skysim.core.types import Floats
 from skysim.experiments.dome_survey import prior, procedure, stops
 from skysim.experiments.dome_survey.folder import images, watch
 from skysim.scene import loader
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.lab import Lab, build_lab
 
 DEAD, FAR, SWAPPED = 44, 20, (31, 57)
 FAR_M = 0.03
@@ -67,7 +67,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         '  layout: {kind: poisson_disk, cap_deg: 17, spacing: "38 mm", hardware_seed: 3}\n'
     )
     (made / "places.yaml").write_text(text)
-    place_m = build_testbed(loader.load(made / "places.yaml")).sources.place[:, :3]
+    place_m = build_lab(loader.load(made / "places.yaml")).sources.place[:, :3]
     rng, count = np.random.default_rng(1), len(place_m)
     level = np.array([1.0, 0.6, 0.36])[rng.integers(0, 3, count)]
     level[list(SWAPPED)] = [1.0, 0.36]
@@ -85,16 +85,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def built(folder: Path) -> Testbed:
-    return build_testbed(loader.load(folder / "built.yaml"))
+def built(folder: Path) -> Lab:
+    return build_lab(loader.load(folder / "built.yaml"))
 
 
 @pytest.fixture(scope="module")
-def frames(folder: Path, built: Testbed) -> Path:
+def frames(folder: Path, built: Lab) -> Path:
     """The images of a survey of the built dome, and the attitudes of its IMU."""
     uncertainty = prior.survey_uncertainty("0.3 deg", "1 mm", "3 mm", "1%")
-    testbed = build_testbed(prior.as_listed(loader.load(folder / "design.yaml")))
-    assumed = prior.prior_of(testbed, prior.calibration_prior(testbed).camera, prior.calibration_prior(testbed).leds)
+    lab = build_lab(prior.as_listed(loader.load(folder / "design.yaml")))
+    assumed = prior.prior_of(lab, prior.calibration_prior(lab).camera, prior.calibration_prior(lab).leds)
     model = prior.survey_model(assumed, uncertainty, 0.02)
     held = stops.planned_stops(built.scene, model, 8.0, STOPS, TILT_DEG)
     for _ in procedure.simulated_frames(built, uncertainty, held, folder / "frames"):
@@ -116,7 +116,7 @@ def result(folder: Path, frames: Path) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_the_folder_alone_gives_the_dome_as_built(result: dict[str, Any], folder: Path, built: Testbed) -> None:
+def test_the_folder_alone_gives_the_dome_as_built(result: dict[str, Any], folder: Path, built: Lab) -> None:
     """Only here is the truth known: places, focal length and lever within their errors, and better than the list."""
     found = Table.read(folder / "by_imu" / "leds.ecsv", format="ascii.ecsv")
     assert len(found) > 0.7 * len(built.sources)

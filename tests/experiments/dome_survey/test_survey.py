@@ -30,7 +30,7 @@ from skysim.experiments.dome_survey import prior as survey_prior
 from skysim.experiments.dome_survey import stops as survey_stops
 from skysim.experiments.dome_survey.frames import SurveyFrame
 from skysim.scene import loader
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking import dome_map_file, factory
 
 RARE = 1e-6  # the seeds are fixed: it fails for a wrong law alone
@@ -87,9 +87,9 @@ def statistics(folder: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def testbed(folder: Path) -> Testbed:
+def lab(folder: Path) -> Lab:
     """The small dome as it is believed before the survey."""
-    return build_testbed(survey_prior.with_survey_errors(loader.load(folder / "small.yaml"), UNCERTAINTY))
+    return build_lab(survey_prior.with_survey_errors(loader.load(folder / "small.yaml"), UNCERTAINTY))
 
 
 # --- end to end ---------------------------------------------------------------------------------------------
@@ -146,21 +146,19 @@ def test_the_leds_are_off_by_what_their_sigmas_say(statistics: dict[str, Any], f
 def test_a_scene_beside_the_file_believes_it(statistics: dict[str, Any], folder: Path) -> None:
     """Places, sigma, lever and lens as measured; LEDs not surveyed are left out; frames of the scene are solved."""
     (folder / "mapped.yaml").write_text("schema: 1\nbase: small.yaml\ntracker: {map: leds.ecsv}\n")
-    testbed = build_testbed(loader.load(folder / "mapped.yaml"))
-    tracker = build_tracker(testbed)
+    lab = build_lab(loader.load(folder / "mapped.yaml"))
+    tracker = build_tracker(lab.camera)
     assert isinstance(tracker, DomeTracker)
     measured = dome_map_file.read_dome_map(folder / "leds.ecsv")
     np.testing.assert_array_equal(tracker.leds.id, measured.id)
     np.testing.assert_array_equal(tracker.leds.position_m, measured.position_m)
-    assert len(tracker.leds.id) == statistics["surveyed"] < len(testbed.sources.id)
+    assert len(tracker.leds.id) == statistics["surveyed"] < len(lab.camera.sources.id)
     assert tracker.leds.sigma_m == np.median(measured.sigma_m)
     np.testing.assert_array_equal(tracker.lever.camera_body_m, measured.camera_body_m)
     assert tracker.lever.sigma_m == measured.lever_sigma_m
     found = {row["what"]: row["found"] for row in statistics["values"]}
     assert tracker.camera.focal_px == pytest.approx(found["focal length px"], rel=1e-12)
-    ((frame, truth),) = survey_frames.render_stops(
-        testbed, survey_stops.stop_attitudes(testbed.scene, "checks", 1, 10.0)
-    )
+    ((frame, truth),) = survey_frames.render_stops(lab, survey_stops.stop_attitudes(lab.scene, "checks", 1, 10.0))
     answer = factory.solve_frame(tracker, frame).attitude
     assert answer.cam_from_ref is not None
     assert np.degrees((answer.cam_from_ref * truth.cam_from_lab.inv()).magnitude()) < 0.1
@@ -185,8 +183,8 @@ def test_afit_s_dome_is_measured_to_a_hundredth_of_a_degree(tmp_path: Path) -> N
 # --- stops and names ----------------------------------------------------------------------------------------
 
 
-def test_stops_lean_evenly_over_the_cap_and_turn_any_way(testbed: Testbed) -> None:
-    stops = survey_stops.stop_attitudes(testbed.scene, "attitudes", 2000, 25.0)
+def test_stops_lean_evenly_over_the_cap_and_turn_any_way(lab: Lab) -> None:
+    stops = survey_stops.stop_attitudes(lab.scene, "attitudes", 2000, 25.0)
     up = stops.apply([0.0, 0.0, 1.0])
     least = np.cos(np.radians(25))
     # The height of the body's axis is uniform from cos 25 deg to 1; its azimuth and the heading are uniform too.
@@ -198,17 +196,17 @@ def test_stops_lean_evenly_over_the_cap_and_turn_any_way(testbed: Testbed) -> No
         assert np.mean(uniform**2) == pytest.approx(1 / 3, abs=5 * np.sqrt(4 / 45 / 2000))
 
 
-def test_the_imu_errs_by_its_sigma_about_each_axis(testbed: Testbed) -> None:
-    stops = survey_stops.stop_attitudes(testbed.scene, "attitudes", 500, 25.0)
-    off = (survey_frames.imu_attitudes(testbed.scene, stops, 0.01) * stops).as_rotvec() / 0.01
+def test_the_imu_errs_by_its_sigma_about_each_axis(lab: Lab) -> None:
+    stops = survey_stops.stop_attitudes(lab.scene, "attitudes", 500, 25.0)
+    off = (survey_frames.imu_attitudes(lab.scene, stops, 0.01) * stops).as_rotvec() / 0.01
     for axis in off.T:
         low, high = chi2.ppf([RARE / 2, 1 - RARE / 2], 500)
         assert low < np.sum(axis**2) < high
 
 
-def test_a_frame_of_a_stop_shows_a_vehicle_that_stands_there(testbed: Testbed) -> None:
-    stops = survey_stops.stop_attitudes(testbed.scene, "attitudes", 3, 18.0)
-    ((_, first), *_, (frame, last)) = survey_frames.render_stops(testbed, stops, 7)
+def test_a_frame_of_a_stop_shows_a_vehicle_that_stands_there(lab: Lab) -> None:
+    stops = survey_stops.stop_attitudes(lab.scene, "attitudes", 3, 18.0)
+    ((_, first), *_, (frame, last)) = survey_frames.render_stops(lab, stops, 7)
     assert frame.index == 9
     assert (last.lab_from_body * stops[2].inv()).magnitude() < 1e-12
     assert np.abs(last.rate_cam_rad_s).max() == 0
@@ -216,9 +214,9 @@ def test_a_frame_of_a_stop_shows_a_vehicle_that_stands_there(testbed: Testbed) -
 
 
 @pytest.mark.slow
-def test_an_imu_error_shifts_a_frame_by_what_is_predicted(testbed: Testbed) -> None:
+def test_an_imu_error_shifts_a_frame_by_what_is_predicted(lab: Lab) -> None:
     """The camera is off the center of rotation, so that it moves too: the LEDs shift by half as much again."""
-    prior = survey_prior.calibration_prior(testbed)
+    prior = survey_prior.calibration_prior(lab)
     sigmas = replace(UNCERTAINTY, lever_sigma_m=0.0)
     predicted_px, _ = matching.prediction_sigmas_px(prior, sigmas)
     errors_rad = sigmas.imu_sigma_rad * np.random.default_rng(7).standard_normal((2000, 3))
@@ -228,13 +226,13 @@ def test_an_imu_error_shifts_a_frame_by_what_is_predicted(testbed: Testbed) -> N
     assert predicted_px > 1.4 * sigmas.imu_sigma_rad * prior.camera.focal_px
 
 
-def test_lights_get_their_true_names_by_the_imu(testbed: Testbed) -> None:
+def test_lights_get_their_true_names_by_the_imu(lab: Lab) -> None:
     """Of ten stops' lights, 25 px aside each and 60 px all together where LEDs are some 75 px apart: 19 in 20."""
-    prior = survey_prior.calibration_prior(testbed)
-    stops = survey_stops.stop_attitudes(testbed.scene, "attitudes", 10, 18.0)
-    taken = procedure.simulated_frames(testbed, UNCERTAINTY, stops)
+    prior = survey_prior.calibration_prior(lab)
+    stops = survey_stops.stop_attitudes(lab.scene, "attitudes", 10, 18.0)
+    taken = procedure.simulated_frames(lab, UNCERTAINTY, stops)
     named = right = lights = 0
-    for survey_frame, (_, truth) in zip(taken, survey_frames.render_stops(testbed, stops), strict=True):
+    for survey_frame, (_, truth) in zip(taken, survey_frames.render_stops(lab, stops), strict=True):
         names = matching.match_by_imu(survey_frame, prior, UNCERTAINTY)
         apart_px, nearest = cKDTree(truth.sources.flux_xy_px).query(survey_frame.lights.xy_px[names.light])
         true = np.where(apart_px < 2, truth.sources.id[nearest], -1)
@@ -389,9 +387,9 @@ def refusal(folder: Path, tmp_path: Path, text: str) -> str:
     """What the tracker of the small scene says of a map of that text."""
     path = tmp_path / "leds.ecsv"
     path.write_text(text)
-    testbed = build_testbed(loader.load(folder / "small.yaml", {"tracker.map": str(path)}))
+    lab = build_lab(loader.load(folder / "small.yaml", {"tracker.map": str(path)}))
     with pytest.raises(InputError) as refused:
-        build_tracker(testbed)
+        build_tracker(lab.camera)
     assert "\n" not in str(refused.value)
     assert str(path) in str(refused.value)
     return str(refused.value)

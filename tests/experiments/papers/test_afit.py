@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from skysim.core.quantities.units import INCH_M
+from skysim.core.constants import INCH_M
 from skysim.experiments.configs import with_config
 from skysim.experiments.papers.afit import led_tests, surface, test1, test2
 from skysim.experiments.papers.afit.test2 import PAIR_M, Place, geometric_angle_arcsec
@@ -19,24 +19,24 @@ from skysim.experiments.papers.afit.test_stand import (
 )
 from skysim.experiments.papers.intervals import confidence_interval
 from skysim.scene.loader import load
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 
 R_M, M_M = 48 * INCH_M, 15 * INCH_M
 
 
 @pytest.fixture(scope="module")
-def pair() -> Testbed:
+def pair() -> Lab:
     return build_test_stand(test2.scene(0.3))
 
 
-def test_the_angle_of_a_pair_at_the_apex_is_eq_45s_own(pair: Testbed) -> None:
+def test_the_angle_of_a_pair_at_the_apex_is_eq_45s_own(pair: Lab) -> None:
     """y is half the pair, x the root of (R - M)^2 - y^2; the camera's M is added: an angle about the bearing."""
     y = PAIR_M / 2
     angle = 2 * np.arctan(y / (np.sqrt((R_M - M_M) ** 2 - y**2) + M_M))
     assert geometric_angle_arcsec(pair, Place(0.0)) == pytest.approx(np.degrees(angle) * 3600, abs=1e-3)
 
 
-def test_a_board_that_leans_shows_the_cosine_of_its_angle(pair: Testbed) -> None:
+def test_a_board_that_leans_shows_the_cosine_of_its_angle(pair: Lab) -> None:
     """One LED comes nearer and the other farther, which cancels but for the square of half the pair's angle."""
     share = geometric_angle_arcsec(pair, Place(28.0, 5.0)) / geometric_angle_arcsec(pair, Place(28.0))
     # The dome's own normal leans there by a little, so that five degrees are added to it.
@@ -46,7 +46,7 @@ def test_a_board_that_leans_shows_the_cosine_of_its_angle(pair: Testbed) -> None
     assert share == pytest.approx(np.cos(own + np.radians(5)) / np.cos(own), abs=2e-5)
 
 
-def test_a_dome_that_is_moved_away_shows_less_by_the_longer_way(pair: Testbed) -> None:
+def test_a_dome_that_is_moved_away_shows_less_by_the_longer_way(pair: Lab) -> None:
     """The range from the camera grows; the pair in the image plane at R - M shrinks by as much."""
     places = [Place(28.0), Place(28.0, 0.0, 0.125)]
     camera_m = M_M * np.array([np.sin(np.radians(28)), 0, np.cos(np.radians(28))])
@@ -58,7 +58,7 @@ def test_a_dome_that_is_moved_away_shows_less_by_the_longer_way(pair: Testbed) -
     assert angle[1] < angle[0] - 4
 
 
-def test_images_have_the_angle_of_the_geometry(pair: Testbed) -> None:
+def test_images_have_the_angle_of_the_geometry(pair: Lab) -> None:
     board = test2.place_pair(pair, Place(28.0))
     frame, truth = render_at_attitude(board, test2.point_at(Place(28.0)), np.random.default_rng(1))
     lights = measure_lights(gray_levels(frame, board))

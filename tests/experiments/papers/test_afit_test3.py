@@ -17,31 +17,31 @@ from skysim.experiments.papers.afit.test3_images import (
 )
 from skysim.experiments.papers.intervals import prediction_interval
 from skysim.experiments.papers.published import experiments
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 from skysim.tracking import onboard_model
 
 
 @pytest.fixture(scope="module")
-def testbed() -> Testbed:
+def lab() -> Lab:
     return build_test3()
 
 
 @pytest.fixture(scope="module")
-def sightings(testbed: Testbed) -> list[Sighting]:
+def sightings(lab: Lab) -> list[Sighting]:
     """Two images at each position, the IMU a little wrong at the last."""
-    seen = test3.photograph_positions(testbed, 2, np.random.default_rng(70))
-    return test3.ImageSeries(testbed, seen).sightings
+    seen = test3.photograph_positions(lab, 2, np.random.default_rng(70))
+    return test3.ImageSeries(lab, seen).sightings
 
 
 def test_every_position_shows_all_five(sightings: list[Sighting]) -> None:
     assert [one.stop for one in sightings] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
 
 
-def test_the_epsilons_are_those_of_the_thesis_s_calibration(testbed: Testbed, sightings: list[Sighting]) -> None:
-    measurements = measure(testbed, sightings)
-    believed = onboard_model.assumed_dome(testbed.scene, testbed.scene.light, testbed.sources)  # type: ignore[arg-type]
-    lever = onboard_model.assumed_lever(testbed.scene, testbed.mount)
-    told = calibrate(sightings, onboard_model.calibration(testbed.scene.camera), believed, lever)
+def test_the_epsilons_are_those_of_the_thesis_s_calibration(lab: Lab, sightings: list[Sighting]) -> None:
+    measurements = measure(lab, sightings)
+    believed = onboard_model.assumed_dome(lab.scene, lab.scene.light, lab.camera.sources)  # type: ignore[arg-type]
+    lever = onboard_model.assumed_lever(lab.scene, lab.camera.mount)
+    told = calibrate(sightings, onboard_model.calibration(lab.scene.camera), believed, lever)
     found = [
         test3.largest_std(measurements.magnitude),
         test3.largest_std(measurements.lab_m.reshape(len(sightings), -1)),
@@ -52,33 +52,29 @@ def test_the_epsilons_are_those_of_the_thesis_s_calibration(testbed: Testbed, si
     np.testing.assert_allclose(found, theirs * np.sqrt(1 - 1 / len(sightings)), rtol=1e-9)
 
 
-def test_an_imu_that_is_wrong_at_one_of_five_spreads_a_place_by_two_fifths(
-    testbed: Testbed, sightings: list[Sighting]
-) -> None:
+def test_an_imu_that_is_wrong_at_one_of_five_spreads_a_place_by_two_fifths(lab: Lab, sightings: list[Sighting]) -> None:
     """A shift d of one in five: sd = d sqrt(1/5 4/5), 48 in times the IMU's .239 deg (Table 14); n - 1 aside."""
     shift_mm = 48 * 25.4 * np.radians(0.239)
     expected = shift_mm * np.sqrt(0.2 * 0.8) * np.sqrt(10 / 9)
-    bumped = test3.ImageSeries(testbed, sightings).bumped(test3.BUMPED_POSITION)
+    bumped = test3.ImageSeries(lab, sightings).bumped(test3.BUMPED_POSITION)
     x_mm = bumped.lab_m[:, :, 0] * 1e3
     # What eq. 44 leaves between the positions without a bump, 0.1 mm, is in it.
     np.testing.assert_allclose(x_mm.std(axis=0, ddof=1).mean(), expected, rtol=0.05)
 
 
 @pytest.mark.long
-def test_the_places_fitted_are_table_8_and_a_cross_of_eight_millimeters(testbed: Testbed) -> None:
-    place_m = test3.fit_positions(testbed)
+def test_the_places_fitted_are_table_8_and_a_cross_of_eight_millimeters(lab: Lab) -> None:
+    place_m = test3.fit_positions(lab)
     rows = experiments()["afit-table-6-9"].rows
     published = [rows[f"separation_{n}"].published for n in range(1, 11)]
-    assert np.abs(np.sort(test3.expected_angles_arcsec(testbed, place_m)) - published).max() < 1
+    assert np.abs(np.sort(test3.expected_angles_arcsec(lab, place_m)) - published).max() < 1
     arms_mm = np.linalg.norm(place_m[1:, :2], axis=1) * 1e3
     assert np.abs(arms_mm - 8).max() < 0.25  # set by hand
 
 
-def test_intervals_draw_the_images_of_a_position_and_not_the_positions(
-    testbed: Testbed, sightings: list[Sighting]
-) -> None:
+def test_intervals_draw_the_images_of_a_position_and_not_the_positions(lab: Lab, sightings: list[Sighting]) -> None:
     """What differs between positions alone has no interval."""
-    measurements = measure(testbed, sightings)
+    measurements = measure(lab, sightings)
     values = measurements.position[:, None].astype(float)
     found = test3.stratified_bootstrap(measurements, values, test3.mean)
     assert found[:3] == (2.0, 2.0, 2.0)
@@ -95,9 +91,9 @@ def test_another_draw_is_in_its_interval_as_often_as_it_says() -> None:
 
 
 @pytest.mark.long
-def test_an_image_against_the_catalog_of_itself_is_not_turned_at_all(testbed: Testbed) -> None:
+def test_an_image_against_the_catalog_of_itself_is_not_turned_at_all(lab: Lab) -> None:
     """Reference 1.2, item 14: the thesis has .0335 deg there."""
-    found = attitude.algorithm_errors(testbed, 1, 2, np.random.default_rng(72))
+    found = attitude.algorithm_errors(lab, 1, 2, np.random.default_rng(72))
     assert np.abs(found.error_deg[:, 0]).max() < 1e-9
     assert found.named == (5, 5)
     assert np.abs(found.error_deg[:, 1:, :2]).max() < 0.02  # the slip of eq. 44
@@ -137,8 +133,8 @@ def test_the_vehicle_stands_where_the_tables_say() -> None:
         )
 
 
-def test_images_are_the_same_by_the_same_seed(testbed: Testbed) -> None:
+def test_images_are_the_same_by_the_same_seed(lab: Lab) -> None:
     first, again = (
-        photograph(testbed, 0, lab_from_body(IMU_DEG[0]), 1, np.random.default_rng(75))[0].xy_px for _ in range(2)
+        photograph(lab, 0, lab_from_body(IMU_DEG[0]), 1, np.random.default_rng(75))[0].xy_px for _ in range(2)
     )
     np.testing.assert_array_equal(first, again)

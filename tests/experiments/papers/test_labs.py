@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.experiments.papers.other_domes import apl, nps, oled
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 
 pytestmark = pytest.mark.slow  # much is compiled
 
@@ -20,7 +20,7 @@ def level() -> nps.OnboardModel:
 
 def test_with_the_true_attitude_the_distances_are_true(level: nps.OnboardModel) -> None:
     """R_0 + alpha b is the star's place: within a pitch of the panel and the noise, a few tenths of a px."""
-    place = level.testbed.sources.place[:, :3]
+    place = level.lab.camera.sources.place[:, :3]
     wanted = place / np.linalg.norm(place, axis=1, keepdims=True)
     apart = np.array([np.linalg.norm(wanted - one, axis=1).min() for one in level.vectors])
     assert len(apart) == 9
@@ -29,7 +29,7 @@ def test_with_the_true_attitude_the_distances_are_true(level: nps.OnboardModel) 
 
 def test_an_update_leaves_a_small_share_of_the_error(level: nps.OnboardModel) -> None:
     """A wrong distance moves a point almost along its direction: two degrees become less than a tenth of that."""
-    rays = nps.rays_body(level.testbed, 11)
+    rays = nps.rays_body(level.lab, 11)
     found = nps.solve(level, rays, nps.initial_error(2.0))
     again = nps.solve_iteratively(level, rays, nps.initial_error(2.0))
     exact = nps.solve(level, rays, Rotation.identity())
@@ -40,10 +40,10 @@ def test_an_update_leaves_a_small_share_of_the_error(level: nps.OnboardModel) ->
 def test_a_camera_in_the_center_sees_no_shell() -> None:
     """(r / R)(dR / R) is nothing for r = 0, and proportional to r."""
     scene = apl.shell_scene(0.004, 5)
-    testbed = build_testbed(scene)
+    lab = build_lab(scene)
     poses = apl.random_attitudes(8, np.random.default_rng(1))
     worst = [
-        apl.largest_discrepancies_arcsec(scene, testbed, offset_m, True, poses).max() for offset_m in (0.0, 0.001, 0.01)
+        apl.largest_discrepancies_arcsec(scene, lab, offset_m, True, poses).max() for offset_m in (0.0, 0.001, 0.01)
     ]
     assert worst[0] < 1e-6
     assert worst[2] == pytest.approx(10 * worst[1], rel=0.02)
@@ -51,9 +51,9 @@ def test_a_camera_in_the_center_sees_no_shell() -> None:
 
 def test_a_circle_about_the_zenith_holds_its_share_of_evenly_spread_stars() -> None:
     """n (1 - cos(d / 2)) of n on a hemisphere."""
-    testbed = build_testbed(apl.shell_scene(0.0, 1))
+    lab = build_lab(apl.shell_scene(0.0, 1))
     rng = np.random.default_rng(2)
-    mean = apl.count_fibers(testbed, 10.0, apl.random_boresights(50_000, rng)).mean()
+    mean = apl.count_fibers(lab, 10.0, apl.random_boresights(50_000, rng)).mean()
     assert mean == pytest.approx(100 * (1 - np.cos(np.radians(5))), rel=0.05)
 
 

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from estimator.catalog.pair_index import PairIndex
 from skysim.apps.cli.main import app
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.experiments.papers.ptase import ground, monte_carlo
 from skysim.results.metrics import rms
 

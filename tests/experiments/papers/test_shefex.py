@@ -124,7 +124,7 @@ def test_an_empty_frame_of_a_coarse_converter_lengthens_the_exposure() -> None:
 
 def test_a_planet_s_light_is_pogson_s() -> None:
     loop = camera.ExposureLoop({}, camera.random_attitudes(1, 1)[0], 40)
-    before, after = loop.testbed.sources, camera.with_planets(loop.testbed, 3)
+    before, after = loop.lab.camera.sources, camera.with_planets(loop.lab, 3)
     changed = after.strength != before.strength
     assert changed.sum() == 3
     gained_mag = 2.5 * np.log10(after.strength[changed] / before.strength[changed])

@@ -18,7 +18,7 @@ from skysim.experiments.study.report import overview, page
 from skysim.results import metrics
 from skysim.results.metrics import Summary
 from skysim.simulation import checks
-from skysim.simulation.testbed import build_testbed
+from skysim.simulation.lab import build_lab
 
 STUDY: dict[str, Any] = {
     "schema": 1,
@@ -215,7 +215,7 @@ def test_the_tracker_s_knowledge_is_told_as_by_the_check(tmp_path: Path) -> None
     survey = {"tracker.survey": {"instrument": station | {"distance_sigma": "1 mm"}, "led_sigma": "0.1 mm"}}
     plan = loaded(tmp_path, set=STUDY["set"] | survey)
     scene, _ = resolve_point(plan.spec, plan.points[0].settings)
-    (fact,) = [one for one in checks.check(build_testbed(scene)).facts if one.name == "tracker knows"]
+    (fact,) = [one for one in checks.check(build_lab(scene)).facts if one.name == "tracker knows"]
     told = dict(overview.overview(plan).rows)["tracker knows"]
     assert told == "; ".join(fact.lines)
     assert "measured by a total station" in told

@@ -71,7 +71,7 @@ def test_leds_and_survey_are_drawn_independently(tmp_path: Path) -> None:
     errors_m = []
     for n in range(4):
         setup = setups.prepared_setup(spec, spec.trial_settings({}, n))
-        errors_m.append(setup.estimator.leds.position_m - setup.testbed.sources.place[:, :3])
+        errors_m.append(setup.estimator.leds.position_m - setup.lab.camera.sources.place[:, :3])
     assert np.std(errors_m) == pytest.approx(0.2e-3, rel=0.05)
     assert np.corrcoef(np.reshape(errors_m, (4, -1))) == pytest.approx(np.eye(4), abs=0.2)
 

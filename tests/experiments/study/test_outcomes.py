@@ -32,7 +32,7 @@ def solved(spec: TrialSpec, seed: int = 3) -> tuple[Setup, Report, TrueLights]:
 
 
 def scored(setup: Setup, report: Report, lights: TrueLights) -> Outcome:
-    return outcomes.score(setup.testbed, setup.estimator, report, lights)
+    return outcomes.score(setup.lab, setup.estimator, report, lights)
 
 
 def with_match(report: Report, star: Floats) -> Report:
@@ -74,7 +74,7 @@ def test_a_light_is_the_stars_own_within_three_pixels(spec: TrialSpec, distance_
 def test_wrong_lights_mislead_where_the_error_is_more_than_claimed(sigmas: float, misled: int) -> None:
     """NEES 25 is allowed, 49 is not (40.8 has the probability 1e-8); with the right lights neither is misled."""
     setup, report, lights = solved(SKY)
-    truth = setup.testbed.mount.cam_from_body * lights.lab_from_body.inv()
+    truth = setup.lab.camera.mount.cam_from_body * lights.lab_from_body.inv()
     error = Rotation.from_rotvec([sigmas * 1e-6, 0, 0])
     attitude = replace(report.attitude, cam_from_ref=error * truth, covariance_rad2=1e-12 * np.eye(3))
     assert scored(setup, Report(attitude, report.centroids), lights).misled == 0
@@ -104,7 +104,7 @@ def test_honest_roll_noise_is_beyond_ten_arcminutes_and_within_the_covariance(
 ) -> None:
     """NEES is (roll / sigma)^2: 5.8 and 3.2 and 3.1 are allowed, 144 is not."""
     setup, report, lights = solved(DOME)
-    truth = setup.testbed.mount.cam_from_body * lights.lab_from_body.inv()
+    truth = setup.lab.camera.mount.cam_from_body * lights.lab_from_body.inv()
     sigma_rad = ARCMIN_RAD * np.array([1.0, 1.0, sigma_arcmin])
     attitude = replace(
         report.attitude,
@@ -144,7 +144,7 @@ def test_false_lights_have_no_centroid_error() -> None:
 def test_a_streak_is_as_long_as_the_rate_times_the_exposure() -> None:
     spec = replace(SKY, trial={"kind": "frames", "rate_deg_s": 4.0})
     setup = setups.prepared_setup(spec, {})
-    expected_px = math.radians(4.0) * setup.testbed.scene.exposure.time_s * setup.testbed.scene.camera.focal_px
+    expected_px = math.radians(4.0) * setup.lab.scene.exposure.time_s * setup.lab.scene.camera.focal_px
     assert trials.run_frame_trial(setup, 5).streak_px == pytest.approx(expected_px, rel=0.03)
     assert math.isnan(trials.run_centroid_trials(setups.prepared_setup(SKY, {}), [5])[0].streak_px)
 
@@ -156,10 +156,10 @@ def test_frames_solved_in_flight_have_the_streaks_of_rendered_ones() -> None:
     base = {"exposure.frames": 3, "vehicle.imu": {}, "filter": {"start_deg": 0.1}}
     spec = replace(DOME, base=base, trial=flight)
     setup = setups.prepared_setup(spec, {})
-    testbed = trials.run.simulate_motion(setup.testbed.in_run(4))
-    assert len(testbed.reports) == 3
-    in_flight = [one.streak_px for _, one in trials.flight_outcomes(testbed, setup.estimator)]
-    rendered = [one.streak_px for _, one in trials.flight_outcomes(replace(testbed, reports={}), setup.estimator)]
+    lab = trials.run.simulate_motion(setup.lab.in_run(4))
+    assert len(lab.reports) == 3
+    in_flight = [one.streak_px for _, one in trials.flight_outcomes(lab, setup.estimator)]
+    rendered = [one.streak_px for _, one in trials.flight_outcomes(replace(lab, reports={}), setup.estimator)]
     assert max(rendered) > 0.5
     assert in_flight == pytest.approx(rendered, rel=0.05)
 
@@ -178,7 +178,7 @@ def test_a_row_has_the_attitude_of_its_trial() -> None:
             assert drawn.apply([0, 0, 1]) == pytest.approx(axis, abs=1e-12)
             assert math.isnan(outcome.boresight_ra_deg)
         else:
-            ra, dec, _ = np.degrees(ra_dec_roll_rad(setup.testbed.mount.cam_from_body * drawn.inv()))
+            ra, dec, _ = np.degrees(ra_dec_roll_rad(setup.lab.camera.mount.cam_from_body * drawn.inv()))
             assert (outcome.boresight_ra_deg, outcome.boresight_dec_deg) == pytest.approx((ra, dec), abs=1e-9)
             assert math.isnan(outcome.body_tilt_deg)
 

@@ -63,7 +63,7 @@ def test_attitudes_are_even_over_what_is_allowed(spec, key):
     rng = np.random.default_rng(3)
     drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(2000)])
     if spec is SKY:
-        boresight = drawn.apply(ready.testbed.mount.cam_from_body.inv().apply([0, 0, 1]))
+        boresight = drawn.apply(ready.lab.camera.mount.cam_from_body.inv().apply([0, 0, 1]))
         ends = np.sin(np.radians([low, high]))
     else:
         boresight = drawn.apply([0, 0, 1])
@@ -84,7 +84,7 @@ def test_attitudes_near_the_zenith_are_at_their_altitudes():
     ready = setups.prepared_setup(SKY, {"start_time": "2012-10-29T22:00:00", "site": site, "trial.near": near})
     rng = np.random.default_rng(4)
     drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(200)])
-    x, y, z = drawn.apply(ready.testbed.mount.cam_from_body.inv().apply([0, 0, 1])).T
+    x, y, z = drawn.apply(ready.lab.camera.mount.cam_from_body.inv().apply([0, 0, 1])).T
     place = EarthLocation.from_geodetic(8.8, 53.1)
     with iers.conf.set_temp("auto_download", False):
         boresight = SkyCoord(np.arctan2(y, x) * u.rad, np.arcsin(z) * u.rad)
@@ -101,8 +101,8 @@ def test_attitudes_near_a_body_are_even_about_it():
     ready = setups.prepared_setup(SKY, {"start_time": "2012-07-03T18:00:00", "trial.near": near})
     rng = np.random.default_rng(3)
     drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(2000)])
-    boresight = drawn.apply(ready.testbed.mount.cam_from_body.inv().apply([0, 0, 1]))
-    moon = place("moon", observe_from(ready.testbed.scene.start_time, ready.testbed.scene.site)).direction
+    boresight = drawn.apply(ready.lab.camera.mount.cam_from_body.inv().apply([0, 0, 1]))
+    moon = place("moon", observe_from(ready.lab.scene.start_time, ready.lab.scene.site)).direction
     low, high = np.cos(np.radians([8.0, 2.0]))
     level = (boresight @ moon - low) / (high - low)
     east = np.cross([0, 0, 1], moon)
@@ -133,12 +133,12 @@ def test_three_turns_are_scipys(angles):
 def test_lights_are_where_the_renderer_puts_them_and_as_bright(spec):
     """Pixel and electrons against the truth of a rendered frame, of those lights whose whole image is on the chip."""
     ready = setups.prepared_setup(spec, {"background": []})
-    testbed = ready.testbed
+    lab = ready.lab
     lab_from_body = trials.random_attitude(ready, np.random.default_rng(5))
     still = Trajectory(np.array([-1.0, 9.0]), Rotation.concatenate([lab_from_body] * 2), np.zeros((2, 3)))
-    _, truth = exposure.render_frame(replace(testbed, trajectory=still), 0)
-    xy_px, electrons = detections.visible_sources(testbed, lab_from_body)
-    size_px = np.array(testbed.canvas.shape[::-1])
+    _, truth = exposure.render_frame(replace(lab, trajectory=still), 0)
+    xy_px, electrons = detections.visible_sources(lab, lab_from_body)
+    size_px = np.array(lab.camera.canvas.shape[::-1])
     inner = np.flatnonzero(((truth.sources.xy_px > 40) & (truth.sources.xy_px < size_px - 41)).all(axis=1))
     assert len(inner) >= 5
     for n in inner:
@@ -154,7 +154,7 @@ def test_what_is_spoilt_is_spoilt_as_told():
     trial = CentroidTrial(kind="centroids", noise_px=0.3, missing=0.25, false_share=0.5, magnitude_sigma=0.0)
     xy_px, electrons = np.full((40, 2), 300.0), np.linspace(1e5, 2e5, 40)
     rng = np.random.default_rng(6)
-    seen = [detections.simulate_detections(trial, xy_px, electrons, ready.testbed.scene, rng) for _ in range(400)]
+    seen = [detections.simulate_detections(trial, xy_px, electrons, ready.lab.scene, rng) for _ in range(400)]
     true = [np.hypot(*(one.xy_px - 300).T) < 3 for one in seen]
     kept = sum(int(one.sum()) for one in true)
     assert kept / (400 * 40) == pytest.approx(0.75, abs=4 * math.sqrt(0.75 * 0.25 / 16_000))
@@ -169,9 +169,9 @@ def test_the_brightest_are_kept_where_only_so_many_may_be():
     ready = setups.prepared_setup(SKY, {})
     trial = CentroidTrial(kind="centroids", noise_px=0.0, lights=3, magnitude_sigma=0.0)
     seen = detections.simulate_detections(
-        trial, np.zeros((9, 2)), np.arange(9.0), ready.testbed.scene, np.random.default_rng(1)
+        trial, np.zeros((9, 2)), np.arange(9.0), ready.lab.scene, np.random.default_rng(1)
     )
-    gain_e_dn = ready.testbed.scene.camera.detector.gain_e_dn
+    gain_e_dn = ready.lab.scene.camera.detector.gain_e_dn
     assert seen.flux * gain_e_dn == pytest.approx([8, 7, 6], rel=1e-12)
 
 
@@ -202,11 +202,11 @@ CODES = [
 def test_lights_of_a_coded_trial_are_as_bright_as_rendered_ones(code):
     """Of frame 7, over the mean light of each LED: bits, edges of bits, pulses."""
     ready = setups.prepared_setup(CODED, {"light.led.code": code})
-    testbed, lab_from_body = ready.testbed.in_run(5), Rotation.from_rotvec([0.1, 0.05, 1.0])
-    ((rows, xy_px, electrons),) = detections.visible_rows(testbed, Rotation.concatenate([lab_from_body]))
-    light_e = electrons * detections.brightness(testbed, rows, 7)
-    _, truth = exposure.render_frame(testbed.at_rest(lab_from_body, 7), 7)
-    size_px = np.array(testbed.canvas.shape[::-1])
+    lab, lab_from_body = ready.lab.in_run(5), Rotation.from_rotvec([0.1, 0.05, 1.0])
+    ((rows, xy_px, electrons),) = detections.visible_rows(lab, Rotation.concatenate([lab_from_body]))
+    light_e = electrons * detections.brightness(lab, rows, 7)
+    _, truth = exposure.render_frame(lab.at_rest(lab_from_body, 7), 7)
+    size_px = np.array(lab.camera.canvas.shape[::-1])
     inner = np.flatnonzero(((xy_px > 40) & (xy_px < size_px - 41)).all(axis=1))
     assert len(inner) >= 2
     for n in inner:
@@ -249,9 +249,9 @@ def test_a_frame_that_turns_is_smeared_by_what_the_gyro_tells():
     ready = setups.prepared_setup(spec, {})
     assert isinstance(ready.trial, FrameTrial)
     _, truth, told_px = trials.render_trial_frame(ready, 77)
-    wanted = math.radians(4.0) * ready.testbed.scene.exposure.time_s * ready.testbed.scene.camera.focal_px
+    wanted = math.radians(4.0) * ready.lab.scene.exposure.time_s * ready.lab.scene.camera.focal_px
     assert math.hypot(*told_px) == pytest.approx(wanted, rel=1e-12)
-    middle = np.argmin(np.hypot(*(truth.sources.xy_px - np.array(ready.testbed.canvas.shape[::-1]) / 2).T))
+    middle = np.argmin(np.hypot(*(truth.sources.xy_px - np.array(ready.lab.camera.canvas.shape[::-1]) / 2).T))
     assert truth.sources.streak_px[middle] == pytest.approx(wanted, rel=0.03)
     came = trials.run_frame_trial(ready, 77)
     assert came.frames == 1
@@ -292,7 +292,7 @@ def test_a_flights_filter_is_scored_at_every_tick():
 def test_a_bench_is_kept_and_shared_where_only_the_trial_differs():
     first = setups.prepared_setup(SKY, {"trial.noise_px": 0.1})
     other = setups.prepared_setup(SKY, {"trial.noise_px": 0.2})
-    assert first.testbed is other.testbed
+    assert first.lab is other.lab
     assert setups.prepared_setup(SKY, {"trial.noise_px": 0.1}) is first
     assert other.trial.noise_px == 0.2
     for n in range(setups.CACHE_SIZE):
@@ -333,7 +333,7 @@ def test_a_frame_turns_about_the_axis_that_is_named(axis, frame, expected):
     _, truth, _ = trials.render_trial_frame(ready, 7)
     rate = truth.rate_cam_rad_s
     if frame == "body":
-        rate = ready.testbed.mount.cam_from_body.inv().apply(rate)
+        rate = ready.lab.camera.mount.cam_from_body.inv().apply(rate)
     np.testing.assert_allclose(rate, np.radians(2.0) * np.array(expected), rtol=0, atol=1e-12)
     assert (truth.cam_from_lab * before.cam_from_lab.inv()).magnitude() < 1e-12
     assert abs(before.rate_cam_rad_s[2]) < 1e-12  # perpendicular to the boresight
@@ -343,9 +343,9 @@ def test_a_turn_about_the_boresight_leaves_its_star_where_it_is():
     """Streaks grow with the distance from the image's center: rate x exposure x distance."""
     ready = setups.prepared_setup(FRAMES, {"trial.rate_axis": "boresight", "trial.rate_deg_s": 20.0})
     _, truth, streak_px = trials.render_trial_frame(ready, 3)
-    sources, camera = truth.sources, ready.testbed.scene.camera
+    sources, camera = truth.sources, ready.lab.scene.camera
     distance_px = np.hypot(*(sources.xy_px - [(camera.width_px - 1) / 2, (camera.height_px - 1) / 2]).T)
-    swept = np.radians(20.0) * ready.testbed.scene.exposure.time_s * distance_px
+    swept = np.radians(20.0) * ready.lab.scene.exposure.time_s * distance_px
     near = distance_px < 150  # where tan is its angle
     assert near.sum() > 3
     np.testing.assert_allclose(sources.streak_px[near], swept[near], rtol=0.02, atol=0.02)
@@ -366,7 +366,7 @@ def test_a_flight_starts_anywhere_and_the_same_for_the_same_seed(name):
     assert (starts[0].inv() * drawn).magnitude() == 0
     scene_start = ready._replace(trial=plan.FlightTrial(kind="flight"))
     fixed = trials.flight_testbed(scene_start, 5).trajectory.lab_from_body[0]
-    assert (fixed.inv() * ready.testbed.trajectory.lab_from_body[0]).magnitude() == 0
+    assert (fixed.inv() * ready.lab.start).magnitude() == 0
 
 
 @pytest.mark.slow
@@ -448,6 +448,6 @@ def test_a_tracked_frame_has_the_motion_of_its_time():
     truth = rendered(settings | {"trial.tracked": 2})
     assert (truth.cam_from_lab * rendered(settings).cam_from_lab.inv()).magnitude() < 1e-12
     setup = setups.prepared_setup(AT_REST, settings | {"trial.tracked": 2})
-    testbed = trials.moving_testbed(setup, 5)[0]
-    step = trials.rotation_between(testbed, truth.t_s - 0.1, truth.t_s)
+    lab = trials.moving_testbed(setup, 5)[0]
+    step = trials.rotation_between(lab, truth.t_s - 0.1, truth.t_s)
     assert np.degrees(step.magnitude()) == pytest.approx(0.2, rel=1e-9)

@@ -10,13 +10,14 @@ import typer
 
 from skysim.apps.cli.options import Json, Overrides, SceneArg, load
 from skysim.apps.cli.terminal import print_json, print_table, progress_callback
+from skysim.core.constants import DAY_S, HOUR_S, JULIAN_YEAR_DAY
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
     from skysim.scene.scene import Scene
     from skysim.sources.orbit.availability import Pointing, Samples
 
-SPANS_S = {"orbit": None, "day": 86_400.0, "year": 365.25 * 86_400.0}
+SPANS_S = {"orbit": None, "day": DAY_S, "year": JULIAN_YEAR_DAY * DAY_S}
 LAWS = ("inertial", "zenith")
 
 
@@ -53,7 +54,7 @@ def availability(
     rows = [[name, f"more than {limit:g}° away", f"{100 * fractions[name]:.2f} %"] for name, limit in limits.items()]
     rows.append(["stars", f"at least {exclusion.stars}", f"{100 * fractions['stars']:.2f} %"])
     rows.append(["all", "available", f"{100 * fractions['all']:.2f} %"])
-    print_table(f"{config.name}: {span} of {found.t_s[-1] / 3600:.4g} h", ["", "condition", "fraction of time"], rows)
+    print_table(f"{config.name}: {span} of {found.t_s[-1] / HOUR_S:.4g} h", ["", "condition", "fraction of time"], rows)
 
 
 def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Pointing:
@@ -76,19 +77,19 @@ def computed(scene: Scene, pointing: Pointing, span_s: float | None, samples: in
     """The angles over the span, or over one revolution."""
     import numpy as np
 
+    from skysim.core.constants import EARTH_MU_M3_S2
     from skysim.sources import catalog, stars
     from skysim.sources.orbit.availability import sample
     from skysim.sources.orbit.camera_orbit import build_orbit
-    from skysim.sources.orbit.earth import MU_M3_S2
 
     orbit = build_orbit(scene.orbit, scene.start_time)
     assert orbit is not None
     if span_s is None:
         first = orbit.states(np.zeros(1))
-        energy = np.sum(first.velocity_m_s**2) / 2 - MU_M3_S2 / np.linalg.norm(first.position_m)
+        energy = np.sum(first.velocity_m_s**2) / 2 - EARTH_MU_M3_S2 / np.linalg.norm(first.position_m)
         if energy >= 0:
             raise InputError("--span", "orbit: this orbit is not closed", "day, year")
-        span_s = float(2 * np.pi * MU_M3_S2 / (-2 * energy) ** 1.5)
+        span_s = float(2 * np.pi * EARTH_MU_M3_S2 / (-2 * energy) ** 1.5)
     t_s = np.asarray((np.arange(samples) + 0.5) * (span_s / samples), float)
     known = catalog.read_for("tracker.catalog", scene.tracker.catalog).to_limit(scene.tracker.limit_mag)
     camera = scene.camera
@@ -117,7 +118,7 @@ def write_picture(path: Path, found: Samples, scene: Scene) -> None:
 
     assert scene.orbit is not None
     assert scene.orbit.exclusion is not None
-    exclusion, hours = scene.orbit.exclusion, found.t_s / 3600
+    exclusion, hours = scene.orbit.exclusion, found.t_s / HOUR_S
     curves = (
         ("Sun", found.sun_deg, exclusion.sun_deg),
         ("Earth's limb", found.earth_deg, exclusion.earth_deg),

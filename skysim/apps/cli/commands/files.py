@@ -58,18 +58,18 @@ def scenes_export(
     """
     from skysim.core.io import files
     from skysim.results.files.builder import templates
-    from skysim.simulation.testbed import build_testbed, export_leds, export_mjcf
+    from skysim.simulation.lab import build_lab
 
     loaded = load(scene, None, seed, set_)
     path = out or Path("out") / f"{loaded.name}.xml"
-    testbed, use = build_testbed(loaded), f"python -m mujoco.viewer --mjcf={path}"
+    lab, use = build_lab(loaded), f"python -m mujoco.viewer --mjcf={path}"
     if path.suffix.lower() == ".csv":
-        text, cap_deg = export_leds(testbed)
+        text, cap_deg = lab.export_leds()
         use = f"light.layout: {{kind: listed, cap_deg: {cap_deg}, file: {path}}}"
     elif (ending := path.suffix.lower()) in templates.TEMPLATES:
-        text, use = templates.template(testbed, ending), "print it at 100 %" if ending == ".svg" else "in mm"
+        text, use = templates.template(lab, ending), "print it at 100 %" if ending == ".svg" else "in mm"
     else:
-        text = export_mjcf(testbed)
+        text = lab.export_mjcf()
     files.make_folder(path.parent)
     files.write_text(path, text)
     print(f"{path}: {use}")

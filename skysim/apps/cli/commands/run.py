@@ -5,8 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from dataclasses import asdict
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -36,7 +35,6 @@ from skysim.apps.cli.options import (
 
 if TYPE_CHECKING:
     from skysim.core.types import FrameRow
-    from skysim.simulation.testbed import Testbed
 
 
 def run(
@@ -59,36 +57,30 @@ def run(
 ) -> None:
     """Simulate a scene: motion, frames, attitude solutions and their scores."""
     from skysim.results import scoring
-    from skysim.results.run import Recorder, score_frames
+    from skysim.results.run import FlightRecorder
     from skysim.simulation.checks import check
     from skysim.simulation.compilation import on_two_processes
-    from skysim.simulation.run import simulate_motion
-    from skysim.simulation.testbed import build_testbed
+    from skysim.simulation.flight import open_flight
 
     stages = selected_stages(detector=detector, centroider=centroider, identifier=identifier, solver=solver)
     if tracker is not None:
         stages["name"] = tracker
     loaded = load(scene, frames, seed, [*(set_ or []), *(f"tracker.{key}={name}" for key, name in stages.items())])
-    testbed = build_testbed(loaded, used_programs(program, scene_names(loaded)))
-    plan = check(testbed)
-    for finding in plan.findings:
-        terminal.print_error(with_location(finding))
-    with on_two_processes(*LOADED[-1]):
-        with terminal.progress_callback("simulating the motion") as update:
-            testbed = simulate_motion(testbed, update)
-        scored = terminal.eager_first(score_frames(testbed))
-    recorder = Recorder(output_folder(out, loaded.name), testbed, plan)
-    for frame in terminal.progress(scored, loaded.exposure.frames, loaded.title):
-        recorder.add(frame)
-    views = terminal.write_3d_views(testbed, recorder.folder) if scene_3d else []
-    command = shlex.join(["skysim", *sys.argv[1:]])
-    statistics = recorder.finish(command, views)
-    heads = run_heads(testbed, recorder.folder, command)
+    with open_flight(loaded, programs=used_programs(program, scene_names(loaded))) as flight:
+        plan = check(flight.lab)
+        for finding in plan.findings:
+            terminal.print_error(with_location(finding))
+        recorder = FlightRecorder(output_folder(out, loaded.name), flight)
+        with on_two_processes(*LOADED[-1]), terminal.progress_callback(loaded.title) as update:
+            rows = recorder.record(flight.shots(progress=update))
+        command = shlex.join(["skysim", *sys.argv[1:]])
+        statistics, *others = recorder.finish(command, plan, terminal.write_3d_views if scene_3d else None)
+    heads = dict(zip([head.name for head in loaded.heads], others, strict=True))
     if json:
-        rows = {"rows": [asdict(row) for row in recorder.rows]}
-        terminal.print_json({"scene": loaded.name, **statistics, **rows, **({"heads": heads} if heads else {})})
+        result = {"scene": loaded.name, **statistics, "rows": [asdict(row) for row in rows]}
+        terminal.print_json(result | {"heads": heads} if heads else result)
     else:
-        terminal.print_rows(recorder.rows, scoring.angle_names(loaded), statistics["exposures_ms"])
+        terminal.print_rows(rows, scoring.angle_names(loaded), statistics["exposures_ms"])
         terminal.print_summary(statistics)
         for name, head in heads.items():
             terminal.print_head(name, head)
@@ -97,19 +89,6 @@ def run(
                 terminal.print_fact(fact)
     if open_:
         typer.launch(statistics["report"])
-
-
-def run_heads(testbed: Testbed, folder: Path, command: str) -> dict[str, dict[str, Any]]:
-    """Render, solve and write the frames of the further star cameras, each to its folder; their statistics by name."""
-    from skysim.results.run import Recorder, score_frames
-
-    statistics = {}
-    for config, head in zip(testbed.scene.heads, testbed.heads, strict=True):
-        recorder = Recorder(folder / config.name, head)
-        for frame in terminal.progress(score_frames(head), head.scene.exposure.frames, config.name):
-            recorder.add(frame)
-        statistics[config.name] = recorder.finish(command)
-    return statistics
 
 
 def render(
@@ -124,26 +103,20 @@ def render(
     json: Json = False,
 ) -> None:
     """Simulate a scene and write its frames with their truth, without solving them."""
-    from skysim.results.run import Recorder
-    from skysim.simulation import run as simulation
+    from skysim.results.run import FlightRecorder
     from skysim.simulation.checks.dome import assumptions
-    from skysim.simulation.testbed import build_testbed
+    from skysim.simulation.flight import open_flight
 
     loaded = load(scene, frames, seed, set_)
-    testbed = build_testbed(loaded)
-    if warning := assumptions.camera_outside_warning(loaded, testbed.mount):
-        terminal.print_error(warning)
-    with terminal.progress_callback("simulating the motion") as update:
-        testbed = simulation.simulate_motion(testbed, update)
-    folder, paths = output_folder(out, loaded.name), list[str]()
-    folders = [folder, *(folder / head.name for head in loaded.heads)]
-    for camera, own_folder in zip(testbed.cameras, folders, strict=True):
-        rendered = terminal.eager_first(simulation.render_frames(camera))
-        recorder = Recorder(own_folder, camera)
-        paths += [
-            str(recorder.write(frame, truth, preview))
-            for frame, truth, _ in terminal.progress(rendered, camera.scene.exposure.frames, loaded.title)
-        ]
+    folder = output_folder(out, loaded.name)
+    paths = list[str]()
+    with open_flight(loaded) as flight:
+        if warning := assumptions.camera_outside_warning(loaded, flight.lab.camera.mount):
+            terminal.print_error(warning)
+        recorder = FlightRecorder(folder, flight)
+        with terminal.progress_callback(loaded.title) as update:
+            for shot in flight.shots(solves=False, progress=update):
+                paths.append(str(recorder.of(shot.camera).write(shot.frame, shot.truth, preview)))
     if json:
         terminal.print_json(paths)
     else:
@@ -162,22 +135,27 @@ def compare(
 ) -> None:
     """Let trackers solve the same frames and compare their scores. With a filter, the first one closes the loop."""
     from skysim.experiments import tracker_comparison
-    from skysim.results.run import Recorder
-    from skysim.simulation import run as simulation
-    from skysim.simulation.testbed import build_testbed
+    from skysim.results.recorder import Recorder
+    from skysim.simulation.flight import Flight
+    from skysim.simulation.lab import build_lab
+    from skysim.simulation.user_parts import UserParts
 
     loaded = load(scene, frames, seed, set_, tracker)
-    testbed = build_testbed(loaded, used_programs(program, [*tracker, *scene_names(loaded)]))
-    entrants = tracker_comparison.build_trackers(testbed, tracker)
-    with terminal.progress_callback("simulating the motion", quiet=json) as update:
-        testbed = simulation.simulate_motion(testbed, update)
-    solved = terminal.eager_first(tracker_comparison.compare_frames(testbed, entrants))
-    recorder = Recorder(output_folder(out, loaded.name), testbed)
+    programs = used_programs(program, [*tracker, *scene_names(loaded)])
+    lab = build_lab(loaded, UserParts(programs))
+    entrants = tracker_comparison.build_trackers(lab, tracker, programs)
     rows: dict[str, list[FrameRow]] = {name: [] for name in entrants}
-    for frame, truth, row_by_tracker in terminal.progress(solved, loaded.exposure.frames, loaded.title, quiet=json):
-        recorder.write(frame, truth)
-        for name, row in row_by_tracker.items():
-            rows[name].append(row)
+    recorder = None
+    with (
+        Flight(lab, UserParts(programs, tracker=entrants[tracker[0]])) as flight,
+        terminal.progress_callback(loaded.title, quiet=json) as update,
+    ):
+        for frame, truth, row_by_tracker in tracker_comparison.compare_frames(flight, entrants, update):
+            recorder = recorder or Recorder(output_folder(out, loaded.name), lab.camera)
+            recorder.write(frame, truth)
+            for name, row in row_by_tracker.items():
+                rows[name].append(row)
+    assert recorder is not None
     lines = tracker_comparison.write_scores(recorder.folder, rows, loaded)
     if json:
         terminal.print_json({"scene": loaded.name, "scoreboard": tracker_comparison.as_dicts(lines)})

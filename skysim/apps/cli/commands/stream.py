@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -47,7 +46,7 @@ def stream(
     from skysim.apps.stream.pacing import Pace
     from skysim.apps.stream.sinks import READER_GONE, Sink, folder_writer, pipe_writer
     from skysim.core.io import files
-    from skysim.simulation.testbed import build_testbed
+    from skysim.simulation.flight import open_flight
 
     if folder is None and http is None and pipe is None:
         raise InputError("", "no output", "--folder DIR, --http PORT or --pipe PATH")
@@ -55,19 +54,20 @@ def stream(
         raise InputError("--host", "has no effect without --http", f"--http PORT --host {host}")
     if endless and frames is not None:
         raise InputError("--endless", "has no effect with --frames", "one of the two")
-    testbed = replace(build_testbed(load(scene, frames, seed, set_)), endless=endless)
+    flight = open_flight(load(scene, frames, seed, set_), endless=endless, keeps_history=False)
     sinks = []
     if folder is not None:
         sinks.append(Sink("folder", folder_writer(folder)))
     if pipe is not None:
         sinks.append(Sink("pipe", pipe_writer(pipe)))
-    stats, pace = sender.SenderStats(), Pace(speed, testbed.scene.exposure.rate_hz)
+    stats, pace = sender.SenderStats(), Pace(speed, flight.lab.scene.exposure.rate_hz)
     with serving(http, host, lambda: stats.statistics(sinks)) as hub:
         try:
-            sender.send(testbed, pace, sinks, stats, hub.publish if hub else None)
+            sender.send(flight, pace, sinks, stats, hub.publish if hub else None)
         except KeyboardInterrupt:
             print(file=sys.stderr)
         finally:
+            flight.close()
             for sink in sinks:
                 sink.close()
     statistics = stats.statistics(sinks) | (hub.counters() if hub else {})

@@ -89,10 +89,11 @@ def check(scene: SceneArg, program: Programs = None, set_: Overrides = None, jso
     Nothing is simulated or rendered; everything is computed at sampled attitudes.
     """
     from skysim.simulation.checks import check as check_plan
-    from skysim.simulation.testbed import build_testbed
+    from skysim.simulation.lab import build_lab
+    from skysim.simulation.user_parts import UserParts
 
     loaded = load(scene, None, None, set_)
-    result = check_plan(build_testbed(loaded, used_programs(program, scene_names(loaded))))
+    result = check_plan(build_lab(loaded, UserParts(used_programs(program, scene_names(loaded)))))
     findings = [with_location(finding) for finding in result.findings]
     if json:
         print_json(result._replace(findings=findings).as_dict())
@@ -169,16 +170,17 @@ def check_scene(path: Path, programs: Mapping[str, str]) -> tuple[str, tuple[str
     """Set up a scene without simulating its motion: vehicle, lights, tracker. Returns a description and warnings."""
     from skysim.scene import loader
     from skysim.simulation.checks import check as check_plan
-    from skysim.simulation.testbed import build_testbed, build_tracker
+    from skysim.simulation.lab import build_lab, build_tracker
+    from skysim.simulation.user_parts import UserParts
 
     scene = loader.load(path)
     try:
-        testbed = build_testbed(scene, programs)
-        build_tracker(testbed)
-        findings = check_plan(testbed).findings
+        lab = build_lab(scene, UserParts(programs))
+        build_tracker(lab.camera, programs)
+        findings = check_plan(lab).findings
     except InputError as error:
         raise loader.located(error, str(path), {}) from None
-    count, frames = len(testbed.sources.id), scene.exposure.frames
+    count, frames = len(lab.camera.sources.id), scene.exposure.frames
     described = f"a scene of {count} lights and {frames} frames"
     return described, tuple(with_location(finding, (str(path), {})) for finding in findings)
 

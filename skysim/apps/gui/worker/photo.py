@@ -33,7 +33,6 @@ from skysim.experiments.study.execution.setups import prepared_setup
 from skysim.experiments.study.execution.trials import run_trial
 from skysim.experiments.study.store import STORE
 from skysim.results import scoring, stretch
-from skysim.simulation.run import FrameResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,22 +96,22 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     row = run_trial(plan.spec, segment, trial, segment.replicates[0])
     setup = prepared_setup(plan.spec, segment.settings)
     frame, truth, report = next(replay.replayed_frames(setup, row.seed))
-    result = tracker_result(setup.testbed, setup.estimator, FrameResult(frame, truth, report, {}))
+    result = tracker_result(setup.lab, setup.estimator, frame, truth, report)
     if row.error:
         result = TrackerResult(row.error.strip().splitlines()[-1], result.detections, result.ms)
-    scene, (height, width) = setup.testbed.scene, frame.image_dn.shape
+    scene, (height, width) = setup.lab.scene, frame.image_dn.shape
     photo = Photo(
         (width, height),
         result,
         {},
         stretch.frame_statistics(frame.image_dn, frame.saturation_dn),
         names=scoring.angle_names(scene),
-        true_deg=scoring.angles_deg(truth.cam_from_lab, scene, setup.testbed.mount),
-        lights=true_lights(truth, magnitude_by_id(setup.testbed)),
-        prefix=id_prefix(setup.testbed),
+        true_deg=scoring.angles_deg(truth.cam_from_lab, scene, setup.lab.camera.mount),
+        lights=true_lights(truth, magnitude_by_id(setup.lab)),
+        prefix=id_prefix(setup.lab),
         saturation_dn=frame.saturation_dn,
-        lens=(lens := lenses.scene_lens(setup.testbed)),
-        pose=lenses.scene_pose(setup.testbed, lens, truth),
+        lens=(lens := lenses.scene_lens(setup.lab)),
+        pose=lenses.scene_pose(setup.lab, lens, truth),
     )
     return photo, frame.image_dn
 

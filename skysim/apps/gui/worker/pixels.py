@@ -17,6 +17,7 @@ from numba import float32, int32, uint32, uint64
 from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import Display, Pixels
+from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.jit import jit
 from skysim.results import stretch
 
@@ -25,7 +26,6 @@ HEADER_BYTES = 16
 SATURATED, SHADES = 255, 255  # the shade of saturated pixels, and the number of the others
 WORTHWHILE = 0.95  # of the columns, above which all pixels are sent
 BINS = 80  # of the histogram
-QUARTILE_SIGMA = 1.4826  # of a normal distribution, over the distance from quartile to median
 AXIS_MARGIN = 0.3  # on either side of it, in units of its axis
 ZSCALE_SAMPLES = 1000  # pixels, as in IRAF
 LOUPE_PX = 11  # most rows and columns in the loupe
@@ -190,7 +190,7 @@ def histogram(integers: NDArray) -> dict[str, Any]:
     sample = integers[:: 2 * stretch.SAMPLE_STRIDE, :: stretch.SAMPLE_STRIDE].astype(float)
     low, high = float(integers.min()), float(integers.max())
     below, sky = np.percentile(sample, (25, 50))
-    scatter = max(QUARTILE_SIGMA * float(sky - below), 1.0)
+    scatter = max(SIGMA_PER_MAD * float(sky - below), 1.0)
     first, last = np.arcsinh((np.array([low, high]) - sky) / scatter)
     ends = first - AXIS_MARGIN, last + AXIS_MARGIN
     counts, _ = np.histogram(np.arcsinh((sample - sky) / scatter), BINS, ends)

@@ -11,16 +11,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimator.trackers.pipeline import Report
-from skysim.apps.gui.messages import NAN, FlightStep, FrameRow, FrameView, MotionLog, Phase
+from skysim.apps.gui.messages import NAN, FlightStep, FrameRow, FrameView, MotionLog
 from skysim.apps.gui.worker import pixels
 from skysim.apps.gui.worker.workbench import Workbench, tracker_result
 from skysim.core import quaternion
-from skysim.core.quantities.units import ARCSEC_RAD
-from skysim.core.types import Frame, Telemetry
+from skysim.core.constants import ARCSEC_RAD
+from skysim.core.types import Frame, Mount, Telemetry
 from skysim.results import telemetry_report
-from skysim.simulation import exposure, run
-from skysim.simulation.run import FrameResult
-from skysim.simulation.testbed import Testbed, build_tracker, exposure_window
+from skysim.simulation.flight import Flight, Shot
+from skysim.simulation.timing import exposure_window
 
 MAX_POINTS = 500  # of a curve on the page, roughly
 FLOOR = 1e-3  # arcsec; lower limit of values on a logarithmic axis
@@ -39,51 +38,60 @@ class KeptFrame:
     place: tuple[int, int] | None
 
 
-class Flight:
+class Playback:
     """A flight of a workbench's scene. Frames are those of `skysim run`.
 
     Its computation is a series of short steps, so that the worker does other tasks between them.
 
-    file : pixels of the first frames, so that playing them costs no rendering;  shown : number of the shown frame
-    moved : the testbed after the simulation of its motion, None before;  told : number of frames reported by `advance`
+    file  : pixels of the first frames, so that playing them costs no rendering;  shown : number of the shown frame
+    reported : number of frames reported by `advance`
     """
 
     def __init__(self, bench: Workbench) -> None:
-        self.bench, self.frames, self.file = bench, list[KeptFrame](), tempfile.TemporaryFile()  # noqa: SIM115
-        self.moved: Testbed | None = None
+        self.bench = bench
+        self.frames = list[KeptFrame]()
+        self.file = tempfile.TemporaryFile()  # noqa: SIM115
+        self.flight = Flight(bench.lab)
         self.shown: int | None = None
-        self.told, self.told_log = 0, False
-        self.progress = (0.0, 1.0)
-        self.steps = self.compute()
-
-    def compute(self) -> Iterator[tuple[float, float]]:
-        """Simulate the motion, then render and solve every frame; yields (done, total) of either."""
-        self.moved = yield from run.motion_steps(self.bench.testbed)
-        count = self.moved.scene.exposure.frames
-        yield 0, count
-        tracker = build_tracker(self.moved)
-        for result in run.run(self.moved, tracker):
-            solved = tracker_result(self.moved, tracker, result)
-            view = self.bench.frame_view(result.frame, result.truth, solved, sum(result.seconds.values()))
-            t_s = exposure_window(self.moved.scene, result.frame.index, result.frame.exposure_s).open_s
-            error, innovation = filter_errors(self.moved, result, t_s)
-            view = replace(view, t_s=t_s, filter_arcsec=error, innovation_arcsec=innovation)
-            self.frames.append(KeptFrame(view, result.report, self.keep(result.frame)))
-            yield len(self.frames), count
+        self.reported = 0
+        flight = self.flight
+        self.events = flight.events(flight.filter_schedules or flight.schedules[:1], solves=True)
 
     def advance(self, budget_s: float) -> FlightStep:
         """Compute for about a time, and report what is new."""
-        end_s, is_done = time.perf_counter() + budget_s, False
+        end_s = time.perf_counter() + budget_s
+        is_done = False
         while not is_done and time.perf_counter() < end_s:
-            progress = next(self.steps, None)
-            is_done, self.progress = progress is None, progress or self.progress
-        views = [frame.view for frame in self.frames[self.told :]]
-        rows, residuals = tuple(map(frame_row, views)), tuple(row for view in views for row in light_residuals(view))
-        self.told, log = len(self.frames), None
-        if self.moved and not self.told_log:
-            self.told_log, log = True, curves(self.moved.log)
-        phase: Phase = "done" if is_done else "frames" if self.moved else "motion"
-        return FlightStep(phase, *self.progress, rows, log, residuals)
+            try:
+                shot = next(self.events)
+            except StopIteration:
+                is_done = True
+            else:
+                if shot is not None and shot.camera is self.bench.lab.camera:
+                    self.add(shot)
+        log = self.flight.telemetry()
+        new = self.frames[self.reported :]
+        for frame in new:
+            frame.view = with_filter_errors(frame, log, self.bench.lab.camera.mount)
+        self.reported = len(self.frames)
+        views = [frame.view for frame in new]
+        return FlightStep(
+            is_done,
+            self.flight.now_s,
+            self.flight.duration_s,
+            tuple(map(frame_row, views)),
+            curves(log) if is_done or views else None,
+            tuple(row for view in views for row in light_residuals(view)),
+        )
+
+    def add(self, shot: Shot) -> None:
+        """Keep a shot, and its pixels as far as the file has room."""
+        bench = self.bench
+        assert shot.report is not None
+        solved = tracker_result(bench.lab, bench.estimator, shot.frame, shot.truth, shot.report)
+        view = bench.frame_view(shot.frame, shot.truth, solved, sum(shot.seconds.values()))
+        t_s = exposure_window(bench.scene, shot.frame.index, shot.frame.exposure_s).open_s
+        self.frames.append(KeptFrame(replace(view, t_s=t_s), shot.report, self.keep(shot.frame)))
 
     def keep(self, frame: Frame) -> tuple[int, int] | None:
         """Write a frame's pixels to the end of the file, and return their place there; None if the file is full."""
@@ -109,9 +117,8 @@ class Flight:
         """Render the shown frame with its truth, unless another frame of the scene has been rendered since."""
         if self.shown is None or self.bench.frame is not None:
             return
-        assert self.moved is not None
         kept, bench = self.frames[self.shown], self.bench
-        bench.frame, bench.truth = exposure.render_frame(self.moved, self.shown, exposure_s=kept.view.exposure_s)
+        bench.frame, bench.truth = self.flight.render(self.shown)
         bench.report = kept.report
 
 
@@ -148,15 +155,16 @@ def curves(log: Telemetry) -> MotionLog:
     return MotionLog(tuple(log.t_s[::every].tolist()), thinned)
 
 
-def filter_errors(moved: Testbed, result: FrameResult, t_s: float) -> tuple[float, float]:
-    """Error of the filter, and angle between the star tracker's attitude and the filter's, arcsec; NaN if none."""
-    log = moved.log
+def with_filter_errors(kept: KeptFrame, log: Telemetry, mount: Mount) -> FrameView:
+    """A frame's view with the error of the filter, and the angle between the tracker's attitude and the filter's."""
+    view = kept.view
     if log.lab_from_filter is None:
-        return math.nan, math.nan
-    n = min(int(np.searchsorted(log.t_s, t_s)), len(log.t_s) - 1)
+        return view
+    n = min(int(np.searchsorted(log.t_s, view.t_s)), len(log.t_s) - 1)
     error_arcsec = float((log.lab_from_filter[n].inv() * log.lab_from_body[n]).magnitude()) / ARCSEC_RAD
-    cam_from_lab = result.report.attitude.cam_from_ref
-    if cam_from_lab is None:
-        return error_arcsec, math.nan
-    lab_from_body = cam_from_lab.inv() * moved.mount.cam_from_body
-    return error_arcsec, float((lab_from_body.inv() * log.lab_from_filter[n]).magnitude()) / ARCSEC_RAD
+    cam_from_lab = kept.report.attitude.cam_from_ref
+    innovation_arcsec = math.nan
+    if cam_from_lab is not None:
+        lab_from_body = cam_from_lab.inv() * mount.cam_from_body
+        innovation_arcsec = float((lab_from_body.inv() * log.lab_from_filter[n]).magnitude()) / ARCSEC_RAD
+    return replace(view, filter_arcsec=error_arcsec, innovation_arcsec=innovation_arcsec)

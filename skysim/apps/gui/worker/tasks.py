@@ -49,7 +49,7 @@ class Worker:
     display: Display | None = None
     shown: dict[int, tuple[pixels.Levels, float]] = field(default_factory=dict)
     number: int = 0
-    flight: playback.Flight | None = None
+    flight: playback.Playback | None = None
     pushed: Push | None = None
     surveyed: survey.Survey | None = None
     other: photo.Photo | None = None
@@ -116,7 +116,7 @@ class Worker:
         """Set up a scene and render a first frame; angles_deg : of another attitude than the kept one or the start."""
         bench = Workbench.open(scene, overrides, self.current)
         if angles_deg is not None:
-            bench.lab_from_body = pointing.from_angles(bench.scene, bench.testbed.mount, angles_deg)
+            bench.lab_from_body = pointing.from_angles(bench.scene, bench.lab.camera.mount, angles_deg)
         self.current = bench
         self.scene, self.overrides, self.flight, self.pushed = scene, dict(overrides), None, None
         surveyed = self.surveyed is not None and self.surveyed.is_of(bench.scene)
@@ -128,12 +128,14 @@ class Worker:
 
     def point(self, angles_deg: Triple, solve: bool) -> FrameView:
         bench = self.workbench
-        bench.lab_from_body = pointing.from_angles(bench.scene, bench.testbed.mount, angles_deg)
+        bench.lab_from_body = pointing.from_angles(bench.scene, bench.lab.camera.mount, angles_deg)
         return self.render(solve)
 
     def move(self, right: float, up: float, roll_deg: float, solve: bool) -> FrameView:
         bench = self.workbench
-        bench.lab_from_body = pointing.moved(bench.scene, bench.testbed.mount, bench.lab_from_body, right, up, roll_deg)
+        bench.lab_from_body = pointing.moved(
+            bench.scene, bench.lab.camera.mount, bench.lab_from_body, right, up, roll_deg
+        )
         return self.render(solve)
 
     def push(self, grip: Grip | None, elapsed_s: float, solve: bool) -> PushedView:
@@ -143,19 +145,19 @@ class Worker:
         """
         bench = self.workbench
         if self.pushed is None or self.pushed.lab_from_body is not bench.lab_from_body:
-            self.pushed = Push(bench.testbed, bench.lab_from_body)
+            self.pushed = Push(bench.lab, bench.lab_from_body)
         self.pushed.advance(grip, elapsed_s)
         bench.lab_from_body = self.pushed.lab_from_body
-        view = bench.render(self.pushed.seen(bench.next_run()), solve)
+        view = bench.render(bench.next_run().camera, self.pushed.seen(), solve)
         view = self.show_frame(view, self.levels)
         rate_rad_s = np.linalg.norm(self.pushed.simulation.rate_body_rad_s)
         return PushedView(view, float(np.linalg.norm(self.pushed.torque_nm)), math.degrees(rate_rad_s))
 
     def check(self) -> PlanCheck:
-        return planning.check(self.workbench.testbed)
+        return planning.check(self.workbench.lab)
 
     def ambiguity(self) -> AmbiguityMap:
-        return planning.ambiguity(self.workbench.testbed)
+        return planning.ambiguity(self.workbench.lab)
 
     def plan_survey(self, frames: int) -> SurveyPlan:
         """Begin a survey of the scene's dome."""
@@ -174,7 +176,7 @@ class Worker:
 
     def begin_flight(self) -> FlightStep:
         """Begin to compute the scene's flight; `advance_flight` does the work."""
-        self.flight = playback.Flight(self.workbench)
+        self.flight = playback.Playback(self.workbench)
         return self.flight.advance(0.0)
 
     def advance_flight(self, budget_s: float) -> FlightStep:

@@ -1,4 +1,4 @@
-"""State of a GUI worker: a scene's testbed and tracker, and the current attitude."""
+"""State of a GUI worker: a scene's lab and tracker, and the current attitude."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui.messages import Detection, FrameView, LabGeometry, Lens, Lights, SceneInfo, TrackerResult
 from skysim.apps.gui.worker.scene import geometry, lens
 from skysim.core import quaternion
-from skysim.core.quantities.units import ARCSEC_RAD
-from skysim.core.types import Floats, Frame, Truth
+from skysim.core.constants import ARCSEC_RAD
+from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.results import scoring, stretch
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation import exposure
-from skysim.simulation.run import FrameResult, warm_up_tracker
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.compilation import warm_up
+from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
+from skysim.simulation.timing import frame_end_s
 from skysim.tracking import factory
 from skysim.tracking import settings as tracker_settings
 
@@ -43,7 +44,7 @@ class Workbench:
     """
 
     scene: Scene
-    testbed: Testbed
+    lab: Lab
     estimator: factory.Estimator
     lab_from_body: Rotation
     lens: Lens
@@ -56,7 +57,7 @@ class Workbench:
 
     @classmethod
     def open(cls, name: str, overrides: Mapping[str, str], before: Workbench | None = None) -> Workbench:
-        """Set up a scene, or keep `before` if it is the same. If only the tracker differs from `before`, its testbed is
+        """Set up a scene, or keep `before` if it is the same. If only the tracker differs from `before`, its lab is
         kept; if tracker or camera, its attitude.
 
         Raises InputError.
@@ -65,13 +66,13 @@ class Workbench:
         if before and before.scene == scene:
             return before
         if before and before.scene.model_copy(update={"tracker": scene.tracker}) == scene:
-            testbed = replace(before.testbed, scene=scene)
-            return replace(before, scene=scene, testbed=testbed, estimator=warm_tracker(testbed))
-        testbed = build_testbed(scene)
+            lab = before.lab.with_scene(scene)
+            return replace(before, scene=scene, lab=lab, estimator=warm_tracker(lab))
+        lab = build_lab(scene)
         same = before and before.scene.model_copy(update={"tracker": scene.tracker, "camera": scene.camera}) == scene
-        lab_from_body = before.lab_from_body if before and same else testbed.trajectory.lab_from_body[0]
-        views = lens.scene_lens(testbed), geometry.lab_geometry(testbed)
-        return cls(scene, testbed, warm_tracker(testbed), lab_from_body, *views, magnitude=magnitude_by_id(testbed))
+        lab_from_body = before.lab_from_body if before and same else lab.start
+        views = lens.scene_lens(lab), geometry.lab_geometry(lab)
+        return cls(scene, lab, warm_tracker(lab), lab_from_body, *views, magnitude=magnitude_by_id(lab))
 
     @property
     def stages(self) -> dict[str, str]:
@@ -88,11 +89,11 @@ class Workbench:
             scene.title,
             isinstance(scene.light, StarsConfig),
             scoring.angle_names(scene),
-            id_prefix(self.testbed),
+            id_prefix(self.lab),
             2 * math.degrees(math.atan(camera.width_px / 2 / camera.focal_px)),
             1 / camera.focal_px / ARCSEC_RAD,
             self.stages,
-            self.testbed.duration_s,
+            self.lab.duration_s,
             camera.detector.noise,
             self.geometry,
             self.lens,
@@ -100,24 +101,25 @@ class Workbench:
 
     def render_at_rest(self, solve: bool = False) -> FrameView:
         """Render a frame at the current attitude at rest, with independent noise; solve it if `solve`."""
-        return self.render(self.next_run().at_rest(self.lab_from_body), solve)
+        camera = self.next_run().camera
+        return self.render(camera, Trajectory.at_rest(self.lab_from_body, frame_end_s(self.scene, 0)), solve)
 
-    def next_run(self) -> Testbed:
-        """The test bed in a run with its own noise."""
+    def next_run(self) -> Lab:
+        """The lab in a run with its own noise."""
         self.rendered_count += 1
-        return self.testbed.in_run(self.scene.seed + self.rendered_count)
+        return self.lab.in_run(self.scene.seed + self.rendered_count)
 
     @property
     def result(self) -> TrackerResult | None:
         """The tracker's solution of the newest frame; None if it was not solved."""
         if self.frame is None or self.truth is None or self.report is None:
             return None
-        return tracker_result(self.testbed, self.estimator, FrameResult(self.frame, self.truth, self.report, {}))
+        return tracker_result(self.lab, self.estimator, self.frame, self.truth, self.report)
 
-    def render(self, testbed: Testbed, solve: bool) -> FrameView:
-        """Render frame 0 of a testbed, solve it if `solve`, and return the view for the page."""
+    def render(self, camera: StarCamera, trajectory: Trajectory, solve: bool) -> FrameView:
+        """Render frame 0 of a camera in motion, solve it if `solve`, and return the view for the page."""
         clock = Clock()
-        self.frame, self.truth = exposure.render_frame(testbed, 0)
+        self.frame, self.truth = exposure.render_frame(camera, trajectory, 0)
         self.report = factory.solve_frame(self.estimator, self.frame) if solve else None
         clock.lap("all")
         return self.frame_view(self.frame, self.truth, self.result, clock.seconds["all"])
@@ -126,10 +128,10 @@ class Workbench:
         """The view of a frame of this scene for the page, without its pixels."""
         height, width = frame.image_dn.shape
         return FrameView(
-            lens.scene_pose(self.testbed, self.lens, truth),
+            lens.scene_pose(self.lab, self.lens, truth),
             frame.saturation_dn,
             (width, height),
-            scoring.angles_deg(truth.cam_from_lab, self.scene, self.testbed.mount),
+            scoring.angles_deg(truth.cam_from_lab, self.scene, self.lab.camera.mount),
             tuple(quaternion.from_rotation(truth.lab_from_body).tolist()),
             frame.exposure_s,
             stretch.frame_statistics(frame.image_dn, frame.saturation_dn),
@@ -139,16 +141,16 @@ class Workbench:
         )
 
 
-def warm_tracker(testbed: Testbed) -> factory.Estimator:
+def warm_tracker(lab: Lab) -> factory.Estimator:
     """The scene's tracker, compiled, so that its first frame's time is that of solving it."""
-    tracker = build_tracker(testbed)
-    warm_up_tracker(testbed, tracker)
+    tracker = build_tracker(lab.camera)
+    warm_up(lab.camera, lab.start, tracker)
     return tracker
 
 
-def id_prefix(testbed: Testbed) -> str:
+def id_prefix(lab: Lab) -> str:
     """Catalog of the lights' numbers: LED if no light has a magnitude, else HIP."""
-    return "LED" if np.isnan(testbed.sources.magnitude).all() else "HIP"
+    return "LED" if np.isnan(lab.camera.sources.magnitude).all() else "HIP"
 
 
 def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> Lights:
@@ -161,14 +163,14 @@ def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> Lights:
     return Lights(ids, sources.flux_xy_px[rows], sources.electrons[rows], np.array(magnitudes, float))
 
 
-def magnitude_by_id(testbed: Testbed) -> dict[int, float]:
+def magnitude_by_id(lab: Lab) -> dict[int, float]:
     """V magnitude by a light's number; NaN for an LED."""
-    return dict(zip(testbed.sources.id.tolist(), testbed.sources.magnitude.tolist(), strict=True))
+    return dict(zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True))
 
 
-def tracker_result(testbed: Testbed, estimator: factory.Estimator, result: FrameResult) -> TrackerResult:
+def tracker_result(lab: Lab, estimator: factory.Estimator, frame: Frame, truth: Truth, report: Report) -> TrackerResult:
     """The tracker's report with its errors relative to the truth."""
-    row, report = scoring.row(result, testbed.scene, testbed.mount), result.report
+    row = scoring.row(lab.camera, frame, truth, report)
     return TrackerResult(
         row.status,
         detection_views(report, matches_by_row(estimator, report.attitude, report.centroids.xy_px)),

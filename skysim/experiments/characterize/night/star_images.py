@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
+from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.types import Floats
 from skysim.experiments.characterize.sensor.estimate import Estimate
 from skysim.experiments.characterize.sensor.photon_transfer import ROUNDING_DN2
@@ -156,7 +157,7 @@ def image_size(stars: StarImages, center_px: tuple[float, float], corner_px: flo
         found = normal @ ((design.T * weight) @ stars.variance_px2)
         expected = np.maximum(design @ found, LEAST_VARIANCE_PX2)
         pull = (stars.variance_px2 - expected) / (relative * expected)
-        again = sound & (np.abs(pull) < OUTLIER_SIGMAS * max(1.0, float(np.median(np.abs(pull[kept]))) / 0.6745))
+        again = sound & (np.abs(pull) < OUTLIER_SIGMAS * max(1.0, float(np.median(np.abs(pull[kept]))) / MAD_PER_SIGMA))
         is_settled = np.array_equal(again, kept) and np.allclose(error, relative * expected, rtol=SETTLED)
         kept = again
         if is_settled:

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special, stats
 
+from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.types import Floats
 from skysim.experiments.characterize.sensor.estimate import Estimate
 
@@ -89,7 +90,7 @@ def fit(rates: Floats, noise: RateNoise, greatest: float) -> DarkCurrent:
 def median_and_spread(values: Floats) -> tuple[float, float]:
     """Median and robust standard deviation."""
     median = float(np.median(values))
-    return median, float(np.median(np.abs(values - median))) / 0.6745
+    return median, float(np.median(np.abs(values - median))) / MAD_PER_SIGMA
 
 
 def bin_edges(rates: Floats, greatest: float) -> Floats:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.types import Floats
 from skysim.experiments.characterize.sensor import dark_current, photon_transfer, uniformity
 from skysim.experiments.characterize.sensor.dark_current import DarkCurrent, RateNoise
@@ -103,7 +104,7 @@ def usable_pixels(darks: Sequence[Level]) -> Mask:
     for one in darks:
         mean = one.mean_dn
         median = np.median(mean)
-        spread = max(np.median(np.abs(mean - median)) / 0.6745, 0.5)
+        spread = max(np.median(np.abs(mean - median)) / MAD_PER_SIGMA, 0.5)
         usable &= (mean < median + HOT_SIGMAS * spread) & steady_pixels(one, float(np.median(one.variance_dn2)))
     return usable
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import Lever, on_surface
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.core.camera import Camera
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Mount, Truth
 from skysim.experiments.dome_survey.adjust import lens_sigma
 from skysim.experiments.dome_survey.prior import CalibrationPrior
@@ -21,7 +21,7 @@ from skysim.experiments.dome_survey.results.findings import Coverage, DomeFaults
 from skysim.experiments.dome_survey.survey_run import SurveyRun
 from skysim.results import metrics
 from skysim.scene.sections.camera import CameraConfig
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 from skysim.tracking import factory
 
 LENS = ("focal length px", "center x px", "center y px", "k1", "k2", "p1", "p2")
@@ -68,9 +68,9 @@ class LedErrors(NamedTuple):
     renamed: NDArray[np.bool_]
 
 
-def led_errors(survey: DomeSurvey, prior: CalibrationPrior, testbed: Testbed) -> LedErrors:
+def led_errors(survey: DomeSurvey, prior: CalibrationPrior, lab: Lab) -> LedErrors:
     """LED position errors before and after the survey."""
-    true_m = testbed.sources.place[:, :3]
+    true_m = lab.camera.sources.place[:, :3]
     row = np.flatnonzero(survey.surveyed)
     position_m = survey.leds.position_m[row]
     _, nearest = cKDTree(true_m).query(position_m)
@@ -102,10 +102,10 @@ def survey_statistics(run: SurveyRun, before: CalibrationPrior) -> dict[str, Any
     }
 
 
-def truth_statistics(run: SurveyRun, before: CalibrationPrior, testbed: Testbed) -> dict[str, Any]:
+def truth_statistics(run: SurveyRun, before: CalibrationPrior, lab: Lab) -> dict[str, Any]:
     """The errors of a simulated survey: of the LEDs before and after it, and the true parameters."""
-    errors = led_errors(run.survey, before, testbed)
-    truth = parameters(testbed.scene.camera, testbed.mount)
+    errors = led_errors(run.survey, before, lab)
+    truth = parameters(lab.scene.camera, lab.camera.mount)
     return {
         "renamed": int(errors.renamed.sum()),
         "led_mm_before": float(1e3 * np.sqrt(np.mean(errors.before_m**2))),

@@ -19,7 +19,7 @@ from estimator.catalog.catalog import unit
 from estimator.catalog.pair_buckets import PairCatalog, build_pair_catalog, candidates
 from estimator.core.arrays import Ints
 from estimator.identification.published.saa_search import Gates, SearchInput, build_primary, gate_rad, match_assumptions
-from skysim.core.quantities.units import ARCSEC_RAD, INCH_M
+from skysim.core.constants import ARCSEC_RAD, INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, imu
@@ -45,7 +45,7 @@ from skysim.experiments.papers.intervals import percent, prediction_interval, sa
 from skysim.results.metrics import proportion
 from skysim.results.plots import INK
 from skysim.scene import loader
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.lab import Lab, build_lab
 
 HOLD_MIN = 0.75  # time at a position: fitted, see `draw_holds`
 HOLDS_MIN = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
@@ -164,21 +164,21 @@ def table_15(clean: Floats, causes: AllCauses) -> dict[str, RowResult]:
 # The camera.
 
 
-def algorithm_errors(testbed: Testbed, images: int, lights: int, rng: np.random.Generator) -> AlgorithmErrors:
+def algorithm_errors(lab: Lab, images: int, lights: int, rng: np.random.Generator) -> AlgorithmErrors:
     """The thesis's processing: eqs 43-44, SAA with Table 9's epsilons, QUEST with the `lights` brightest LEDs.
 
     images : number of images per position
     """
-    sightings = [photograph(testbed, n, lab_from_body(angles), images, rng) for n, angles in enumerate(IMU_DEG)]
+    sightings = [photograph(lab, n, lab_from_body(angles), images, rng) for n, angles in enumerate(IMU_DEG)]
     sets = list(zip(*sightings, strict=False))
     error_deg, correct = np.empty((len(sets), len(IMU_DEG), 3)), 0
     for n_set, sightings_of_set in enumerate(sets):
         # The home image is the map: all attitudes of a set are relative to it, as in the thesis (3.6.4).
         home = sightings_of_set[HOME]
-        catalog = build_pair_catalog(unit(light_positions_m(testbed, home.xy_px)), home.brightness)
+        catalog = build_pair_catalog(unit(light_positions_m(lab, home.xy_px)), home.brightness)
         for n, sighting in enumerate(sightings_of_set):
             order = np.argsort(-sighting.brightness, kind="stable")
-            vectors = unit(light_positions_m(testbed, sighting.xy_px[order]))
+            vectors = unit(light_positions_m(lab, sighting.xy_px[order]))
             star = identify_leds(vectors, sighting.brightness[order], catalog)
             correct += int(np.array_equal(star, order))
             rows = order[:lights]
@@ -211,15 +211,15 @@ def imu_drift(hold_min: float, units: int, rng: np.random.Generator, earth: bool
     The vehicle follows Test 3's commanded attitudes exactly; each IMU has its own hardware seed.
     earth : measure the Earth rate and do not correct for it
     """
-    testbed = build_testbed(loader.load("afit_test3_ideal", {"site.x_azimuth_deg": SITE_AZIMUTH_DEG}))
-    config = testbed.scene.vehicle.imu
+    lab = build_lab(loader.load("afit_test3_ideal", {"site.x_azimuth_deg": SITE_AZIMUTH_DEG}))
+    config = lab.scene.vehicle.imu
     assert config is not None
-    legs = testbed.scene.motion.maneuver[1:]  # the IMU is zeroed as the vehicle leaves home
+    legs = lab.scene.motion.maneuver[1:]  # the IMU is zeroed as the vehicle leaves home
     timed_legs = [leg.model_copy(update={"duration_s": 60 * hold_min}) if leg.kind == "hold" else leg for leg in legs]
-    reference = guidance.plan(testbed.scene.motion.model_copy(update={"maneuver": tuple(timed_legs)}))
+    reference = guidance.plan(lab.scene.motion.model_copy(update={"maneuver": tuple(timed_legs)}))
     t_s = np.arange(0, reference.duration_s, KNOT_S)
     wxyz, rate, _ = (np.array(column) for column in zip(*map(reference.state_at, t_s), strict=True))
-    earth_rad_s, vehicle = imu.earth_rate_lab_rad_s(testbed.scene.site) * earth, testbed.vehicle
+    earth_rad_s, vehicle = imu.earth_rate_lab_rad_s(lab.scene.site) * earth, lab.vehicle
     increments = imu.ideal_increments(
         t_s, wxyz, rate, t_s[1:], KNOT_S, imu_position_m(vehicle), vehicle.gravity_m_s2, earth_rad_s
     )

@@ -6,6 +6,7 @@ error of the IMU alone is compared with Table 14; the errors of star tracker and
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,8 +19,7 @@ from skysim.experiments.papers.intervals import prediction_interval
 from skysim.experiments.papers.published import experiments
 from skysim.results.plots import INK
 from skysim.scene import loader
-from skysim.simulation import run
-from skysim.simulation.testbed import Testbed, exposure_window
+from skysim.simulation.flight import Shot, open_flight
 
 BumpRate = tuple[float, float, float]
 # deg/s about the body axes: fitted to Table 14's theta_2 and theta_3, and the scene's own.
@@ -86,8 +86,9 @@ def simulate_bump(bump_deg_s: BumpRate | None, seed: int) -> BumpRun:
         "motion.maneuver": f'[{hold_leg}{bump_leg if bump_deg_s else ""}{{kind: hold, duration: "30 s"}}]',
         "exposure": '{time: "10 ms", rate_hz: 1, frames: 6, first: "0.4 s"}',
     }
-    testbed = run.prepare(loader.load("simsat_bump", overrides))
-    log = testbed.log
+    with open_flight(loader.load("simsat_bump", overrides)) as flight:
+        errors_deg = [tracker_error_deg(shot) for shot in flight.shots() if shot.truth.t_s > BUMP_END_S]
+        log = flight.telemetry()
     assert log.lab_from_imu is not None
     assert log.lab_from_filter is not None
     assert log.saturated is not None
@@ -96,20 +97,15 @@ def simulate_bump(bump_deg_s: BumpRate | None, seed: int) -> BumpRun:
         angles_deg(log.lab_from_imu) - angles_deg(log.lab_from_body),
         np.degrees((log.lab_from_filter * log.lab_from_body.inv()).magnitude()),
         float(log.saturated.sum() * log.period_s),
-        tracker_error_deg(testbed),
+        max(errors_deg),
     )
 
 
-def tracker_error_deg(testbed: Testbed) -> float:
-    """The star tracker's worst error after the bump; infinite if an image was not solved."""
-    errors_deg = []
-    for index, report in testbed.reports.items():
-        t_s = exposure_window(testbed.scene, index).middle_s(testbed.scene.camera.height_px)
-        if t_s > BUMP_END_S:
-            estimate = report.attitude.cam_from_ref
-            true_attitude = testbed.mount.cam_from_body * testbed.trajectory.attitude_at(t_s).inv()
-            errors_deg.append(np.inf if estimate is None else np.degrees((estimate * true_attitude.inv()).magnitude()))
-    return float(max(errors_deg))
+def tracker_error_deg(shot: Shot) -> float:
+    """The star tracker's error; infinite if the image was not solved."""
+    assert shot.report is not None
+    estimate = shot.report.attitude.cam_from_ref
+    return math.inf if estimate is None else float(np.degrees((estimate * shot.truth.cam_from_lab.inv()).magnitude()))
 
 
 def draw(fig: Any, run: BumpRun) -> None:

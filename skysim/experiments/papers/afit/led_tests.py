@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from skysim.core.quantities.units import INCH_M
+from skysim.core.constants import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.configs import with_config
@@ -36,7 +36,7 @@ from skysim.scene.sections.camera import MoffatPsfConfig
 from skysim.scene.sections.layouts import ListedConfig
 from skysim.scene.sections.leds import CosineLobeConfig, DirectConfig
 from skysim.scene.sections.light import FlatSurfaceConfig
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 
 GrayImage = NDArray[np.uint8]
 LEDS, BOARD_DISTANCE_IN, DOME_IN, CAMERA_IN, PITCH_MM = 9, 36.0, 33.0, 15.0, 8.0
@@ -85,7 +85,7 @@ def board_scene(levels: Sequence[float], distance_in: float, lens: LensSettings,
     return scene
 
 
-def color_board(lens: LensSettings = DEFAULT_LENS, **led_values: Any) -> Testbed:
+def color_board(lens: LensSettings = DEFAULT_LENS, **led_values: Any) -> Lab:
     """Test stand with the first board: three colors by three resistors, always on."""
     drive = DirectConfig(kind="direct")
     scene = board_scene(BOARD, BOARD_DISTANCE_IN, lens, drive=drive, intensity_cd=BOARD_INTENSITY_CD, **led_values)
@@ -93,7 +93,7 @@ def color_board(lens: LensSettings = DEFAULT_LENS, **led_values: Any) -> Testbed
     return build_test_stand(with_config(scene, "exposure", time_s=BOARD_EXPOSURE_S))
 
 
-def white_board(pulses_us: Sequence[float], saturation_fraction: float = 1.0) -> Testbed:
+def white_board(pulses_us: Sequence[float], saturation_fraction: float = 1.0) -> Lab:
     """The last board under the dome: white LEDs lit one after another, each for its pulse within its slot.
 
     saturation_fraction : a pixel saturates at this fraction of the converter's range
@@ -104,17 +104,17 @@ def white_board(pulses_us: Sequence[float], saturation_fraction: float = 1.0) ->
     return build_test_stand(with_config(scene, "exposure", time_s=WHITE_EXPOSURE_S))
 
 
-def with_exposure(testbed: Testbed, time_s: float) -> Testbed:
-    """The testbed with another exposure time."""
-    return replace(testbed, scene=with_config(testbed.scene, "exposure", time_s=time_s))
+def with_exposure(lab: Lab, time_s: float) -> Lab:
+    """The lab with another exposure time."""
+    return lab.with_scene(with_config(lab.scene, "exposure", time_s=time_s))
 
 
 def take_image(
-    testbed: Testbed, rng: np.random.Generator, roll_pitch_deg: tuple[float, float] = (0.0, 0.0)
+    lab: Lab, rng: np.random.Generator, roll_pitch_deg: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[GrayImage, Floats]:
     """An image in gray levels, and the (N, 2) true pixels of its LEDs in the order of their numbers."""
-    frame, truth = render_at_attitude(testbed, Rotation.from_euler("xy", roll_pitch_deg, degrees=True), rng)
-    return gray_levels(frame, testbed), truth.sources.xy_px[np.argsort(truth.sources.id)]
+    frame, truth = render_at_attitude(lab, Rotation.from_euler("xy", roll_pitch_deg, degrees=True), rng)
+    return gray_levels(frame, lab), truth.sources.xy_px[np.argsort(truth.sources.id)]
 
 
 class ThresholdCounts(NamedTuple):
@@ -178,21 +178,19 @@ def led_tests(options: ExperimentOptions) -> ExperimentResult:
 
 def led_electrons(angle_deg: float, rng: np.random.Generator) -> float:
     """Electrons of the board's central LED, tilted away from the camera by angle_deg."""
-    testbed = white_board([1000.0] * 9)
+    lab = white_board([1000.0] * 9)
     direction = Rotation.from_euler("y", angle_deg, degrees=True).apply([0.0, 0.0, -1.0])
-    single = testbed.sources.take(np.array([4]))
-    testbed = with_exposure(replace(testbed, sources=replace(single, normal=direction[None])), 9 * SLOT_S)
-    return float(render_at_attitude(testbed, Rotation.identity(), rng)[1].sources.electrons[0])
+    single = lab.camera.sources.take(np.array([4]))
+    lab = with_exposure(lab.with_camera(sources=replace(single, normal=direction[None])), 9 * SLOT_S)
+    return float(render_at_attitude(lab, Rotation.identity(), rng)[1].sources.electrons[0])
 
 
 def duty_cycles(rng: np.random.Generator) -> dict[str, RowResult]:
     """Eq. 37: light of each of nine multiplexed LEDs relative to one that is always on."""
     pulses_us = [1000.0, 500.0, 400.0, 200.0, 1.0, 1000.0, 1000.0, 1000.0, 1000.0]
-    testbed = with_exposure(white_board(pulses_us), 4 * 9 * SLOT_S)
-    always_on = replace(testbed, sources=replace(testbed.sources, on_s=testbed.sources.period_s))
-    pulsed, unpulsed = (
-        render_at_attitude(board, Rotation.identity(), rng)[1].sources for board in (testbed, always_on)
-    )
+    lab = with_exposure(white_board(pulses_us), 4 * 9 * SLOT_S)
+    always_on = lab.with_camera(sources=replace(lab.camera.sources, on_s=lab.camera.sources.period_s))
+    pulsed, unpulsed = (render_at_attitude(board, Rotation.identity(), rng)[1].sources for board in (lab, always_on))
     fraction = pulsed.electrons[np.argsort(pulsed.id)] / unpulsed.electrons[np.argsort(unpulsed.id)]
     return {f"duty_{int(pulses_us[n])}": RowResult(exact(100 * fraction[n])) for n in range(5)}
 
@@ -200,8 +198,8 @@ def duty_cycles(rng: np.random.Generator) -> dict[str, RowResult]:
 def thresholds(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
     """Fig. 37: pixels of the first board above thresholds of 2, 10 and 25 %."""
     own_noise, test2_noise = (
-        [apply_thresholds(*take_image(testbed, rng)) for _ in range(images)]
-        for testbed in (color_board(), color_board(LensSettings(noise_e=NOISE_E)))
+        [apply_thresholds(*take_image(lab, rng)) for _ in range(images)]
+        for lab in (color_board(), color_board(LensSettings(noise_e=NOISE_E)))
     )
 
     def both(statistic: Callable[[BoardImage], Any], note: str = "") -> RowResult:
@@ -245,8 +243,8 @@ def apertures(images: int, rng: np.random.Generator) -> dict[str, RowResult]:
     """Fig. 36: LEDs found with a wide aperture in focus, a narrow one out of focus, and a balanced one."""
     results: dict[str, RowResult] = {}
     for name, lens in APERTURES.items():
-        testbed = color_board(lens)
-        taken = [take_image(testbed, rng) for _ in range(images)]
+        lab = color_board(lens)
+        taken = [take_image(lab, rng) for _ in range(images)]
         found = [float(np.sum(count_above(*image_and_px, 0.10).area_px >= MIN_AREA_PX)) for image_and_px in taken]
         results[f"found_{name}"] = RowResult(confidence_interval(found))
         if name == "wide":
@@ -262,8 +260,9 @@ def viewing_angles(images: int, rng: np.random.Generator) -> dict[str, RowResult
     """Figs 38 and 40: how much an LED's area varies between positions, for a directional and a diffuse lobe."""
     narrow = color_board(lobe=NARROW_LOBE)
     misalignment = Rotation.from_euler("y", MISALIGNMENT_DEG, degrees=True)
-    misaligned = replace(narrow, sources=replace(narrow.sources, normal=misalignment.apply(narrow.sources.normal)))
-    directional = [area_variation(testbed, 0.10, images, rng)[0][:, DIMMEST_LED] for testbed in (narrow, misaligned)]
+    sources = narrow.camera.sources
+    misaligned = narrow.with_camera(sources=replace(sources, normal=misalignment.apply(sources.normal)))
+    directional = [area_variation(lab, 0.10, images, rng)[0][:, DIMMEST_LED] for lab in (narrow, misaligned)]
     areas, stray = area_variation(color_board(), 0.04, images, rng)
     test2_percent, intermediate_percent = (
         area_variation(color_board(LensSettings(noise_e=noise_e)), 0.04, 1, rng)[1][0]
@@ -278,11 +277,11 @@ def viewing_angles(images: int, rng: np.random.Generator) -> dict[str, RowResult
     }
 
 
-def area_variation(testbed: Testbed, threshold: float, images: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+def area_variation(lab: Lab, threshold: float, images: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """(n, 9) smallest over largest area of each LED over the positions; (n,) percent of pixels outside LEDs."""
     ratio, stray = [], []
     for _ in range(images):
-        taken = [take_image(testbed, rng, roll_pitch_deg) for roll_pitch_deg in VIEW_ANGLES_DEG]
+        taken = [take_image(lab, rng, roll_pitch_deg) for roll_pitch_deg in VIEW_ANGLES_DEG]
         counted = [count_above(image, xy_px, threshold) for image, xy_px in taken]
         area = np.array([counts.area_px for counts in counted])
         ratio.append(np.where(area.any(axis=0), area.min(axis=0) / np.maximum(area.max(axis=0), 1), 1.0))
@@ -293,7 +292,7 @@ def area_variation(testbed: Testbed, threshold: float, images: int, rng: np.rand
 def brightness(images: int, rng: np.random.Generator) -> tuple[dict[str, RowResult], Floats]:
     """Figs 43 and 46: magnitude of five LEDs against their pulse, and whether LEDs of 1 us are detected."""
     long_us, pulses_us = 1e6 * ON_FRACTION * SLOT_S, np.array(PULSES_US[:4])
-    testbed, long_pulse = white_board(PULSES_US), white_board((*PULSES_US[:-1], long_us))
+    lab, long_pulse = white_board(PULSES_US), white_board((*PULSES_US[:-1], long_us))
     magnitudes = np.array([led_magnitudes(long_pulse, rng) for _ in range(images)])
     per_us = magnitudes[:, :4] / pulses_us
     saturating = white_board(PULSES_US, SATURATION_FRACTION)
@@ -305,7 +304,7 @@ def brightness(images: int, rng: np.random.Generator) -> tuple[dict[str, RowResu
         [len(measure_lights(take_image(one, rng)[0]).magnitude) for _ in range(images)]
         for one in (white_board(board), white_board(tuple(max(pulse, long_us) for pulse in board)))
     ]
-    short_magnitudes = [led_magnitudes(testbed, rng) for _ in range(images)]
+    short_magnitudes = [led_magnitudes(lab, rng) for _ in range(images)]
     first_to_last = [values[:, 0] / values[:, 3] for values in (per_us, saturating_per_us)]
     return {
         "order": with_cause(CAUSE_LONG_PULSE, fraction_in_order, short_magnitudes, magnitudes),
@@ -328,9 +327,9 @@ def table_7_magnitudes() -> list[float]:
     return published_values("afit-table-6-9", *keys).tolist()
 
 
-def led_magnitudes(testbed: Testbed, rng: np.random.Generator) -> Floats:
+def led_magnitudes(lab: Lab, rng: np.random.Generator) -> Floats:
     """(N,) magnitude of each LED; 0 if it is not found."""
-    image, xy_px = take_image(testbed, rng)
+    image, xy_px = take_image(lab, rng)
     lights = measure_lights(image)
     distance_px = np.linalg.norm(xy_px[:, None] - lights.xy_px, axis=2)
     return np.where(distance_px.min(axis=1) < 10, lights.magnitude[distance_px.argmin(axis=1)], 0.0)

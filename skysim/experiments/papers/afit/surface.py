@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from skysim.core.quantities.units import INCH_M
+from skysim.core.constants import INCH_M
 from skysim.core.types import Floats
 from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
 from skysim.experiments.papers.published import published_values

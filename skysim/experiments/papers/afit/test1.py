@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration.home_position import pooled
+from skysim.core.constants import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
@@ -31,7 +31,7 @@ from skysim.results.plots import INK
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import SlewConfig
-from skysim.simulation.testbed import Testbed, light_sources
+from skysim.simulation.lab import Lab, light_sources
 from skysim.tracking import onboard_model
 
 LEDS, POSITIONS = 9, 5
@@ -58,13 +58,13 @@ def scene_with_exposure(time_s: float) -> Scene:
     return with_config(scene, "light.led", intensity_cd=INTENSITY_CD * FRAME_TIME_S / time_s)
 
 
-def take_board(testbed: Testbed, images: int, rng: np.random.Generator) -> Floats:
+def take_board(lab: Lab, images: int, rng: np.random.Generator) -> Floats:
     """(n, 9) magnitudes of a board, sorted within each image, from images at each of the five attitudes.
 
     Images that do not show all nine LEDs are left out.
     """
-    poses = [lab_from_body for lab_from_body in attitudes(testbed.scene) for _ in range(images)]
-    magnitudes = [measure_frame(testbed, lab_from_body, rng).magnitude for lab_from_body in poses]
+    poses = [lab_from_body for lab_from_body in attitudes(lab.scene) for _ in range(images)]
+    magnitudes = [measure_frame(lab, lab_from_body, rng).magnitude for lab_from_body in poses]
     return np.array([one for one in magnitudes if len(one) == LEDS])
 
 
@@ -76,10 +76,10 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
     for n in range(boards):
         options.watch(n, boards)
         hardware_seed = int(random_stream(options.seed, n).integers(2**31))
-        for stage, testbed in enumerate(stands):
+        for stage, lab in enumerate(stands):
             # The same board with nine other LEDs, by another hardware seed.
-            scene = with_config(testbed.scene, "light.layout", hardware_seed=hardware_seed)
-            other_leds = replace(testbed, scene=scene, sources=light_sources(scene, testbed.band))
+            scene = with_config(lab.scene, "light.layout", hardware_seed=hardware_seed)
+            other_leds = lab.with_scene(scene).with_camera(sources=light_sources(scene, lab.camera.band))
             rng = random_stream(options.seed, stage, n)
             runs[stage].append(take_board(other_leds, images, rng))
     found_arcsec = lattice_angles(stands[0], options.trials(20, 2), random_stream(options.seed, 2))
@@ -128,20 +128,20 @@ def pooled_std_by_rank(board: Floats) -> Floats:
     return pooled(board.ravel(), rank, np.zeros_like(rank))
 
 
-def lattice_angles(testbed: Testbed, images: int, rng: np.random.Generator) -> Floats:
+def lattice_angles(lab: Lab, images: int, rng: np.random.Generator) -> Floats:
     """(n, 36) angles of all pairs, ascending, by the thesis's scale: four spacings of the first image average 8 mm."""
-    camera = onboard_model.assumed_camera(testbed.scene)
+    camera = onboard_model.assumed_camera(lab.scene)
     angles_arcsec: list[Floats] = []
-    for lab_from_body in attitudes(testbed.scene):
+    for lab_from_body in attitudes(lab.scene):
         for _ in range(images):
-            frame, truth = render_at_attitude(testbed, lab_from_body, rng)
-            xy_px = measure_lights(gray_levels(frame, testbed)).xy_px
+            frame, truth = render_at_attitude(lab, lab_from_body, rng)
+            xy_px = measure_lights(gray_levels(frame, lab)).xy_px
             if not angles_arcsec:
                 nearest = [int(np.argmin(np.linalg.norm(xy_px - led_px, axis=1))) for led_px in truth.sources.xy_px]
                 spacing_px = [np.linalg.norm(xy_px[nearest[a]] - xy_px[nearest[b]]) for a, b in NEIGHBORS]
-                distance_m = testbed.sources.place[4, 2] - testbed.mount.camera_body_m[2]
+                distance_m = lab.camera.sources.place[4, 2] - lab.camera.mount.camera_body_m[2]
                 camera = camera.zoomed(float(np.mean(spacing_px)) * distance_m / PITCH_M / camera.focal_px)
-            angles_arcsec.append(np.sort(separations_arcsec(xy_px, testbed, camera)))
+            angles_arcsec.append(np.sort(separations_arcsec(xy_px, lab, camera)))
     return np.array(angles_arcsec)
 
 
@@ -186,7 +186,7 @@ def draw_angles(fig: Any, angles_arcsec: Floats) -> None:
     axes = fig.subplots()
     axes.hist(angles_arcsec.ravel(), np.arange(1200, 4000, 20), color=INK[0], label="ours")
     # Angles about the bearing of two LEDs of the lattice, in a board at 48 in.
-    for n, angle_rad in enumerate(2 * np.arctan(PITCH_M * np.sqrt(SQUARED_DISTANCES) / 2 / (48 * 0.0254))):
+    for n, angle_rad in enumerate(2 * np.arctan(PITCH_M * np.sqrt(SQUARED_DISTANCES) / 2 / (48 * INCH_M))):
         label = "8 mm lattice" if n == 0 else None
         axes.axvline(np.degrees(angle_rad) * 3600, ls="--", color=INK[1], label=label)
     axes.set(xlabel="angle of a pair (arcsec)", ylabel="pairs in all images")

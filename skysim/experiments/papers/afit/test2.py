@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import project
-from skysim.core.quantities.units import INCH_M
+from skysim.core.constants import INCH_M
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.configs import with_config
@@ -30,7 +30,7 @@ from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import MoffatPsfConfig
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 from skysim.sources.dome.shell.surface import Surface, build_surface
 from skysim.tracking import onboard_model
 
@@ -77,16 +77,16 @@ def measured_dome(scene: Scene, decenter_in: float = 0.0) -> Surface:
     return build_surface(scene.light.surface.model_copy(update={"offset_m": (decenter_in * INCH_M, 0.0, 0.0)}))
 
 
-def place_pair(testbed: Testbed, place: Place) -> Testbed:
+def place_pair(lab: Lab, place: Place) -> Lab:
     """The pair on a board tangent to the dome, or tilted from it, with its LEDs along the meridian."""
-    dome, tilt = measured_dome(testbed.scene, place.decenter_in), np.radians(place.tilt_deg)
+    dome, tilt = measured_dome(lab.scene, place.decenter_in), np.radians(place.tilt_deg)
     center_m = dome.meet(np.zeros(3), np.array([[np.sin(tilt), 0.0, np.cos(tilt)]]))[0]
     board_tilt = Rotation.from_euler("y", place.board_tilt_deg, degrees=True)
     normal = board_tilt.apply(dome.inward(center_m[None])[0])
     meridian = np.cross(normal, [0.0, 1.0, 0.0])
     positions_m = center_m + np.outer([-PAIR_M / 2, PAIR_M / 2], meridian / np.linalg.norm(meridian))
-    pair, homogeneous = testbed.sources.take(np.arange(2)), np.column_stack([positions_m, np.ones(2)])
-    return replace(testbed, sources=replace(pair, place=homogeneous, normal=np.tile(normal, (2, 1))))
+    pair, homogeneous = lab.camera.sources.take(np.arange(2)), np.column_stack([positions_m, np.ones(2)])
+    return lab.with_camera(sources=replace(pair, place=homogeneous, normal=np.tile(normal, (2, 1))))
 
 
 def point_at(place: Place) -> Rotation:
@@ -94,15 +94,15 @@ def point_at(place: Place) -> Rotation:
     return Rotation.from_euler("y", place.tilt_deg, degrees=True)
 
 
-def series(testbed: Testbed, place: Place, images: int, rng: np.random.Generator) -> Series:
+def series(lab: Lab, place: Place, images: int, rng: np.random.Generator) -> Series:
     """Measure images of a place; those that do not show two lights are left out."""
-    testbed_at_place, attitude = place_pair(testbed, place), point_at(place)
+    lab_at_place, attitude = place_pair(lab, place), point_at(place)
     magnitudes, angles = [], []
     for _ in range(images):
-        lights = measure_frame(testbed_at_place, attitude, rng)
+        lights = measure_frame(lab_at_place, attitude, rng)
         if len(lights.magnitude) == 2:
             magnitudes.append(lights.magnitude)
-            angles.append(separations_arcsec(lights.xy_px, testbed_at_place)[0])
+            angles.append(separations_arcsec(lights.xy_px, lab_at_place)[0])
     return Series(np.array(magnitudes), np.array(angles))
 
 
@@ -181,11 +181,11 @@ def standard_deviations(runs: NoiseRuns) -> dict[str, RowResult]:
     return {f"sd_{key}": with_cause(CAUSE_NOISE, std_interval, *pair) for key, pair in values.items()}
 
 
-def angles(testbed: Testbed, runs: NoiseRuns, images: int, rng: np.random.Generator) -> dict[str, RowResult]:
+def angles(lab: Lab, runs: NoiseRuns, images: int, rng: np.random.Generator) -> dict[str, RowResult]:
     """Table 5's means, with the effect of each cause on the last two."""
     edge = PLACES_DEG[2]
     halfway, decentered, tilted, tilted_decentered, more_tilted_decentered = (
-        series(testbed, place, images, rng).angle_arcsec
+        series(lab, place, images, rng).angle_arcsec
         for place in (
             Place(HALFWAY_DEG),
             Place(edge, 0.0, DECENTER_IN),
@@ -194,7 +194,7 @@ def angles(testbed: Testbed, runs: NoiseRuns, images: int, rng: np.random.Genera
             Place(edge, BOARD_TILT_DEG, DECENTER_IN),
         )
     )
-    glare_arcsec = glare_bias_arcsec(testbed, images, rng)
+    glare_arcsec = glare_bias_arcsec(lab, images, rng)
     noise_bias_arcsec = [
         float(more.angle_arcsec.mean() - own.angle_arcsec.mean()) for own, more in zip(*runs, strict=True)
     ]
@@ -207,7 +207,7 @@ def angles(testbed: Testbed, runs: NoiseRuns, images: int, rng: np.random.Genera
         f' wings: {glare_arcsec:+.1f}"'
     )
     cause = f"a board tilted by {BOARD_TILT_DEG:g} deg"
-    smallest = min(geometric_angle_arcsec(testbed, Place(float(tilt))) for tilt in np.linspace(20, 34, 29))
+    smallest = min(geometric_angle_arcsec(lab, Place(float(tilt))) for tilt in np.linspace(20, 34, 29))
     return {
         "angle_1": RowResult(confidence_interval(at_apex)),
         "angle_2": with_cause(f"the board at {HALFWAY_DEG} deg", confidence_interval, at_halfway, halfway),
@@ -224,7 +224,7 @@ def relative_decrease(reference: float, angles: Floats) -> Summary:
     return Summary(value, low, high, mean.trials)
 
 
-def glare_bias_arcsec(testbed: Testbed, images: int, rng: np.random.Generator) -> float:
+def glare_bias_arcsec(lab: Lab, images: int, rng: np.random.Generator) -> float:
     """Change of the angle from apex to edge in arcsec, beyond geometry, due to a PSF with wide wings.
 
     The wings add light of one LED below the other, which biases the centroids.
@@ -233,16 +233,16 @@ def glare_bias_arcsec(testbed: Testbed, images: int, rng: np.random.Generator) -
     stand = build_test_stand(with_config(scene(2 * ON_FRACTION), "camera", psf=psf))
     edge, apex = Place(PLACES_DEG[2]), Place(0.0)
     at_edge, at_apex = (series(stand, place, images, rng).angle_arcsec.mean() for place in (edge, apex))
-    expected_edge, expected_apex = (geometric_angle_arcsec(testbed, place) for place in (edge, apex))
+    expected_edge, expected_apex = (geometric_angle_arcsec(lab, place) for place in (edge, apex))
     return float(at_edge - at_apex - expected_edge + expected_apex)
 
 
-def geometric_angle_arcsec(testbed: Testbed, place: Place) -> float:
+def geometric_angle_arcsec(lab: Lab, place: Place) -> float:
     """The pair's angle by eqs 43-45 from its LEDs' projected positions, without rendering."""
-    lever = onboard_model.assumed_lever(testbed.scene, testbed.mount)
-    camera = onboard_model.assumed_camera(testbed.scene)
-    xy_px = project(point_at(place).inv(), place_pair(testbed, place).sources.place[:, :3], lever, camera)
-    return float(separations_arcsec(xy_px, testbed)[0])
+    lever = onboard_model.assumed_lever(lab.scene, lab.camera.mount)
+    camera = onboard_model.assumed_camera(lab.scene)
+    xy_px = project(point_at(place).inv(), place_pair(lab, place).camera.sources.place[:, :3], lever, camera)
+    return float(separations_arcsec(xy_px, lab)[0])
 
 
 def draw_magnitudes(fig: Any, places: Sequence[Series]) -> None:
@@ -264,7 +264,7 @@ def draw_magnitudes(fig: Any, places: Sequence[Series]) -> None:
     fig.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
 
 
-def draw_angles(fig: Any, testbed: Testbed, places: Sequence[Series]) -> None:
+def draw_angles(fig: Any, lab: Lab, places: Sequence[Series]) -> None:
     rows, axes = experiments()["afit-table-3-5"].rows, fig.subplots()
     tilt_deg = np.linspace(0, 32, 33)
     curves = (
@@ -273,7 +273,7 @@ def draw_angles(fig: Any, testbed: Testbed, places: Sequence[Series]) -> None:
         (f"leaning {BOARD_TILT_DEG:g} deg", Place(0, BOARD_TILT_DEG)),
     )
     for ink, style, (name, place) in zip((INK[0], INK[2], INK[4]), ("-", "--", "-."), curves, strict=True):
-        angle = [geometric_angle_arcsec(testbed, place._replace(tilt_deg=float(tilt))) for tilt in tilt_deg]
+        angle = [geometric_angle_arcsec(lab, place._replace(tilt_deg=float(tilt))) for tilt in tilt_deg]
         axes.plot(tilt_deg, angle, style, color=ink, label=name)
     ours = [one.angle_arcsec.mean() for one in places]
     axes.plot(PLACES_DEG, ours, "s", color=INK[0], label="ours, from images")

@@ -18,7 +18,7 @@ from estimator.attitude.dome_map import project
 from estimator.calibration.home_position import Sighting
 from estimator.catalog.catalog import unit
 from estimator.catalog.pair_buckets import bucket_of, build_pair_catalog
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.afit.test3_images import (
@@ -37,7 +37,7 @@ from skysim.experiments.papers.intervals import bootstrap_interval
 from skysim.experiments.papers.published import experiments, published_values
 from skysim.results.metrics import Summary, exact, extremum
 from skysim.results.plots import INK, MARKS
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 from skysim.tracking import onboard_model
 
 ID = "afit-table-6-9"
@@ -69,8 +69,8 @@ def tables_6_to_9(options: ExperimentOptions) -> ExperimentResult:
     series = {}
     for done, (name, (overrides, n_images)) in enumerate(plan.items()):
         options.watch(done, len(plan))
-        testbed, rng = build_test3(fitted_overrides | overrides), random_stream(options.seed, done)
-        series[name] = ImageSeries(testbed, photograph_positions(testbed, n_images, rng))
+        lab, rng = build_test3(fitted_overrides | overrides), random_stream(options.seed, done)
+        series[name] = ImageSeries(lab, photograph_positions(lab, n_images, rng))
     ours, with_faults, nominal = (series[name].measurements for name in ("ours", "camera faults", "nominal"))
     bumped = series["ours"].bumped(BUMPED_POSITION)
     drifted = series["ours"].bumped(*range(len(IMU_DEG)))
@@ -90,15 +90,15 @@ def tables_6_to_9(options: ExperimentOptions) -> ExperimentResult:
 
 
 class ImageSeries(NamedTuple):
-    """Images of one testbed."""
+    """Images of one lab."""
 
-    testbed: Testbed
+    lab: Lab
     sightings: list[Sighting]
 
     @property
     def measurements(self) -> Measurements:
         """The images as measured in the thesis."""
-        return measure(self.testbed, self.sightings)
+        return measure(self.lab, self.sightings)
 
     def bumped(self, *positions: int) -> Measurements:
         """The same images, with the IMU errors of Tables 10-14 at these positions."""
@@ -109,46 +109,46 @@ class ImageSeries(NamedTuple):
             replace(one, body_from_lab=imu_attitudes[one.stop].inv()) if one.stop in imu_attitudes else one
             for one in self.sightings
         ]
-        return measure(self.testbed, sightings)
+        return measure(self.lab, sightings)
 
 
-def photograph_positions(testbed: Testbed, images: int, rng: np.random.Generator) -> list[Sighting]:
+def photograph_positions(lab: Lab, images: int, rng: np.random.Generator) -> list[Sighting]:
     """Images at each of the five positions, with a perfect IMU."""
     return [
         sighting
         for position, angles in enumerate(TRUE_ANGLES_DEG)
-        for sighting in photograph(testbed, position, lab_from_body(angles), images, rng)
+        for sighting in photograph(lab, position, lab_from_body(angles), images, rng)
     ]
 
 
-def fit_positions(testbed: Testbed) -> Floats:
+def fit_positions(lab: Lab) -> Floats:
     """(5, 3) LED positions in the board's plane for which the thesis's eqs 43-45, without noise, give Table 8.
 
     Least squares of eight coordinates to ten angles; the central LED is fixed. Table 8 is sorted, so its angles are
     assigned to pairs by the order of the angles from the scene's positions, which neglect the error of eq. 44.
     """
     published_arcsec = published("separation", 10)
-    position_m = testbed.sources.place[:, :3].copy()
-    start_arcsec = expected_angles_arcsec(testbed, position_m)
+    position_m = lab.camera.sources.place[:, :3].copy()
+    start_arcsec = expected_angles_arcsec(lab, position_m)
     # Table 8 is in ascending order: its k-th angle belongs to the pair with the k-th smallest start angle.
     target_arcsec = np.empty(len(published_arcsec))
     target_arcsec[np.argsort(start_arcsec)] = published_arcsec
 
     def residual_arcsec(arms_mm: Floats) -> Floats:
         position_m[1:, :2] = arms_mm.reshape(-1, 2) / 1e3
-        return expected_angles_arcsec(testbed, position_m) - target_arcsec
+        return expected_angles_arcsec(lab, position_m) - target_arcsec
 
     fitted_mm = least_squares(residual_arcsec, position_m[1:, :2].ravel() * 1e3).x
     position_m[1:, :2] = fitted_mm.reshape(-1, 2) / 1e3
     return position_m
 
 
-def expected_angles_arcsec(testbed: Testbed, position_m: Floats) -> Floats:
+def expected_angles_arcsec(lab: Lab, position_m: Floats) -> Floats:
     """(10,) angle of every pair as the thesis measures it, without noise, averaged over the vehicle's positions."""
-    lever = onboard_model.assumed_lever(testbed.scene, testbed.mount)
-    camera = onboard_model.calibration(testbed.scene.camera)
+    lever = onboard_model.assumed_lever(lab.scene, lab.camera.mount)
+    camera = onboard_model.calibration(lab.scene.camera)
     pixels = [project(lab_from_body(angles_deg).inv(), position_m, lever, camera) for angles_deg in TRUE_ANGLES_DEG]
-    body_m = np.array([light_positions_m(testbed, xy_px) for xy_px in pixels])
+    body_m = np.array([light_positions_m(lab, xy_px) for xy_px in pixels])
     zeros = np.zeros((len(body_m), len(position_m)))
     return Measurements(np.arange(len(body_m)), zeros, body_m, body_m).separation_arcsec.mean(axis=0)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -20,8 +20,8 @@ from skysim.experiments.papers.afit.test_stand import light_positions_m, pair_an
 from skysim.experiments.papers.published import experiments
 from skysim.scene import loader
 from skysim.scene.sections.motion import AttitudeConfig
-from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.exposure import render_at_rest
+from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import onboard_model
 from skysim.tracking import settings as tracker_settings
 
@@ -52,11 +52,11 @@ FITTED_IMAGING = {  # rolling shutter, exposure of a non-integer number of LED c
 }
 
 
-def build_test3(overrides: Mapping[str, str] | None = None) -> Testbed:
-    """Test 3's testbed, with the camera turned so that all five positions are on the detector."""
-    testbed = build_testbed(loader.load("afit_test3_ideal", STATED_IMAGING | dict(overrides or {})))
-    cam_from_body = Rotation.from_euler("z", CAMERA_ROTATION_DEG, degrees=True) * testbed.mount.cam_from_body
-    return replace(testbed, mount=Mount(testbed.mount.camera_body_m, cam_from_body))
+def build_test3(overrides: Mapping[str, str] | None = None) -> Lab:
+    """Test 3's lab, with the camera turned so that all five positions are on the detector."""
+    lab = build_lab(loader.load("afit_test3_ideal", STATED_IMAGING | dict(overrides or {})))
+    cam_from_body = Rotation.from_euler("z", CAMERA_ROTATION_DEG, degrees=True) * lab.camera.mount.cam_from_body
+    return lab.with_camera(mount=Mount(lab.camera.mount.camera_body_m, cam_from_body))
 
 
 def lab_from_body(angles_deg: Sequence[float]) -> Rotation:
@@ -71,17 +71,17 @@ def angles_deg(lab_from_body: Rotation) -> Floats:
 
 
 def photograph(
-    testbed: Testbed, position: int, lab_from_body: Rotation, images: int, rng: np.random.Generator
+    lab: Lab, position: int, lab_from_body: Rotation, images: int, rng: np.random.Generator
 ) -> list[Sighting]:
     """Images from one attitude at random times; lights identified by the truth, in the order of the LEDs.
 
     The IMU's attitude is the true one. Images without all five LEDs are left out.
     """
-    camera = onboard_model.calibration(testbed.scene.camera)
-    settings = tracker_settings.assumed_settings(testbed.scene)
+    camera = onboard_model.calibration(lab.scene.camera)
+    settings = tracker_settings.assumed_settings(lab.scene)
     sightings = []
     for seed in rng.integers(2**62, size=images):  # each image in a run of its own, for a random phase of the LEDs
-        frame, truth = exposure.render_frame(testbed.in_run(int(seed)).at_rest(lab_from_body), 0)
+        frame, truth = render_at_rest(lab.in_run(int(seed)).camera, lab_from_body)
         priors = FramePriors(None, frame.saturation_dn)
         blobs = DETECTORS["thesis"](frame.image_dn, priors=priors)
         lights = CENTROIDERS["cog"](frame.image_dn, blobs, settings.gain_e_dn, priors)
@@ -114,9 +114,9 @@ class Measurements:
         return pair_angles_arcsec(self.body_m)
 
 
-def measure(testbed: Testbed, sightings: Sequence[Sighting]) -> Measurements:
+def measure(lab: Lab, sightings: Sequence[Sighting]) -> Measurements:
     """Measure the images as in the thesis."""
-    body_m = np.array([light_positions_m(testbed, sighting.xy_px) for sighting in sightings])
+    body_m = np.array([light_positions_m(lab, sighting.xy_px) for sighting in sightings])
     lab_m = np.array([one.body_from_lab.inv().apply(led_m) for one, led_m in zip(sightings, body_m, strict=True)])
     position, magnitude = (np.array([getattr(one, name) for one in sightings]) for name in ("stop", "brightness"))
     return Measurements(position, magnitude, body_m, lab_m)

@@ -17,13 +17,13 @@ from estimator.core.errors import ImageError
 from estimator.core.types import FramePriors
 from estimator.detection import detect
 from skysim.camera.optics import Optics
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Truth
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed, build_obstacles, build_testbed, light_sources
+from skysim.simulation.exposure import render_at_rest
+from skysim.simulation.lab import Lab, build_lab, build_obstacles, light_sources
 from skysim.sources.dome.led import Emitter
 from skysim.sources.dome.timing.clocks import build_clocks
 from skysim.tracking import onboard_model
@@ -42,36 +42,34 @@ class MeasuredLights(NamedTuple):
 
 
 @cache
-def base_testbed() -> Testbed:
-    """Testbed of Test 1, whose vehicle and detector all AFIT scenes share."""
-    return build_testbed(load("afit_test1_ideal"))
+def base_lab() -> Lab:
+    """Lab of Test 1, whose vehicle and detector all AFIT scenes share."""
+    return build_lab(load("afit_test1_ideal"))
 
 
-def build_test_stand(scene: Scene) -> Testbed:
-    """Testbed of a scene with other lights, lens or electronics; the detector's fixed pattern is computed only once."""
-    testbed = base_testbed()
+def build_test_stand(scene: Scene) -> Lab:
+    """Lab of a scene with other lights, lens or electronics; the detector's fixed pattern is computed only once."""
+    lab = base_lab()
     assert isinstance(scene.light, DomeConfig)
-    sources = light_sources(scene, testbed.band)
-    return replace(
-        testbed,
-        scene=scene,
+    sources = light_sources(scene, lab.camera.band)
+    return lab.with_scene(scene).with_camera(
         sources=sources,
         clocks=build_clocks(scene.light, sources, scene.seed),
         emitter=Emitter.from_config(scene.light.led),
         optics=Optics.from_camera(scene.camera),
-        detector=replace(testbed.detector, config=scene.camera.detector),
-        obstacles=build_obstacles(scene, testbed.vehicle),
+        detector=replace(lab.camera.detector, config=scene.camera.detector),
+        obstacles=build_obstacles(scene, lab.vehicle),
     )
 
 
-def render_at_attitude(testbed: Testbed, lab_from_body: Rotation, rng: np.random.Generator) -> tuple[Frame, Truth]:
+def render_at_attitude(lab: Lab, lab_from_body: Rotation, rng: np.random.Generator) -> tuple[Frame, Truth]:
     """Render a frame at a fixed attitude, in a run of its own: the phase of the LEDs' cycle is random."""
-    return exposure.render_frame(testbed.in_run(int(rng.integers(2**62))).at_rest(lab_from_body), 0)
+    return render_at_rest(lab.in_run(int(rng.integers(2**62))).camera, lab_from_body)
 
 
-def gray_levels(frame: Frame, testbed: Testbed) -> NDArray[np.uint8]:
+def gray_levels(frame: Frame, lab: Lab) -> NDArray[np.uint8]:
     """The frame in 8-bit gray levels, as in the thesis's MATLAB code: 0 is black, 255 a full well."""
-    config = testbed.scene.camera.detector
+    config = lab.scene.camera.detector
     level = (frame.image_dn - config.offset_dn) * (config.gain_e_dn / E_PER_GRAY)
     return np.clip(np.rint(level), 0, WHITE).astype(np.uint8)
 
@@ -89,20 +87,20 @@ def measure_lights(image: NDArray[np.uint8]) -> MeasuredLights:
     return MeasuredLights(blobs.xy_px[order], area_px[order], mean_dn[order], magnitude[order])
 
 
-def measure_frame(testbed: Testbed, lab_from_body: Rotation, rng: np.random.Generator) -> MeasuredLights:
+def measure_frame(lab: Lab, lab_from_body: Rotation, rng: np.random.Generator) -> MeasuredLights:
     """Lights of a frame rendered at a fixed attitude."""
-    return measure_lights(gray_levels(render_at_attitude(testbed, lab_from_body, rng)[0], testbed))
+    return measure_lights(gray_levels(render_at_attitude(lab, lab_from_body, rng)[0], lab))
 
 
-def light_positions_m(testbed: Testbed, xy_px: Floats, camera: Camera | None = None) -> Floats:
+def light_positions_m(lab: Lab, xy_px: Floats, camera: Camera | None = None) -> Floats:
     """(N, 3) positions of lights in body axes, by eqs 43-44 and the camera's lever arm.
 
     camera : camera model to use; the tracker's own if left out
     """
-    assert isinstance(testbed.scene.light, DomeConfig)
-    leds = onboard_model.assumed_dome(testbed.scene, testbed.scene.light, testbed.sources)
-    lever = onboard_model.assumed_lever(testbed.scene, testbed.mount)
-    rays = (camera or onboard_model.assumed_camera(testbed.scene)).rays(xy_px)
+    assert isinstance(lab.scene.light, DomeConfig)
+    leds = onboard_model.assumed_dome(lab.scene, lab.scene.light, lab.camera.sources)
+    lever = onboard_model.assumed_lever(lab.scene, lab.camera.mount)
+    rays = (camera or onboard_model.assumed_camera(lab.scene)).rays(xy_px)
     points_m, _ = nearfield.thesis_points(rays, leds, lever)
     return lever.cam_from_body.inv().apply(points_m) + lever.camera_body_m
 
@@ -118,6 +116,6 @@ def pair_angles_arcsec(vectors: Floats) -> Floats:
     return np.asarray(2 * np.arcsin(chord / 2) / ARCSEC_RAD)
 
 
-def separations_arcsec(xy_px: Floats, testbed: Testbed, camera: Camera | None = None) -> Floats:
+def separations_arcsec(xy_px: Floats, lab: Lab, camera: Camera | None = None) -> Floats:
     """(N (N - 1) / 2,) angles about the bearing of all pairs of (N, 2) pixels, by eqs 43-45."""
-    return pair_angles_arcsec(light_positions_m(testbed, xy_px, camera))
+    return pair_angles_arcsec(light_positions_m(lab, xy_px, camera))

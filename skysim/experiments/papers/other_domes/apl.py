@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.render import Poses, in_view, project
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
 from skysim.experiments.configs import with_config
@@ -25,7 +25,7 @@ from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.lab import Lab, build_lab
 from skysim.sources import dome
 from skysim.sources.photometry import Band
 from skysim.tracking import onboard_model
@@ -41,12 +41,12 @@ def shell_scene(radius_variation: float, seed: int) -> Scene:
     return loader.load("apl_dome_ideal", {variation: str(radius_variation), hardware_seed: str(seed)})
 
 
-def fibers(scene: Scene, testbed: Testbed) -> tuple[Sources, Floats]:
+def fibers(scene: Scene, lab: Lab) -> tuple[Sources, Floats]:
     """The true fibers of a shell, and their (N, 3) positions on a perfect sphere."""
     assert isinstance(scene.light, DomeConfig)
     true = dome.sources(scene.light, Band.from_camera(scene.camera))
     perfect_light = with_config(scene.light, "layout", radius_variation=0.0)
-    return true, dome.sources(perfect_light, testbed.band).place[:, :3]
+    return true, dome.sources(perfect_light, lab.camera.band).place[:, :3]
 
 
 def random_attitudes(count: int, rng: np.random.Generator) -> list[Rotation]:
@@ -57,15 +57,15 @@ def random_attitudes(count: int, rng: np.random.Generator) -> list[Rotation]:
 
 
 def largest_discrepancies_arcsec(
-    scene: Scene, testbed: Testbed, offset_m: float, corrected: bool, attitudes: list[Rotation]
+    scene: Scene, lab: Lab, offset_m: float, corrected: bool, attitudes: list[Rotation]
 ) -> Floats:
     """(K,) largest angle between observed ray and expected direction of a fiber, for each attitude with one in view.
 
     The pupil is displaced across the boresight by offset_m. The tracker assumes a perfect sphere, and the pupil in its
     center unless `corrected`: then the offset is known.
     """
-    true, perfect_m = fibers(scene, testbed)
-    camera, cam_from_body = onboard_model.assumed_camera(scene), testbed.mount.cam_from_body
+    true, perfect_m = fibers(scene, lab)
+    camera, cam_from_body = onboard_model.assumed_camera(scene), lab.camera.mount.cam_from_body
     pupil_m = cam_from_body.inv().apply([offset_m, 0.0, 0.0])
     assumed_pupil_m = pupil_m if corrected else np.zeros(3)
     boresight = cam_from_body.inv().apply([0.0, 0.0, 1.0])
@@ -74,8 +74,8 @@ def largest_discrepancies_arcsec(
     for lab_from_body in (attitude * level_rotation for attitude in attitudes):
         cam_from_lab = cam_from_body * lab_from_body.inv()
         poses = Poses(cam_from_lab.as_matrix()[None], lab_from_body.apply(pupil_m)[None])
-        visible = in_view(true, testbed.optics, poses)
-        xy_px = project(true.take(visible), testbed.optics, poses)[0][0]
+        visible = in_view(true, lab.camera.optics, poses)
+        xy_px = project(true.take(visible), lab.camera.optics, poses)[0][0]
         on_detector = camera.contains(xy_px)
         assumed_m = cam_from_lab.apply(perfect_m[visible[on_detector]] - lab_from_body.apply(assumed_pupil_m))
         expected_rays = assumed_m / np.linalg.norm(assumed_m, axis=1, keepdims=True)
@@ -85,9 +85,9 @@ def largest_discrepancies_arcsec(
     return np.array(largest)
 
 
-def count_fibers(testbed: Testbed, diameter_deg: float, boresights: Floats) -> Floats:
+def count_fibers(lab: Lab, diameter_deg: float, boresights: Floats) -> Floats:
     """(K,) number of fibers in a circle of this diameter about each of the (K, 3) unit boresights from the center."""
-    position_m = testbed.sources.place[:, :3]
+    position_m = lab.camera.sources.place[:, :3]
     directions = position_m / np.linalg.norm(position_m, axis=1, keepdims=True)
     return np.asarray((boresights @ directions.T > np.cos(np.radians(diameter_deg / 2))).sum(axis=1), float)
 
@@ -101,33 +101,33 @@ def random_boresights(count: int, rng: np.random.Generator) -> Floats:
 def discrepancies_and_counts(options: ExperimentOptions) -> ExperimentResult:
     """Discrepancies over shells and attitudes, and the number of fibers in a field."""
     rng = random_stream(options.seed, 2005)
-    testbed = build_testbed(loader.load("apl_dome_ideal"))
+    lab = build_lab(loader.load("apl_dome_ideal"))
     scenes = [shell_scene(0.004, int(seed)) for seed in rng.integers(2**31, size=options.trials(30, 5))]
     attitudes = random_attitudes(options.trials(60, 20), rng)
     large_offset = np.concatenate(
-        [largest_discrepancies_arcsec(scene, testbed, LARGE_OFFSET_M, True, attitudes) for scene in scenes]
+        [largest_discrepancies_arcsec(scene, lab, LARGE_OFFSET_M, True, attitudes) for scene in scenes]
     )
-    small_offset = largest_discrepancies_arcsec(shell_scene(0.0, 1), testbed, SMALL_OFFSET_M, False, attitudes)
-    true, perfect_m = fibers(scenes[0], testbed)
+    small_offset = largest_discrepancies_arcsec(shell_scene(0.0, 1), lab, SMALL_OFFSET_M, False, attitudes)
+    true, perfect_m = fibers(scenes[0], lab)
     radius_m, perfect_radius_m = (np.linalg.norm(place_m, axis=1) for place_m in (true.place[:, :3], perfect_m))
     radius_change = radius_m / perfect_radius_m - 1
     boresights = random_boresights(options.trials(100_000, 20_000), rng)
     inner_boresights = boresights[boresights[:, 2] > np.sin(np.radians(20))]
 
     def excess_stars(diameter_deg: float) -> float:
-        return count_fibers(testbed, diameter_deg, inner_boresights).mean() - MEAN_STARS
+        return count_fibers(lab, diameter_deg, inner_boresights).mean() - MEAN_STARS
 
     results = {
-        "fibers": RowResult(exact(len(testbed.sources))),
+        "fibers": RowResult(exact(len(lab.camera.sources))),
         "variation": RowResult(extremum(100 * np.abs(radius_change), np.max)),
         "off_50mm": RowResult(extremum(large_offset, np.max)),
         "off_1mm": RowResult(extremum(small_offset, np.max)),
-        "stars_10deg": RowResult(bootstrap_interval(count_fibers(testbed, CIRCLE_DEG, boresights), np.mean)),
+        "stars_10deg": RowResult(bootstrap_interval(count_fibers(lab, CIRCLE_DEG, boresights), np.mean)),
         "field_5stars": RowResult(extremum(np.array([brentq(excess_stars, 5, 90, xtol=0.05)]), np.max)),
     }
     # Worst discrepancies without and with the pupil's offset known.
     worst = [
-        [largest_discrepancies_arcsec(scenes[0], testbed, offset_m, known, attitudes).max() for known in (False, True)]
+        [largest_discrepancies_arcsec(scenes[0], lab, offset_m, known, attitudes).max() for known in (False, True)]
         for offset_m in OFFSETS_M
     ]
     caption = "Largest angular discrepancy of a fiber against the camera's offset, with the offset unknown and known."

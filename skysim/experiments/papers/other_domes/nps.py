@@ -20,7 +20,7 @@ from estimator.attitude.solvers import quest
 from estimator.catalog import pair_index
 from estimator.catalog.pair_index import PairIndex
 from estimator.identification.published.master_star import master_star
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey.frames import detect_lights
@@ -30,8 +30,8 @@ from skysim.results.metrics import Summary, proportion
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
 from skysim.scene.sections.light import DomeConfig, FlatSurfaceConfig
-from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.exposure import render_at_rest
+from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import onboard_model, settings
 
 INITIAL_DEG = (-6, -3, 0, 3, 6)
@@ -44,10 +44,10 @@ FITTED_CAMERA_M = np.array([0.30, 0.0, 0.20])
 class OnboardModel(NamedTuple):
     """The tracker's model: the true panel and lever arm, and the nine stars as seen from the level vehicle.
 
-    testbed: the true testbed;  panel : the plane;  vectors : (9, 3) unit, from the bearing;  pairs : their index
+    lab: the true lab;  panel : the plane;  vectors : (9, 3) unit, from the bearing;  pairs : their index
     """
 
-    testbed: Testbed
+    lab: Lab
     panel: LedMap
     vectors: Floats
     pairs: PairIndex
@@ -71,40 +71,40 @@ def build_model(camera_m: Floats | None, seed: int, frames: int) -> OnboardModel
     The catalog is the mean of `frames` frames from the level vehicle.
     """
     scene = loader.load("nps_tas2_ideal")
-    testbed = build_testbed(scene)
+    lab = build_lab(scene)
     assert isinstance(scene.light, DomeConfig)
     assert isinstance(scene.light.surface, FlatSurfaceConfig)
     height_m = scene.light.surface.apex_m
     if camera_m is not None:
-        shift_m = camera_m - testbed.mount.camera_body_m
-        position = testbed.sources.place + np.append(shift_m, 0.0)
+        shift_m = camera_m - lab.camera.mount.camera_body_m
+        position = lab.camera.sources.place + np.append(shift_m, 0.0)
         height_m += shift_m[2]
-        sources, mount = replace(testbed.sources, place=position), replace(testbed.mount, camera_body_m=camera_m)
-        testbed = replace(testbed, sources=sources, mount=mount)
+        sources, mount = replace(lab.camera.sources, place=position), replace(lab.camera.mount, camera_body_m=camera_m)
+        lab = lab.with_camera(sources=sources, mount=mount)
     no_leds = np.empty(0, np.int64), np.empty((0, 3))
     panel = LedMap(*no_leds, np.zeros(3), np.array([np.inf, np.inf, height_m]))
-    rays_of_frames = [rays_body(testbed, seed + n) for n in range(frames)]
+    rays_of_frames = [rays_body(lab, seed + n) for n in range(frames)]
     # Noise changes the order of brightness between frames, so sort by position before averaging.
     sorted_rays = [rays[np.lexsort((rays[:, 1], rays[:, 0]))] for rays in rays_of_frames]
-    mean = np.mean([rays for rays in sorted_rays if len(rays) == len(testbed.sources)], axis=0)
-    vectors = directions(testbed, panel, mean, Rotation.identity())
-    return OnboardModel(testbed, panel, vectors, pair_index.build(vectors, 1.0))
+    mean = np.mean([rays for rays in sorted_rays if len(rays) == len(lab.camera.sources)], axis=0)
+    vectors = directions(lab, panel, mean, Rotation.identity())
+    return OnboardModel(lab, panel, vectors, pair_index.build(vectors, 1.0))
 
 
-def rays_body(testbed: Testbed, seed: int) -> Floats:
+def rays_body(lab: Lab, seed: int) -> Floats:
     """(N, 3) unit vectors in body axes to the stars of one frame from the level vehicle, brightest first."""
-    frame, _ = exposure.render_frame(testbed.in_run(seed), 0)
-    camera = onboard_model.assumed_camera(testbed.scene)
-    lights = detect_lights(settings.assumed_settings(testbed.scene), camera, frame.image_dn)
-    return testbed.mount.cam_from_body.inv().apply(camera.rays(lights.xy_px))
+    frame, _ = render_at_rest(lab.in_run(seed).camera, lab.start)
+    camera = onboard_model.assumed_camera(lab.scene)
+    lights = detect_lights(settings.assumed_settings(lab.scene), camera, frame.image_dn)
+    return lab.camera.mount.cam_from_body.inv().apply(camera.rays(lights.xy_px))
 
 
-def directions(testbed: Testbed, panel: LedMap, rays: Floats, body_from_lab: Rotation) -> Floats:
+def directions(lab: Lab, panel: LedMap, rays: Floats, body_from_lab: Rotation) -> Floats:
     """(N, 3) unit vectors along R_0 + alpha_i b_i in body axes, distances alpha_i from the assumed attitude (eq. 33).
 
     R_0 is the camera's position and b_i the ray of light i; alpha_i is the distance to the panel along the ray.
     """
-    camera_m, lab_from_body = testbed.mount.camera_body_m, body_from_lab.inv()
+    camera_m, lab_from_body = lab.camera.mount.camera_body_m, body_from_lab.inv()
     origin_m = lab_from_body.apply(camera_m)
     intersection_m = on_surface(lab_from_body.apply(rays), origin_m, panel)
     point_m = camera_m + np.linalg.norm(intersection_m - origin_m, axis=1)[:, None] * rays
@@ -113,7 +113,7 @@ def directions(testbed: Testbed, panel: LedMap, rays: Floats, body_from_lab: Rot
 
 def solve(model: OnboardModel, rays: Floats, assumed: Rotation) -> Solution:
     """Solve once: distances from the assumed attitude, master-star identification within 500 arcsec, QUEST."""
-    observed = directions(model.testbed, model.panel, rays, assumed)
+    observed = directions(model.lab, model.panel, rays, assumed)
     # master_star takes the error of a direction; an angle's is sqrt(2) times that.
     match = master_star(observed, model.pairs, SEPARATION_RAD / np.sqrt(2))
     if match is None:
@@ -168,7 +168,7 @@ def solve_series(
     solutions: dict[float, list[Solution]] = {error: [] for error in errors_deg}
     iterated_solutions = []
     for n in range(frames):
-        rays = rays_body(model.testbed, seed + n)
+        rays = rays_body(model.lab, seed + n)
         for error in errors_deg:
             solutions[error].append(solve(model, rays, initial_error(error)))
         iterated_solutions.append(solve_iteratively(model, rays, initial_error(ITERATED_DEG)))

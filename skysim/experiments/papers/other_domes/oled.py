@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +20,7 @@ from skysim.results.metrics import Summary, rms
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
 from skysim.scene.sections.tracker import SurveyErrorsConfig
-from skysim.simulation.testbed import build_testbed, build_tracker
+from skysim.simulation.lab import build_lab, build_tracker
 
 NOISE_PX = 0.1
 STATED_LIGHTS, MANY_LIGHTS = 20, 80
@@ -53,9 +52,9 @@ def build_setup(lights: int) -> Setup:
     """AFIT's camera under its measured dome with randomly placed lights, of which at most `lights` are used."""
     layout = f'{{kind: poisson_disk, spacing: "{SPACING_MM[lights]} mm", cap_deg: {CAP_DEG}}}'
     scene = loader.load("afit_simsat_ideal", {"light.layout": layout, "tracker.centroid_sigma_px": str(NOISE_PX)})
-    testbed = build_testbed(scene)
+    lab = build_lab(scene)
     trial = CentroidTrial(kind="centroids", noise_px=NOISE_PX, lights=lights, tilt_deg=(0, MAX_TILT_DEG))
-    return Setup(testbed, build_tracker(testbed), trial, "")
+    return Setup(lab, build_tracker(lab.camera), trial, "")
 
 
 def solve_random_attitudes(setup: Setup, seeds: Sequence[int]) -> AttitudeErrors:
@@ -69,8 +68,8 @@ def with_surveyed_map(setup: Setup, sigmas: dict[str, str], seed: int) -> Setup:
     """The same dome with a tracker whose map comes from a survey with position errors and slightly rotated axes."""
     rotation_deg = random_stream(seed, 2).normal(0, LEVEL_SIGMA_DEG, 3)
     survey_errors = SurveyErrorsConfig.model_validate(sigmas | {"rotation_deg": rotation_deg.tolist(), "seed": seed})
-    testbed = replace(setup.testbed, scene=with_config(setup.testbed.scene, "tracker", survey=survey_errors))
-    return setup._replace(testbed=testbed, estimator=build_tracker(testbed))
+    lab = setup.lab.with_scene(with_config(setup.lab.scene, "tracker", survey=survey_errors))
+    return setup._replace(lab=lab, estimator=build_tracker(lab.camera))
 
 
 def mean_absolute_error_deg(setup: Setup, sigmas: dict[str, str], seeds: list[list[int]]) -> Summary:

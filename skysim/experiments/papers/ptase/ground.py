@@ -8,7 +8,6 @@ uncalibrated decentering distortion and vibration as the cause of the paper's la
 from __future__ import annotations
 
 import datetime
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import erfa
@@ -16,8 +15,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import ra_dec_roll_rad
+from skysim.core.constants import DAY_S, EARTH_RATE_RAD_S
 from skysim.core.random_streams import JITTER, random_stream
-from skysim.core.types import Floats
+from skysim.core.time import J2000_JD, tt_days, utc_days
+from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.jitter import Vibration
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.intervals import bootstrap_interval, sample_std, symmetric_interval
@@ -26,14 +27,14 @@ from skysim.experiments.study.execution.trials import constant_rate
 from skysim.results.metrics import WRONG_RAD, extremum, proportion, rms
 from skysim.results.plots import INK, MARKS
 from skysim.scene import loader
-from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.exposure import render_frame
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.sources import stars
 from skysim.tracking import factory
 
 SITE_DEG = (-23.2, -45.9)  # latitude, longitude of Sao Jose dos Campos
 UTC_LESS_LOCAL = datetime.timedelta(hours=3)
-TT_LESS_UTC_S, UT1_LESS_UTC_S = 64.184, -0.36  # in October 2003
+UT1_LESS_UTC_S = -0.36  # in October 2003 (IERS)
 LOCAL_TIMES = [datetime.datetime(2003, 10, 2, *at) for at in ((19, 55, 22), (20, 1, 56), (20, 7, 0), (20, 11, 30))]
 ROWS, ANGLES = ("1", "2", "3", "4"), ("ra", "dec", "roll")
 ATTEMPTS = 18
@@ -51,9 +52,9 @@ FITTED_JITTER = "[{kind: line, frequency_hz: 1, rms_arcsec: [22, 22, 22]}]"  # a
 
 def itrs_from_icrs(local: datetime.datetime) -> Rotation:
     """The Earth's attitude: precession, nutation and rotation (SOFA's c2t06a); polar motion is neglected."""
-    days = (local + UTC_LESS_LOCAL - datetime.datetime(2000, 1, 1, 12)) / datetime.timedelta(1)
-    tt, ut1 = days + TT_LESS_UTC_S / erfa.DAYSEC, days + UT1_LESS_UTC_S / erfa.DAYSEC
-    return Rotation.from_matrix(erfa.c2t06a(erfa.DJ00, tt, erfa.DJ00, ut1, 0.0, 0.0))
+    utc = local + UTC_LESS_LOCAL
+    ut1_days = utc_days(utc) + UT1_LESS_UTC_S / DAY_S
+    return Rotation.from_matrix(erfa.c2t06a(J2000_JD, tt_days(utc), J2000_JD, ut1_days, 0.0, 0.0))
 
 
 def cam_from_itrs() -> Rotation:
@@ -107,14 +108,14 @@ def uncalibrated_overrides(direction_rad: float) -> dict[str, str]:
 
 def photograph_and_solve(overrides: dict[str, str], local: list[datetime.datetime], seed: int) -> FrameSolutions:
     """Render and solve a frame at each time from the Earth-fixed camera."""
-    testbed = build_testbed(loader.load("ptase_2003", NIGHT | overrides))
-    tracker, tripod = build_tracker(testbed), cam_from_itrs()
+    lab = build_lab(loader.load("ptase_2003", NIGHT | overrides))
+    tracker, tripod = build_tracker(lab.camera), cam_from_itrs()
     estimated_deg, true_deg = np.full((len(local), 3), np.nan), np.empty((len(local), 3))
     error_rad = np.full(len(local), np.nan)
     for n, time in enumerate(local):
         cam_from_icrs = tripod * itrs_from_icrs(time)
-        testbed_at_time = earth_fixed(at_time(testbed.in_run(seed + n), time), cam_from_icrs)
-        frame, _ = exposure.render_frame(testbed_at_time, 0)
+        lab_then = at_time(lab.in_run(seed + n), time)
+        frame, _ = render_frame(lab_then.camera, earth_fixed(lab_then, cam_from_icrs), 0)
         solution = factory.solve_frame(tracker, frame).attitude
         true_deg[n] = paper_angles_deg(cam_from_icrs)
         if solution.cam_from_ref is not None:
@@ -123,20 +124,19 @@ def photograph_and_solve(overrides: dict[str, str], local: list[datetime.datetim
     return FrameSolutions(local, estimated_deg, true_deg, error_rad)
 
 
-def at_time(testbed: Testbed, local: datetime.datetime) -> Testbed:
-    """The test bed under the air and the Moon of a local time."""
-    return replace(testbed, scene=testbed.scene.model_copy(update={"start_time": local + UTC_LESS_LOCAL}))
+def at_time(lab: Lab, local: datetime.datetime) -> Lab:
+    """The lab under the air and the Moon of a local time."""
+    return lab.with_scene(lab.scene.model_copy(update={"start_time": local + UTC_LESS_LOCAL}))
 
 
-def earth_fixed(testbed: Testbed, cam_from_icrs: Rotation) -> Testbed:
-    """Testbed with a motion around the first frame's exposure: the given attitude at mid-exposure, rotation at the
+def earth_fixed(lab: Lab, cam_from_icrs: Rotation) -> Trajectory:
+    """A motion around the first frame's exposure: the given attitude at mid-exposure, rotation at the
     sidereal rate, and the scene's vibration."""
-    body_at_middle = cam_from_icrs.inv() * testbed.mount.cam_from_body
-    earth_rad_s = 2 * np.pi * 1.00273781191135448 / erfa.DAYSEC
+    body_at_middle = cam_from_icrs.inv() * lab.camera.mount.cam_from_body
     # The sky turns at the sidereal rate about the celestial pole, the z axis of ICRS (precession neglected).
-    rate_body = earth_rad_s * body_at_middle.inv().apply([0.0, 0.0, 1.0])
-    vibration = Vibration.draw(testbed.scene.motion, random_stream(testbed.scene.seed, JITTER, 0))
-    return replace(testbed, trajectory=vibration.add_to(constant_rate(testbed.scene, body_at_middle, rate_body)))
+    rate_body = EARTH_RATE_RAD_S * body_at_middle.inv().apply([0.0, 0.0, 1.0])
+    vibration = Vibration.draw(lab.scene.motion, random_stream(lab.scene.seed, JITTER, 0))
+    return vibration.add_to(constant_rate(lab.scene, body_at_middle, rate_body))
 
 
 def table_2(options: ExperimentOptions) -> ExperimentResult:

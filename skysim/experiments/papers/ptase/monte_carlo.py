@@ -24,9 +24,9 @@ from estimator.identification.published.fialho import (
     search,
     search_options,
 )
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.jit import jit
 from skysim.core.paths import CATALOGS
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult

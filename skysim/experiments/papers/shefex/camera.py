@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.detection.detect import DETECTORS
 from estimator.detection.shefex import maximum_scan, sequential_scan
+from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources, Trajectory
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
@@ -24,8 +25,9 @@ from skysim.results.metrics import Summary, exact, quantile
 from skysim.results.plots import INK, MARKS
 from skysim.scene.loader import load
 from skysim.scene.sections.light import UniformGlowConfig
-from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.exposure import render_frame
+from skysim.simulation.lab import StarCamera, build_lab
+from skysim.simulation.timing import exposure_window
 from skysim.tracking.exposure_control import ExposureController
 
 REPEATS = 15
@@ -54,7 +56,7 @@ def scan_times(options: ExperimentOptions) -> ExperimentResult:
 def scan_time_s(scan: Callable[..., Any], image: NDArray[Any]) -> float:
     """Minimum run time of REPEATS repeats in seconds; other load on the machine can only lengthen a repeat."""
     # Background noise from the median absolute deviation, 1.4826 MAD = sigma for a normal distribution.
-    level, noise = float(np.median(image)), 1.4826 * float(np.median(np.abs(image - np.median(image))))
+    level, noise = float(np.median(image)), SIGMA_PER_MAD * float(np.median(np.abs(image - np.median(image))))
     times_s = []
     for _ in range(REPEATS + 1):  # the first one compiles
         begin = time.perf_counter()
@@ -118,31 +120,33 @@ class ExposureLoop:
         defaults = {"tracker.exposure_control": f"{{mean_dn: {MEAN_DN}}}", "tracker.detector": "sequential"}
         fixed = exposure_override(start_ms) | {"tracker.brightest": str(MAX_CENTROIDS)}
         scene = load("shefex2", defaults | overrides | fixed)
-        self.testbed = replace(build_testbed(scene), trajectory=Trajectory.at_rest(lab_from_body, 100.0))
+        self.lab = build_lab(scene)
+        self.rest = Trajectory.at_rest(lab_from_body, 100.0)
         self.controller, self.frames = ExposureController(scene), 0
 
     def take_frame(self, glare_e_s: float = 0.0, planets: int = 0) -> float:
         """Render a frame with stray light and planets; return the next commanded exposure time in ms."""
-        testbed = self.testbed
+        lab = self.lab
         if glare_e_s:
-            glow = (*testbed.scene.background, UniformGlowConfig(kind="uniform", e_s=glare_e_s))
-            testbed = replace(testbed, scene=testbed.scene.model_copy(update={"background": glow}))
+            glow = (*lab.scene.background, UniformGlowConfig(kind="uniform", e_s=glare_e_s))
+            lab = lab.with_scene(lab.scene.model_copy(update={"background": glow}))
         if planets:
-            testbed = replace(testbed, sources=with_planets(testbed, planets))
-        frame, _ = exposure.render_frame(testbed, self.frames, exposure_s=self.controller.exposure_s)
+            lab = lab.with_camera(sources=with_planets(lab.camera, self.rest, planets))
+        window = exposure_window(lab.scene, self.frames, self.controller.exposure_s)
+        frame, _ = render_frame(lab.camera, self.rest, self.frames, window=window)
         self.frames += 1
         self.controller.update(frame)
         return 1e3 * self.controller.exposure_s
 
 
-def with_planets(testbed: Testbed, count: int) -> Sources:
+def with_planets(camera: StarCamera, rest: Trajectory, count: int) -> Sources:
     """The light sources, with the `count` brightest stars well inside the detector raised to a planet's magnitude."""
-    visible, size_px = exposure.render_frame(testbed, 0)[1].sources, np.array(testbed.canvas.shape[::-1])
+    visible, size_px = render_frame(camera, rest, 0)[1].sources, np.array(camera.canvas.shape[::-1])
     inside = np.all((visible.xy_px > EDGE_PX) & (visible.xy_px < size_px - EDGE_PX), axis=1)
     chosen = visible.id[inside][np.argsort(-visible.electrons[inside])[:count]]
-    is_planet = np.isin(testbed.sources.id, chosen)
-    factor = np.where(is_planet, 10 ** (0.4 * (testbed.sources.magnitude - PLANET_MAG)), 1.0)
-    return replace(testbed.sources, strength=testbed.sources.strength * factor)
+    is_planet = np.isin(camera.sources.id, chosen)
+    factor = np.where(is_planet, 10 ** (0.4 * (camera.sources.magnitude - PLANET_MAG)), 1.0)
+    return replace(camera.sources, strength=camera.sources.strength * factor)
 
 
 def random_attitudes(count: int, seed: int) -> Rotation:

@@ -14,7 +14,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.experiments.papers.compare import Drawing, ExperimentOptions, ExperimentResult, RowResult, with_cause
 from skysim.experiments.papers.intervals import bootstrap_of_means
-from skysim.experiments.papers.shefex.setup import PRINTED_FIELD_RAD, PUBLISHED, paper_catalog, stars, testbed_with
+from skysim.experiments.papers.shefex.setup import PRINTED_FIELD_RAD, PUBLISHED, lab_with, paper_catalog, stars
 from skysim.experiments.study.execution import detections
 from skysim.results.metrics import exact
 from skysim.results.plots import INK
@@ -63,9 +63,9 @@ def count_pairs(star_catalog: StarCatalog) -> int:
 
 def count_in_fields(catalogs: tuple[StarCatalog, ...], options: ExperimentOptions) -> Floats:
     """(N, K) number of stars of each catalog on the detector at N random attitudes."""
-    testbeds = [testbed_with(star_catalog) for star_catalog in catalogs]
+    labs = [lab_with(star_catalog) for star_catalog in catalogs]
     attitudes = Rotation.random(options.trials(2000, 300), rng=random_stream(options.seed, 0))
-    counts = [[len(detections.visible_sources(one, attitude)[0]) for one in testbeds] for attitude in attitudes]
+    counts = [[len(detections.visible_sources(one, attitude)[0]) for one in labs] for attitude in attitudes]
     return np.array(counts, float)
 
 

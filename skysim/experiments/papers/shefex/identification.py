@@ -32,7 +32,7 @@ from skysim.experiments.papers.shefex.setup import (
     plot_curve,
     random_fields,
     search_options,
-    shefex_testbed,
+    shefex_lab,
 )
 from skysim.experiments.study.report.figures import logarithmic
 from skysim.results.metrics import Summary, exact, extremum, proportion
@@ -71,7 +71,7 @@ def identify(
     At most 15 lights are used: stars in the order of brightness, with spikes inserted at random ranks. Work is the
     number of compared angles: those of candidates, and three for each triangle tested.
     """
-    camera = onboard_model.calibration(shefex_testbed().scene.camera)
+    camera = onboard_model.calibration(shefex_lab().scene.camera)
     xy_px = field.xy_px + centroid_px * rng.standard_normal(field.xy_px.shape)
     if spikes:
         spikes_px = rng.random((spikes, 2)) * [camera.width_px, camera.height_px] - 0.5
@@ -264,7 +264,7 @@ GATE_ANGLES_DEG = {"2": 2.0, "5": 5.0, "10": 10.0, "18": 18.4}
 
 def count_triangles(rng: np.random.Generator) -> int:
     """Number of base triangles that a search tests for 15 spikes."""
-    camera, counters = onboard_model.calibration(shefex_testbed().scene.camera), np.zeros(3, np.int64)
+    camera, counters = onboard_model.calibration(shefex_lab().scene.camera), np.zeros(3, np.int64)
     rays = camera.rays(rng.random((MAX_CENTROIDS, 2)) * [camera.width_px, camera.height_px] - 0.5)
     search_limits = search_options(pairs(), CHOSEN_COS_ERROR, MAX_CENTROIDS, -np.inf)
     search(rays, pairs(), search_limits, counters)

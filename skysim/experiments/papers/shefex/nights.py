@@ -25,7 +25,7 @@ from skysim.experiments.study.plan import FrameTrial
 from skysim.results import metrics
 from skysim.results.metrics import Summary, proportion
 from skysim.scene.loader import load
-from skysim.simulation.testbed import build_testbed, build_tracker
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.tracking import factory
 
 MOON_DEG = (90.0, 20.0)  # right ascension, declination
@@ -71,14 +71,14 @@ def render_frames(
     overrides: dict[str, str], rate_deg_s: float, count: int, seed: int
 ) -> Iterator[tuple[Setup, Frame, Truth]]:
     """Yield frames at random attitudes of the northern sky, not near the Moon; the same attitudes for every rate."""
-    testbed = build_testbed(load("shefex2", ONE_FRAME | overrides))
+    lab = build_lab(load("shefex2", ONE_FRAME | overrides))
     trial = FrameTrial(kind="frames", rate_deg_s=rate_deg_s, dec_deg=NORTH_DEG)
-    setup = Setup(testbed, build_tracker(testbed), trial, "")
+    setup = Setup(lab, build_tracker(lab.camera), trial, "")
     moon_direction, trial_seed, rendered = background.direction(*MOON_DEG), 1_000_000 * seed, 0
     while rendered < count:
         trial_seed += 1
         lab_from_body = trials.random_attitude(setup, trials.streams(setup, trial_seed)[0])
-        boresight = (lab_from_body * testbed.mount.cam_from_body.inv()).apply([[0.0, 0.0, 1.0]])
+        boresight = (lab_from_body * lab.camera.mount.cam_from_body.inv()).apply([[0.0, 0.0, 1.0]])
         if background.angular_separation_deg(boresight, moon_direction)[0] < FROM_MOON_DEG:
             continue
         frame, truth, _ = trials.render_trial_frame(setup, trial_seed)
@@ -91,7 +91,7 @@ def process_frames(overrides: dict[str, str], rate_deg_s: float, count: int, see
     rows = []
     for setup, frame, truth in render_frames(overrides, rate_deg_s, count, seed):
         paper, low_threshold = (
-            processing_chain(CATALOG, sigma, setup.testbed.scene.camera.focal_px).solve(frame.image_dn)
+            processing_chain(CATALOG, sigma, setup.lab.scene.camera.focal_px).solve(frame.image_dn)
             for sigma in (SIGMA, LOW_SIGMA)
         )
         ours = factory.solve_frame(setup.estimator, frame).attitude
@@ -186,7 +186,7 @@ def draw_frame(seed: int, fig: Any) -> None:
     """Draw the first frame in which the paper's chain identifies at least eight stars, or the last of forty."""
     axes = fig.subplots()
     for setup, frame, _ in render_frames(FULL_MOON | exposure_override(40), 0.0, 40, seed):
-        result = processing_chain(CATALOG, SIGMA, setup.testbed.scene.camera.focal_px).solve(frame.image_dn)
+        result = processing_chain(CATALOG, SIGMA, setup.lab.scene.camera.focal_px).solve(frame.image_dn)
         if len(result.observed) >= 8:
             break
     low, high = np.percentile(frame.image_dn, [50, 99.95])

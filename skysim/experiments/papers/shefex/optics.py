@@ -17,13 +17,13 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Trajectory
 from skysim.experiments.papers.compare import ExperimentOptions, RowResult, format_summary
 from skysim.experiments.papers.intervals import bootstrap_interval, symmetric_interval
-from skysim.experiments.papers.shefex.setup import apparent, shefex_testbed, stars
+from skysim.experiments.papers.shefex.setup import apparent, shefex_lab, stars
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.setups import Setup
 from skysim.experiments.study.plan import FrameTrial
 from skysim.results.metrics import Summary, exact
 from skysim.scene.loader import load
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking import onboard_model
 
 NOMINAL_FOCAL_MM, TRUE_FOCAL_MM = 25.0, 24.95
@@ -33,8 +33,8 @@ EXPOSURE_S = 0.05
 
 def optics_results(options: ExperimentOptions) -> dict[str, RowResult]:
     """Answers that need no night-sky frames."""
-    horizontal, vertical, diagonal = field_deg(onboard_model.calibration(shefex_testbed().scene.camera))
-    absorbed = star_image(ground_testbed(), 0.05).sum() / star_image(shefex_testbed(), 0.035).sum()
+    horizontal, vertical, diagonal = field_deg(onboard_model.calibration(shefex_lab().scene.camera))
+    absorbed = star_image(ground_lab(), 0.05).sum() / star_image(shefex_lab(), 0.035).sum()
     results = {
         "field_h": RowResult(exact(horizontal)),
         "field_v": RowResult(exact(vertical)),
@@ -60,14 +60,14 @@ def field_deg(camera: Camera) -> tuple[float, float, float]:
 
 
 @cache
-def ground_testbed() -> Testbed:
+def ground_lab() -> Lab:
     """The camera below an atmosphere that absorbs 30 %."""
-    transmission = 0.7 * shefex_testbed().scene.camera.gray_transmission
-    return build_testbed(load("shefex2", {"camera.transmission": str(transmission)}))
+    transmission = 0.7 * shefex_lab().scene.camera.gray_transmission
+    return build_lab(load("shefex2", {"camera.transmission": str(transmission)}))
 
 
 def star_image(
-    testbed: Testbed, exposure_s: float, rate_deg_s: float = 0.0, place_rad: tuple[float, float] = (0.0, 0.0),
+    lab: Lab, exposure_s: float, rate_deg_s: float = 0.0, place_rad: tuple[float, float] = (0.0, 0.0),
     axis_rad: float = 0.0,
 ) -> Floats:  # fmt: skip
     """(H, W) noise-free electrons of the catalog's brightest star alone, with the camera rotating across the boresight.
@@ -75,19 +75,19 @@ def star_image(
     place_rad : offset of the star from the boresight, right and down, at mid-exposure
     axis_rad : direction of the rotation axis, from camera x towards y
     """
-    brightest = testbed.sources.take(np.array([np.argmax(testbed.sources.strength)]))
+    brightest = lab.camera.sources.take(np.array([np.argmax(lab.camera.sources.strength)]))
     star_direction = brightest.place[0, :3]
     roll = Rotation.align_vectors([[0.0, 0.0, 1.0]], [star_direction])[0]
     cam_from_lab = Rotation.from_rotvec([-place_rad[1], place_rad[0], 0.0]) * roll
     # A rate about an axis in the image plane moves the star along a straight line.
     rate_cam = np.radians(rate_deg_s) * np.array([np.cos(axis_rad), np.sin(axis_rad), 0.0])
-    lab_from_body = cam_from_lab.inv() * testbed.mount.cam_from_body
-    rate_body = testbed.mount.cam_from_body.inv().apply(rate_cam)
+    lab_from_body = cam_from_lab.inv() * lab.camera.mount.cam_from_body
+    rate_body = lab.camera.mount.cam_from_body.inv().apply(rate_cam)
     t_s = np.linspace(-0.01, exposure_s + 0.01, trials.KNOTS)
     path = lab_from_body * Rotation.from_rotvec(np.outer(t_s - exposure_s / 2, rate_body))
-    image = np.zeros(testbed.canvas.shape)
+    image = np.zeros(lab.camera.canvas.shape)
     trajectory = Trajectory(t_s, path, np.tile(rate_body, (len(t_s), 1)))
-    render(image, brightest, testbed.optics, trajectory, testbed.mount, Window(0.0, exposure_s))
+    render(image, brightest, lab.camera.optics, trajectory, lab.camera.mount, Window(0.0, exposure_s))
     return image
 
 
@@ -102,7 +102,7 @@ def variance_px2(image: Floats) -> Floats:
 
 def smear_px(rate_deg_s: float) -> float:
     """Length L of a streak in pixels: smear along a line adds L^2 / 12 to the variance of the star at rest."""
-    moving, at_rest = (variance_px2(star_image(shefex_testbed(), EXPOSURE_S, rate))[0] for rate in (rate_deg_s, 0.0))
+    moving, at_rest = (variance_px2(star_image(shefex_lab(), EXPOSURE_S, rate))[0] for rate in (rate_deg_s, 0.0))
     return float(np.sqrt(12 * (moving - at_rest)))
 
 
@@ -111,12 +111,12 @@ def peak_loss(rate_deg_s: float, count: int, seed: int) -> RowResult:
 
     The note gives the mean over random positions in the pixel and random directions.
     """
-    rng, pixel_rad = random_stream(seed, 4), 1 / shefex_testbed().optics.camera.focal_px
+    rng, pixel_rad = random_stream(seed, 4), 1 / shefex_lab().camera.optics.camera.focal_px
     places = [((0.0, 0.0), np.pi / 2)]
     places += [(tuple(rng.uniform(-0.5, 0.5, 2) * pixel_rad), rng.uniform(0, 2 * np.pi)) for _ in range(count)]
     loss_mag = []
     for place, axis_rad in places:
-        peaks = [star_image(shefex_testbed(), EXPOSURE_S, rate, place, axis_rad).max() for rate in (0.0, rate_deg_s)]
+        peaks = [star_image(shefex_lab(), EXPOSURE_S, rate, place, axis_rad).max() for rate in (0.0, rate_deg_s)]
         loss_mag.append(2.5 * np.log10(peaks[0] / peaks[1]))
     mean_note = format_summary(bootstrap_interval(np.array(loss_mag[1:]), np.mean))
     return RowResult(exact(loss_mag[0]), f"mean over positions in the pixel and directions: {mean_note}")
@@ -124,8 +124,8 @@ def peak_loss(rate_deg_s: float, count: int, seed: int) -> RowResult:
 
 def blur_px() -> float:
     """Diameter D in pixels of a star's blur disk, 0.1 mm out of focus: a uniform disk adds D^2 / 16 per axis."""
-    testbeds = build_testbed(load("shefex2", out_of_focus(DEFOCUS_M))), shefex_testbed()
-    defocused, sharp = (variance_px2(star_image(one, EXPOSURE_S)).mean() for one in testbeds)
+    labs = build_lab(load("shefex2", out_of_focus(DEFOCUS_M))), shefex_lab()
+    defocused, sharp = (variance_px2(star_image(one, EXPOSURE_S)).mean() for one in labs)
     return float(4 * np.sqrt(defocused - sharp))
 
 
@@ -134,17 +134,17 @@ def out_of_focus(defocus_m: float) -> dict[str, str]:
 
     By the thin-lens equation, 1 / distance = 1 / f - 1 / (f + defocus).
     """
-    focal_m = shefex_testbed().scene.camera.focal_length_m
+    focal_m = shefex_lab().scene.camera.focal_length_m
     return {"camera.focus": f"{1 / (1 / focal_m - 1 / (focal_m + defocus_m)):.9g} m"}
 
 
 def calibrated_focal_mm(options: ExperimentOptions) -> tuple[Summary, str]:
     """Focal length in mm by our star-field calibration, of a 24.95 mm lens with a nominal 25 mm; with a note."""
     overrides = {"camera.focal_length": f"{TRUE_FOCAL_MM} mm", "exposure.time": "50 ms"}
-    testbed = build_testbed(load("shefex2", overrides | {"exposure.first": "10 ms", "exposure.frames": "1"}))
-    setup = Setup(testbed, build_tracker(testbed), FrameTrial(kind="frames"), "")
-    nominal_camera = onboard_model.calibration(shefex_testbed().scene.camera)
-    detector = testbed.scene.camera.detector
+    lab = build_lab(load("shefex2", overrides | {"exposure.first": "10 ms", "exposure.frames": "1"}))
+    setup = Setup(lab, build_tracker(lab.camera), FrameTrial(kind="frames"), "")
+    nominal_camera = onboard_model.calibration(shefex_lab().scene.camera)
+    detector = lab.scene.camera.detector
     settings = Settings(gain_e_dn=detector.gain_e_dn, saturation=saturation_dn(detector))
     first_seed = 1_000_000 * options.seed
     rendered = (trials.render_trial_frame(setup, first_seed + n)[0] for n in range(options.trials(40, 8)))
@@ -154,7 +154,7 @@ def calibrated_focal_mm(options: ExperimentOptions) -> tuple[Summary, str]:
         return StarTracker(camera, stars(), apparent(stars()), settings, uncertainty)
 
     calibrated = self_calibrate(frames, tracker, nominal_camera, 0.01, EXPOSURE_S)
-    mm_per_px = 1e3 * testbed.scene.camera.pixel_m
+    mm_per_px = 1e3 * lab.scene.camera.pixel_m
     value = calibrated.camera.focal_px * mm_per_px
     half_width = 1.96 * mm_per_px * float(np.sqrt(calibrated.covariance[0, 0]))
     note = f"from {len(frames)} frames, starting from {NOMINAL_FOCAL_MM:g} mm"

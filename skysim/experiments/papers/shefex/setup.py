@@ -26,7 +26,7 @@ from skysim.experiments.study.execution import detections
 from skysim.results.metrics import Summary
 from skysim.results.plots import INK, MARKS
 from skysim.scene.loader import load
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import onboard_model
 
 MAX_CENTROIDS = 15
@@ -38,9 +38,9 @@ PRINTED_FIELD_RAD = np.radians(18.57)
 
 
 @cache
-def shefex_testbed() -> Testbed:
-    """The scene's testbed under the stars of the paper's catalog."""
-    return build_testbed(load("shefex2", {"light.catalog": "hipparcos_hp6.5"}))
+def shefex_lab() -> Lab:
+    """The scene's lab under the stars of the paper's catalog."""
+    return build_lab(load("shefex2", {"light.catalog": "hipparcos_hp6.5"}))
 
 
 @cache
@@ -55,21 +55,21 @@ def paper_catalog(name: str) -> StarCatalog:
     return shefex.CATALOGS[name](stars())
 
 
-def testbed_with(star_catalog: StarCatalog) -> Testbed:
-    """The scene's testbed with the stars of a catalog only."""
-    testbed = shefex_testbed()
-    return replace(testbed, sources=testbed.sources.take(np.isin(testbed.sources.id, star_catalog.id)))
+def lab_with(star_catalog: StarCatalog) -> Lab:
+    """The scene's lab with the stars of a catalog only."""
+    lab = shefex_lab()
+    return lab.with_camera(sources=lab.camera.sources.take(np.isin(lab.camera.sources.id, star_catalog.id)))
 
 
 def apparent(star_catalog: StarCatalog) -> Floats:
     """(N, 3) apparent directions at the scene's start time."""
-    return catalog.apparent(star_catalog, catalog.on_earth(shefex_testbed().scene.start_time))
+    return catalog.apparent(star_catalog, catalog.on_earth(shefex_lab().scene.start_time))
 
 
 @cache
 def pairs() -> PairIndex:
     """Pair index of the chosen catalog, up to the field's diagonal."""
-    camera = onboard_model.calibration(shefex_testbed().scene.camera)
+    camera = onboard_model.calibration(shefex_lab().scene.camera)
     return pair_index.build(apparent(paper_catalog("chosen")), camera.diagonal_rad)
 
 
@@ -88,7 +88,7 @@ class ProcessingChain:
     """
 
     def __init__(self, name: str, threshold_sigma: float, focal_px: float) -> None:
-        scene = shefex_testbed().scene
+        scene = shefex_lab().scene
         self.camera = replace(onboard_model.calibration(scene.camera), focal_px=focal_px)
         self.index = pair_index.build(apparent(paper_catalog(name)), self.camera.diagonal_rad)
         self.settings = Settings(
@@ -141,12 +141,12 @@ class Field(NamedTuple):
 
 def random_fields(count: int, seed: int) -> list[Field]:
     """Random attitudes over the whole sky, with the projected stars of the chosen catalog."""
-    testbed = testbed_with(paper_catalog("chosen"))
+    lab = lab_with(paper_catalog("chosen"))
     result = []
     for lab_from_body in Rotation.random(count, rng=random_stream(seed, 0)):
-        xy_px, electrons = detections.visible_sources(testbed, lab_from_body)
+        xy_px, electrons = detections.visible_sources(lab, lab_from_body)
         order = np.argsort(-electrons, kind="stable")
-        result.append(Field(xy_px[order], testbed.mount.cam_from_body * lab_from_body.inv()))
+        result.append(Field(xy_px[order], lab.camera.mount.cam_from_body * lab_from_body.inv()))
     return result
 
 

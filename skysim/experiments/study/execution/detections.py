@@ -22,7 +22,8 @@ from skysim.core.types import Floats
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import occlusion_test
-from skysim.simulation.testbed import Testbed, exposure_window, sky_during
+from skysim.simulation.lab import Lab, sky_during
+from skysim.simulation.timing import exposure_window
 from skysim.sources.dome.led import lit_moments_s
 
 LEAST_SIGMA_PX = 1e-3
@@ -32,7 +33,7 @@ FLUX_NOISE = 0.02  # relative, of a light in a frame; above that of rendered one
 class View(NamedTuple):
     """The visible sources whose center is on the detector at one attitude, without occluded ones.
 
-    rows : (N,) in `testbed.sources`;  xy_px : (N, 2);  electrons : (N,) photo-electrons of an exposure
+    rows : (N,) in `lab.camera.sources`;  xy_px : (N, 2);  electrons : (N,) photo-electrons of an exposure
     """
 
     rows: NDArray[np.int64]
@@ -40,36 +41,36 @@ class View(NamedTuple):
     electrons: Floats
 
 
-def visible_sources(testbed: Testbed, lab_from_body: Rotation) -> tuple[Floats, Floats]:
+def visible_sources(lab: Lab, lab_from_body: Rotation) -> tuple[Floats, Floats]:
     """(N, 2) pixel positions and (N,) photo-electrons of the visible sources at one attitude."""
-    (view,) = visible_rows(testbed, Rotation.concatenate([lab_from_body]))
+    (view,) = visible_rows(lab, Rotation.concatenate([lab_from_body]))
     return view.xy_px, view.electrons
 
 
-def visible_rows(testbed: Testbed, lab_from_body: Rotation, t_s: float = 0.0) -> list[View]:
-    """The view at each of B attitudes, all at one time. The sources near all fields are projected at once."""
-    R_cam_from_body, camera_body_m = testbed.mount.cam_from_body.as_matrix(), testbed.mount.camera_body_m
+def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[View]:
+    """The view at each of B attitudes, all at the scene's start. The sources near all fields are projected at once."""
+    R_cam_from_body, camera_body_m = lab.camera.mount.cam_from_body.as_matrix(), lab.camera.mount.camera_body_m
     R_lab_from_body = lab_from_body.as_matrix()
     poses = Poses(
         np.array([R_cam_from_body @ each.T for each in R_lab_from_body]),
         np.array([each @ camera_body_m for each in R_lab_from_body]),
     )
     each_pose = (Poses(*(part[n : n + 1] for part in poses)) for n in range(len(R_lab_from_body)))
-    rows = [in_view(testbed.sources, testbed.optics, pose, reach=0.0) for pose in each_pose]
+    rows = [in_view(lab.camera.sources, lab.camera.optics, pose, reach=0.0) for pose in each_pose]
     ends = np.cumsum([0, *map(len, rows)])
-    near, sky = testbed.sources.take(np.concatenate(rows)), sky_during(testbed, t_s)
+    near, sky = lab.camera.sources.take(np.concatenate(rows)), sky_during(lab.camera, 0.0)
     if sky:
         near = sky.stars_seen(near)
-    xy_px, distance_m, cos_out, cos_in = project_each(near, testbed.optics, poses, ends)
-    rate_e_s = rates_e_s(near, testbed.optics, testbed.emitter, distance_m, cos_out, cos_in)
-    electrons = rate_e_s * np.minimum(near.on_s / near.period_s, 1.0) * testbed.scene.exposure.time_s
+    xy_px, distance_m, cos_out, cos_in = project_each(near, lab.camera.optics, poses, ends)
+    rate_e_s = rates_e_s(near, lab.camera.optics, lab.camera.emitter, distance_m, cos_out, cos_in)
+    electrons = rate_e_s * np.minimum(near.on_s / near.period_s, 1.0) * lab.scene.exposure.time_s
     x, y = xy_px.T
-    width_px, height_px = testbed.canvas.shape[::-1]
+    width_px, height_px = lab.camera.canvas.shape[::-1]
     visible = (x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5)
     views = []
     for n, (begin, end) in enumerate(itertools.pairwise(ends.tolist())):
         chosen = begin + np.flatnonzero(visible[begin:end])
-        if occludes := occlusion_test(testbed, lab_from_body[n], sky):
+        if occludes := occlusion_test(lab.camera, lab_from_body[n], sky):
             chosen = chosen[~occludes(near.place[chosen])]
         views.append(View(rows[n][chosen - begin], xy_px[chosen], electrons[chosen]))
     return views
@@ -102,37 +103,37 @@ def simulate_detections(
 
 
 def solve_coded(
-    testbed: Testbed, tracker: CodedTracker, trial: CentroidTrial, lab_from_body: Rotation, rng: np.random.Generator
+    lab: Lab, tracker: CodedTracker, trial: CentroidTrial, lab_from_body: Rotation, rng: np.random.Generator
 ) -> tuple[Floats, Report]:
     """(N, 2) true pixel positions, and the report of the first frame with an attitude, or of the code's last one."""
-    testbed = testbed.in_run(int(rng.integers(2**62)))
-    ((rows, xy_px, electrons),) = visible_rows(testbed, Rotation.concatenate([lab_from_body]))
+    lab = lab.in_run(int(rng.integers(2**62)))
+    ((rows, xy_px, electrons),) = visible_rows(lab, Rotation.concatenate([lab_from_body]))
     electrons = electrons * 10 ** (0.4 * trial.magnitude_sigma * rng.standard_normal(len(rows)))
     per_frame = trial.model_copy(update={"magnitude_sigma": 0.0})  # the error of a brightness is that of the LED
     tracker.last_s = None  # begins anew
     first = int(rng.integers(tracker.code.bits))
     for frame in range(first, first + tracker.code.bits):
-        light_e = electrons * brightness(testbed, rows, frame) * (1 + FLUX_NOISE * rng.standard_normal(len(rows)))
+        light_e = electrons * brightness(lab, rows, frame) * (1 + FLUX_NOISE * rng.standard_normal(len(rows)))
         light_e += np.sqrt(np.maximum(light_e, 0)) * rng.standard_normal(len(rows))
         lit = light_e > 0
-        detections = simulate_detections(per_frame, xy_px[lit], light_e[lit], testbed.scene, rng)
-        window = exposure_window(testbed.scene, frame)
-        middle_s = window.middle_s(testbed.scene.camera.height_px)
+        detections = simulate_detections(per_frame, xy_px[lit], light_e[lit], lab.scene, rng)
+        window = exposure_window(lab.scene, frame)
+        middle_s = window.middle_s(lab.scene.camera.height_px)
         attitude = tracker.solve_centroids(detections, exposure_s=window.exposure_s, t_s=middle_s, frame=frame)
         if attitude.solved:
             break
     return xy_px, Report(attitude, detections)
 
 
-def brightness(testbed: Testbed, rows: NDArray[np.int64], frame: int) -> Floats:
+def brightness(lab: Lab, rows: NDArray[np.int64], frame: int) -> Floats:
     """(K,) light of LEDs in the exposure of a frame over their mean light: what code, pulses and filters leave."""
-    window, steady = exposure_window(testbed.scene, frame), testbed.sources.take(rows)
+    window, steady = exposure_window(lab.scene, frame), lab.camera.sources.take(rows)
     begin_s, end_s = window.open_s, window.open_s + window.exposure_s
-    shown = testbed.sources
-    if testbed.clocks:
-        shown = testbed.clocks.lights_at(shown, (begin_s + end_s) / 2, window.exposure_s)
-    if testbed.codes:
-        shown = testbed.codes.shown(shown, begin_s, window.exposure_s, frame)
+    shown = lab.camera.sources
+    if lab.camera.clocks:
+        shown = lab.camera.clocks.lights_at(shown, (begin_s + end_s) / 2, window.exposure_s)
+    if lab.camera.codes:
+        shown = lab.camera.codes.shown(shown, begin_s, window.exposure_s, frame)
     shown = shown.take(rows)
     pulses = zip(shown.period_s.tolist(), shown.start_s.tolist(), shown.on_s.tolist(), strict=True)
     lit_s = np.array([lit_moments_s(begin_s, end_s, *one)[0] for one in pulses])

@@ -15,13 +15,13 @@ from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core import quaternion
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.jit import jit
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats, Telemetry, Truth
 from skysim.results import metrics
 from skysim.results.telemetry_report import attitude_error_deg
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 from skysim.tracking import factory
 
 # A centroid is a light's own if it is within this distance of its true image, and half of its streak. Errors of
@@ -121,14 +121,14 @@ def true_lights(truth: Truth) -> TrueLights:
     return TrueLights(truth.lab_from_body, sources.xy_px, sources.flux_xy_px, sources.streak_px)
 
 
-def score(testbed: Testbed, estimator: factory.Estimator, report: Report, lights: TrueLights) -> Outcome:
+def score(lab: Lab, estimator: factory.Estimator, report: Report, lights: TrueLights) -> Outcome:
     """Outcome of one frame from the tracker's report and the truth.
 
     Quaternions are NumPy arrays because SciPy's Rotation would take a tenth of a trial's time.
     """
     solution, centroids_px = report.attitude, report.centroids.xy_px
     lab_from_body = quaternion.from_rotation(lights.lab_from_body)
-    cam_from_body = quaternion.from_rotation(testbed.mount.cam_from_body)
+    cam_from_body = quaternion.from_rotation(lab.camera.mount.cam_from_body)
     cam_from_lab = quaternion.multiply(cam_from_body, quaternion.inverse(lab_from_body))
     streak_px = math.nan
     if lights.streak_px is not None and len(lights.streak_px):
@@ -143,14 +143,14 @@ def score(testbed: Testbed, estimator: factory.Estimator, report: Report, lights
         **dict.fromkeys(IDENTITY, 0.0 if own_tracker else math.nan),
         "centroid_px": centroid_error_px(centroids_px, lights.flux_xy_px, reach_px),
         "streak_px": streak_px,
-        **directions(testbed, lab_from_body, cam_from_lab),
+        **directions(lab, lab_from_body, cam_from_lab),
     }
     if solution.cam_from_ref is None:
         return Outcome(solution.status, 1, **common)
     error, nees = error_and_nees(solution, cam_from_lab)
     wrong = metrics.is_wrong(math.hypot(*error), math.inf if math.isnan(nees) else nees)
     if solution.match is not None and own_tracker:
-        claimed_px = claimed_image_px(testbed, estimator, solution.match, lab_from_body, cam_from_lab)
+        claimed_px = claimed_image_px(lab, estimator, solution.match, lab_from_body, cam_from_lab)
         observed_px = centroids_px[solution.match.observed]
         wrong_matches = count_wrong_matches(observed_px, claimed_px, lights, reach_px)
         allowed = nees <= metrics.OVERCONFIDENT_NEES
@@ -173,7 +173,7 @@ def error_and_nees(solution: Attitude, cam_from_lab: Floats) -> tuple[Floats, fl
 
 
 def claimed_image_px(
-    testbed: Testbed, estimator: factory.Estimator, match: StarMatch, lab_from_body: Floats, cam_from_lab: Floats
+    lab: Lab, estimator: factory.Estimator, match: StarMatch, lab_from_body: Floats, cam_from_lab: Floats
 ) -> Floats:
     """(K, 2) true images at mid-exposure of the stars or LEDs with which the tracker matched its lights.
 
@@ -181,14 +181,14 @@ def claimed_image_px(
     from the tracker's catalog, which is independent of the simulated sky and may have merged a double.
     """
     if isinstance(estimator, DomeTracker):
-        order = np.argsort(testbed.sources.id)
-        rows = order[np.searchsorted(testbed.sources.id, estimator.leds.id[match.star], sorter=order)]
-        camera_m = quaternion.apply(lab_from_body, testbed.mount.camera_body_m)
-        offset_lab = testbed.sources.place[rows, :3] - camera_m
+        order = np.argsort(lab.camera.sources.id)
+        rows = order[np.searchsorted(lab.camera.sources.id, estimator.leds.id[match.star], sorter=order)]
+        camera_m = quaternion.apply(lab_from_body, lab.camera.mount.camera_body_m)
+        offset_lab = lab.camera.sources.place[rows, :3] - camera_m
     else:
         assert isinstance(estimator, StarTracker)
         offset_lab = estimator.stars.vectors[match.star]
-    return testbed.optics.project(offset_lab @ quaternion.to_matrix(cam_from_lab).T)
+    return lab.camera.optics.project(offset_lab @ quaternion.to_matrix(cam_from_lab).T)
 
 
 def count_wrong_matches(observed_px: Floats, claimed_px: Floats, lights: TrueLights, reach_px: float) -> int:
@@ -231,11 +231,11 @@ def nearest_light(xy_px: Floats, lights_px: Floats) -> tuple[NDArray[np.int64], 
 # Attitudes.
 
 
-def directions(testbed: Testbed, lab_from_body: Floats, cam_from_lab: Floats) -> dict[str, float]:
+def directions(lab: Lab, lab_from_body: Floats, cam_from_lab: Floats) -> dict[str, float]:
     """The columns DIRECTION of an attitude."""
     values = dict(zip(DIRECTION[:4], lab_from_body.tolist(), strict=True))
     z = np.array([0.0, 0.0, 1.0])
-    if isinstance(testbed.scene.light, DomeConfig):
+    if isinstance(lab.scene.light, DomeConfig):
         x, y, z_lab = quaternion.apply(lab_from_body, z).tolist()
         values["body_tilt_deg"] = math.degrees(math.atan2(math.hypot(x, y), z_lab))
         values["body_azimuth_deg"] = math.degrees(math.atan2(y, x)) % 360
@@ -255,12 +255,11 @@ def angles_arcsec(lab_from_other: Rotation | None, log: Telemetry, settle_s: flo
     return np.empty(0) if error_deg is None else 3600 * error_deg[log.t_s >= settle_s]
 
 
-def summarize_flight(testbed: Testbed, outcomes: list[Outcome], settle_s: float) -> Outcome:
+def summarize_flight(log: Telemetry, outcomes: list[Outcome], settle_s: float) -> Outcome:
     """Outcome of a flight trial from the outcomes of its frames and, with a filter, from its error at every tick."""
     solved = [outcome for outcome in outcomes if outcome.solved]
     x, y, roll = (rms([getattr(one, name) for one in solved]) for name in ("x_arcsec", "y_arcsec", "roll_arcsec"))
     good = [bool(one.solved and not one.wrong) for one in outcomes]
-    log = testbed.log
     error = angles_arcsec(log.lab_from_filter, log, settle_s)
     pointing = angles_arcsec(log.lab_from_ref, log, settle_s)
     quarter = len(error) // 4

@@ -21,7 +21,6 @@ from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial
 from skysim.experiments.study.store import Store, to_sql
 from skysim.results.files import frames
 from skysim.results.report import annotate, visible
-from skysim.simulation import run
 from skysim.tracking import factory
 
 MAX_FRAMES = 100  # maximum number of frames written for a flight
@@ -58,12 +57,12 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     now = {name: to_sql(getattr(row.outcome, name)) for name in row.outcome.__slots__}
     changed = [name for name, value in now.items() if stored and stored[name] != value]
     files, pictures = [], []
-    if row.scene:  # an invalid scene has no test bed
+    if row.scene:  # an invalid scene has no lab
         setup = prepared_setup(plan.spec, segment.settings)
         frames.remove_results(file_io.make_folder(folder))
         try:
             for frame, truth, report in islice(replayed_frames(setup, row.seed), MAX_FRAMES):
-                frames.write_frame(folder, frame, truth, setup.testbed.scene)
+                frames.write_frame(folder, frame, truth, setup.lab.scene)
                 files.append(folder / f"frame_{frame.index:04d}.fits")
                 pictures.append(folder / f"frame_{frame.index:04d}.annotated.png")
                 match, xy_px = report.attitude.match, report.centroids.xy_px
@@ -90,9 +89,10 @@ def replayed_frames(setup: Setup, seed: int) -> Iterator[tuple[Frame, Truth, Rep
         frame, truth, _ = trials.render_trial_frame(setup._replace(trial=frame_trial), seed)
         yield frame, truth, solve_or_failed(lambda: trials.solved_centroids(setup, [seed])[0][1])
     elif isinstance(trial, FlightTrial):
-        testbed = run.simulate_motion(trials.flight_testbed(setup, seed))
-        for result in run.run(testbed, setup.estimator):
-            yield result.frame, result.truth, result.report
+        with trials.trial_flight(setup, seed) as flight:
+            for shot in flight.shots(cameras=[0]):
+                assert shot.report is not None
+                yield shot.frame, shot.truth, shot.report
     else:
         frame, truth, streak_px = trials.render_trial_frame(setup, seed)
         yield (

@@ -1,10 +1,10 @@
-"""Prepared test beds and trackers for trials, cached per worker; hashes and seeds that record a row's origin."""
+"""Prepared labs and trackers for trials, cached per worker; hashes and seeds that record a row's origin."""
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from dataclasses import replace
+from collections.abc import Mapping
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -18,7 +18,8 @@ from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.plan import Trial, TrialSpec, digest, resolve_point
 from skysim.scene.loader import file_names
 from skysim.scene.scene import Scene
-from skysim.simulation.testbed import Testbed, build_testbed, build_tracker
+from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.user_parts import UserParts
 from skysim.tracking import factory
 from skysim.tracking.external.interface import TRACKERS
 
@@ -26,16 +27,17 @@ CACHE_SIZE = 4  # setups that a worker caches
 
 
 class Setup(NamedTuple):
-    """A scene prepared for trials: hardware without simulated motion, tracker with its index, trial, scene hash."""
+    """A scene prepared for trials: lab, tracker with its index, trial, scene hash, commands of external programs."""
 
-    testbed: Testbed
+    lab: Lab
     estimator: factory.Estimator
     trial: Trial
     scene_hash: str
+    programs: Mapping[str, str] = factory.NO_PROGRAMS
 
 
 class SetupCache(threading.local):
-    """Least-recently-used cache of setups. One per thread, because a test bed's canvas serves one trial at a time."""
+    """Least-recently-used cache of setups. One per thread, because a lab's canvas serves one trial at a time."""
 
     def __init__(self) -> None:
         self.setups: OrderedDict[str, Setup] = OrderedDict()
@@ -68,14 +70,14 @@ def build_setup(spec: TrialSpec, settings: Settings) -> Setup:
     scene, trial = resolve_point(spec, settings)
     hash_ = scene_hash(scene)
     for setup in CACHE.setups.values():
-        if setup.scene_hash == hash_ and setup.testbed.programs == spec.programs:
+        if setup.scene_hash == hash_ and setup.programs == spec.programs:
             return setup._replace(trial=trial)
-    # A test bed whose scene differs only in section `tracker` has the same hardware.
-    cached = (setup.testbed for setup in CACHE.setups.values())
+    # A lab whose scene differs only in section `tracker` has the same hardware.
+    cached = (setup.lab for setup in CACHE.setups.values())
     same = (one for one in cached if one.scene.model_copy(update={"tracker": scene.tracker}) == scene)
-    testbed = next(same, None) or build_testbed(scene, spec.programs)
-    testbed = replace(testbed, scene=scene, programs=spec.programs)
-    return Setup(testbed, build_tracker(testbed), trial, hash_)
+    lab = next(same, None) or build_lab(scene, UserParts(spec.programs))
+    lab = lab.with_scene(scene)
+    return Setup(lab, build_tracker(lab.camera, spec.programs), trial, hash_, spec.programs)
 
 
 def scene_hash(scene: Scene) -> str:

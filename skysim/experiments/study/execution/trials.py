@@ -22,7 +22,6 @@ from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import Health, TrackedReport, TrackingMode
-from skysim.camera import render
 from skysim.camera.detector.added_charge import AddedCharge
 from skysim.core import quaternion
 from skysim.core.paths import ROOT
@@ -52,8 +51,11 @@ from skysim.experiments.study.plan import (
 )
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation import exposure, run
-from skysim.simulation.testbed import MARGIN_S, Testbed, exposure_window
+from skysim.simulation.exposure import render_frame
+from skysim.simulation.flight import Flight
+from skysim.simulation.lab import StarCamera
+from skysim.simulation.timing import MARGIN_S, exposure_window
+from skysim.simulation.user_parts import UserParts
 from skysim.sources.air.air import topocentric_axes
 from skysim.sources.solar_system.observer import observe_from
 from skysim.sources.solar_system.places import place
@@ -61,7 +63,6 @@ from skysim.tracking import factory
 
 GYRO_RAD_S = 1e-5  # standard deviation that a frame trial's gyro claims, 2 arcseconds a second
 KNOTS = 9  # samples of a frame trial's trajectory in each exposure
-STREAK_POSES = 9  # poses along the streak of a frame that is not rendered
 BLOCK = 64  # centroid trials that run together
 
 
@@ -171,22 +172,22 @@ def run_centroid_trials(setup: Setup, seeds: Sequence[int]) -> list[Outcome]:
     Every step is made for all of the trials before the next one, so that its code is in the processor's cache.
     """
     solved = solved_centroids(setup, seeds)
-    return [score(setup.testbed, setup.estimator, report, lights) for lights, report in solved]
+    return [score(setup.lab, setup.estimator, report, lights) for lights, report in solved]
 
 
 def solved_centroids(setup: Setup, seeds: Sequence[int]) -> list[tuple[TrueLights, Report]]:
     """The lights of centroid trials, and the report on the detections; of coded light on those of the last frame."""
-    testbed, trial, estimator = setup.testbed, setup.trial, setup.estimator
+    lab, trial, estimator = setup.lab, setup.trial, setup.estimator
     assert isinstance(trial, CentroidTrial)
     drawn = [streams(setup, seed) for seed in seeds]
     lab_from_body = random_attitudes(setup, [attitude_rng for attitude_rng, _ in drawn])
     noise = [noise_rng for _, noise_rng in drawn]
     if isinstance(estimator, CodedTracker):
-        coded = [solve_coded(testbed, estimator, trial, *each) for each in zip(lab_from_body, noise, strict=True)]
+        coded = [solve_coded(lab, estimator, trial, *each) for each in zip(lab_from_body, noise, strict=True)]
         seen_px, reports = [xy_px for xy_px, _ in coded], [report for _, report in coded]
     else:
-        views = visible_rows(testbed, lab_from_body)
-        seen_px, scene = [view.xy_px for view in views], testbed.scene
+        views = visible_rows(lab, lab_from_body)
+        seen_px, scene = [view.xy_px for view in views], lab.scene
         detections = [
             simulate_detections(trial, view.xy_px, view.electrons, scene, rng)
             for view, rng in zip(views, noise, strict=True)
@@ -207,57 +208,39 @@ def streams(setup: Setup, seed: int) -> tuple[np.random.Generator, np.random.Gen
 
 def run_frame_trial(setup: Setup, seed: int) -> Outcome:
     """Frame trial: random attitude, one rendered frame, solved lost in space or in tracking mode."""
-    testbed, streak_px = moving_testbed(setup, seed)
-    frame, truth = exposure.render_frame(testbed, tracked_frames(setup))
+    moving = moving_camera(setup, seed)
+    frame, truth = moving.render(tracked_frames(setup))
     if tracked_frames(setup):
-        report = tracked_report(setup, testbed, frame, streak_px)
+        report = tracked_report(setup, moving, frame)
     else:
-        report = factory.solve_frame(setup.estimator, frame, streak_px, gyro_rate(setup, truth))
-    return score(setup.testbed, setup.estimator, report, true_lights(truth))
+        report = factory.solve_frame(setup.estimator, frame, moving.streak_px, gyro_rate(setup, truth))
+    return score(setup.lab, setup.estimator, report, true_lights(truth))
 
 
 def run_flight_trial(setup: Setup, seed: int) -> Outcome:
     """Flight trial: the complete scene with another seed, and with a random start if the trial has one."""
     trial = setup.trial
     assert isinstance(trial, FlightTrial)
-    testbed = run.simulate_motion(flight_testbed(setup, seed))
-    outcomes = [one for t_s, one in flight_outcomes(testbed, setup.estimator) if t_s >= trial.settle_s]
-    return summarize_flight(testbed, outcomes, trial.settle_s)
+    with trial_flight(setup, seed) as flight:
+        outcomes = [one for t_s, one in flight_outcomes(flight, setup.estimator) if t_s >= trial.settle_s]
+        return summarize_flight(flight.telemetry(), outcomes, trial.settle_s)
 
 
-def flight_testbed(setup: Setup, seed: int) -> Testbed:
-    """The test bed of a flight trial at its start."""
-    trial, testbed = setup.trial, setup.testbed.in_run(seed)
+def trial_flight(setup: Setup, seed: int) -> Flight:
+    """The flight of a trial at its start."""
+    trial = setup.trial
+    lab = setup.lab.in_run(seed)
     assert isinstance(trial, FlightTrial)
-    if trial.start is None:
-        return testbed
-    lab_from_body = random_attitude(setup, random_stream(seed, 0))
-    return replace(testbed, trajectory=Trajectory.at_rest(lab_from_body, 1.0))
+    if trial.start is not None:
+        lab = replace(lab, start=random_attitude(setup, random_stream(seed, 0)))
+    return Flight(lab, UserParts(setup.programs, tracker=setup.estimator))
 
 
-def flight_outcomes(testbed: Testbed, estimator: factory.Estimator) -> Iterator[tuple[float, Outcome]]:
-    """Mid-exposure time and outcome of every frame.
-
-    Frames already solved during the motion simulation (`testbed.reports`) are not rendered again.
-    """
-    if not testbed.reports:
-        for result in run.run(testbed, estimator):
-            yield result.truth.t_s, score(testbed, estimator, result.report, true_lights(result.truth))
-    for index, report in testbed.reports.items():
-        lights, t_s = flown_lights(testbed, index)
-        yield t_s, score(testbed, estimator, report, lights)
-
-
-def flown_lights(testbed: Testbed, index: int) -> tuple[TrueLights, float]:
-    """The lights of a frame that was solved during the motion, from its trajectory, and its mid-exposure time."""
-    window, rows = exposure_window(testbed.scene, index, testbed.exposures_s[index]), testbed.scene.camera.height_px
-    middle_s, exposed_s = window.middle_s(rows), window.exposure_s * np.linspace(0, 1, STREAK_POSES)
-    lab_from_body = testbed.trajectory.attitude_at(middle_s)
-    (view,) = visible_rows(testbed, Rotation.concatenate([lab_from_body]), middle_s)
-    poses = render.poses(testbed.trajectory, testbed.mount, window.open_s + exposed_s)
-    path_px = render.project(testbed.sources.take(view.rows), testbed.optics, poses)[0]
-    streak_px = np.linalg.norm(np.diff(path_px, axis=0), axis=2).sum(axis=0)
-    return TrueLights(lab_from_body, view.xy_px, view.xy_px, streak_px), middle_s
+def flight_outcomes(flight: Flight, estimator: factory.Estimator) -> Iterator[tuple[float, Outcome]]:
+    """Mid-exposure time and outcome of every frame of the main camera."""
+    for shot in flight.shots(cameras=[0]):
+        assert shot.report is not None
+        yield shot.truth.t_s, score(flight.lab, estimator, shot.report, true_lights(shot.truth))
 
 
 def one_by_one(run: Callable[[Setup, int], Outcome]) -> Callable[[Setup, Sequence[int]], list[Outcome]]:
@@ -286,12 +269,12 @@ def random_attitudes(setup: Setup, rngs: Sequence[np.random.Generator]) -> Rotat
     Under a dome: tilt uniform in solid angle within `tilt_deg`, tilt direction and yaw uniform. Otherwise: boresight
     uniform over the sphere within `dec_deg` or between two angles from a body, roll uniform.
     """
-    trial, testbed = setup.trial, setup.testbed
+    trial, lab = setup.trial, setup.lab
     attitudes = trial.start if isinstance(trial, FlightTrial) else trial
     assert attitudes is not None
     turns = [rng.uniform(0, 2 * math.pi, 2).tolist() for rng in rngs]
     # A uniform cosine of the tilt, or sine of the declination, is uniform in solid angle.
-    if isinstance(testbed.scene.light, DomeConfig):
+    if isinstance(lab.scene.light, DomeConfig):
         tilt_deg = attitudes.tilt_deg
         low, high = tilt_deg if isinstance(tilt_deg, tuple) else (tilt_deg,) * 2
         least, most = math.cos(math.radians(high)), math.cos(math.radians(low))
@@ -306,9 +289,9 @@ def random_attitudes(setup: Setup, rngs: Sequence[np.random.Generator]) -> Rotat
     zeniths = [math.acos(min(max(rng.uniform(least, most), -1.0), 1.0)) for rng in rngs]
     lab_from_cam = [zyz(first, zenith, last) for (first, last), zenith in zip(turns, zeniths, strict=True)]
     if near:
-        lab_from_pole = lab_from_body_pole(near.body, testbed.scene)
+        lab_from_pole = lab_from_body_pole(near.body, lab.scene)
         lab_from_cam = [quaternion.multiply(lab_from_pole, each) for each in lab_from_cam]
-    cam_from_body = quaternion.from_rotation(testbed.mount.cam_from_body)
+    cam_from_body = quaternion.from_rotation(lab.camera.mount.cam_from_body)
     drawn = [quaternion.multiply(each, cam_from_body) for each in lab_from_cam]
     return Rotation.from_quat(np.array(drawn)[:, [1, 2, 3, 0]])
 
@@ -337,8 +320,20 @@ def render_trial_frame(
 
     added : gets the masks of smear and particles
     """
-    testbed, streak_px = moving_testbed(setup, seed)
-    return *exposure.render_frame(testbed, tracked_frames(setup), added=added), streak_px
+    moving = moving_camera(setup, seed)
+    return *moving.render(tracked_frames(setup), added), moving.streak_px
+
+
+class MovingCamera(NamedTuple):
+    """The camera of a frame trial in its motion. streak_px : (dx, dy) of its frame that a gyro measures, if any"""
+
+    camera: StarCamera
+    trajectory: Trajectory
+    streak_px: tuple[float, float] | None
+
+    def render(self, index: int, added: AddedCharge | None = None) -> tuple[Frame, Truth]:
+        """A frame and its truth."""
+        return render_frame(self.camera, self.trajectory, index, added=added)
 
 
 def tracked_frames(setup: Setup) -> int:
@@ -347,34 +342,34 @@ def tracked_frames(setup: Setup) -> int:
     return setup.trial.tracked
 
 
-def moving_testbed(setup: Setup, seed: int) -> tuple[Testbed, tuple[float, float] | None]:
-    """The test bed in the motion of a frame trial and, with a gyro, the streak vector of its frame."""
+def moving_camera(setup: Setup, seed: int) -> MovingCamera:
+    """The camera in the motion of a frame trial and, with a gyro, the streak vector of its frame."""
     trial, (attitude_rng, noise) = setup.trial, streams(setup, seed)
     assert isinstance(trial, FrameTrial)
-    testbed = setup.testbed.in_run(int(noise.integers(2**62)))
+    camera = setup.lab.in_run(int(noise.integers(2**62))).camera
     middle, axis_cam = attitude_and_axis(setup, attitude_rng)
     rate_cam = math.radians(trial.rate_deg_s) * axis_cam
-    body_from_cam = testbed.mount.cam_from_body.inv()
+    body_from_cam = camera.mount.cam_from_body.inv()
     rate_body, turn_body, acceleration_body = (
         body_from_cam.apply(math.radians(value) * axis_cam)
         for value in (trial.rate_deg_s, trial.turn_deg, trial.acceleration_deg_s2)
     )
     middle = middle * Rotation.from_rotvec(turn_body)
-    trajectory = constant_acceleration(testbed.scene, middle, rate_body, acceleration_body, trial.tracked)
-    streak_px = exposure_window(testbed.scene, 0).exposure_s * testbed.scene.camera.focal_px
+    trajectory = constant_acceleration(camera.scene, middle, rate_body, acceleration_body, trial.tracked)
+    streak_px = exposure_window(camera.scene, 0).exposure_s * camera.scene.camera.focal_px
     # For a star on the boresight: d(x / z)/dt = -w_y, d(y / z)/dt = w_x.
     streak = (-rate_cam[1] * streak_px, rate_cam[0] * streak_px) if trial.gyro else None
-    return replace(testbed, trajectory=trajectory), streak
+    return MovingCamera(camera, trajectory, streak)
 
 
 def attitude_and_axis(setup: Setup, rng: np.random.Generator) -> tuple[Rotation, Floats]:
     """Random lab_from_body of a frame trial, and the (3,) axis of its rate in camera axes."""
     assert isinstance(setup.trial, FrameTrial)
     lab_from_body = random_attitude(setup, rng)
-    return lab_from_body, rate_axis(setup.trial.rate_axis, rng.uniform(0, 2 * math.pi), setup.testbed.mount)
+    return lab_from_body, rate_axis(setup.trial.rate_axis, rng.uniform(0, 2 * math.pi), setup.lab.camera.mount)
 
 
-def tracked_report(setup: Setup, testbed: Testbed, frame: Frame, streak_px: tuple[float, float] | None) -> Report:
+def tracked_report(setup: Setup, moving: MovingCamera, frame: Frame) -> Report:
     """The report on a frame trial's last frame by a tracker in its tracking mode, which has solved those before.
 
     Without an attitude if the prediction failed and the frame had to be solved lost in space. A gyro's prediction is
@@ -383,10 +378,12 @@ def tracked_report(setup: Setup, testbed: Testbed, frame: Frame, streak_px: tupl
     assert isinstance(setup.estimator, StarTracker)
     tracker = TrackingMode(setup.estimator)
     for index in range(frame.index + 1):
-        shown = frame if index == frame.index else exposure.render_frame(testbed, index)[0]
-        turned = rotation_between(testbed, tracker.last.t_s, shown.t_mid_s) if streak_px and tracker.last else None
+        shown = frame if index == frame.index else moving.render(index)[0]
+        turned = (
+            rotation_between(moving, tracker.last.t_s, shown.t_mid_s) if moving.streak_px and tracker.last else None
+        )
         try:
-            report = tracker.solve(shown.image_dn, shown.t_mid_s, turned, streak_px, shown.exposure_s)
+            report = tracker.solve(shown.image_dn, shown.t_mid_s, turned, moving.streak_px, shown.exposure_s)
         except ImageError as error:
             report = TrackedReport(Attitude(str(error)), Centroids.empty())
     if report.attitude.solved and report.health & Health.SEARCHED:
@@ -394,9 +391,11 @@ def tracked_report(setup: Setup, testbed: Testbed, frame: Frame, streak_px: tupl
     return report
 
 
-def rotation_between(testbed: Testbed, then_s: float, now_s: float) -> Rotation:
+def rotation_between(moving: MovingCamera, then_s: float, now_s: float) -> Rotation:
     """True rotation cam(now) from cam(then)."""
-    now, then = (testbed.mount.cam_from_body * testbed.trajectory.attitude_at(t_s).inv() for t_s in (now_s, then_s))
+    now, then = (
+        moving.camera.mount.cam_from_body * moving.trajectory.attitude_at(t_s).inv() for t_s in (now_s, then_s)
+    )
     return now * then.inv()
 
 

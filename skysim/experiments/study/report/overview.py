@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.experiments.study.analysis.table import format_level
 from skysim.experiments.study.designs import Point, make_point
@@ -23,7 +23,8 @@ from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation import checks
 from skysim.simulation.checks.facts import TRACKER_KNOWS, Fact
-from skysim.simulation.testbed import Testbed, build_testbed
+from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.user_parts import UserParts
 
 NUMBER = re.compile(r"\d[\d.]*")
 RATE = "trial.rate_deg_s"
@@ -56,16 +57,16 @@ def overview(plan: Plan) -> Overview:
             break
         try:
             scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(point.settings, 0))
-            testbed = build_testbed(scene, plan.spec.programs)
-            found_here = checks.check(testbed, greatest_tilt_deg(scene, trial), trial_rate_rad_s(trial, testbed))
+            lab = build_lab(scene, UserParts(plan.spec.programs))
+            found_here = checks.check(lab, greatest_tilt_deg(scene, trial), trial_rate_rad_s(trial, lab))
         except InputError:
             continue
         checked += 1
         if isinstance(scene.light, DomeConfig):
-            leds[levels] = len(testbed.sources)
+            leds[levels] = len(lab.camera.sources)
         may_be_ambiguous |= may_report_ambiguity(scene)
         fixed |= dict.fromkeys(fixed_seeds(plan.study, scene))
-        rows = rows or scene_rows(plan, testbed, found_here.facts)
+        rows = rows or scene_rows(plan, lab, found_here.facts)
         for line in found_here.findings:
             found.setdefault(NUMBER.sub("#", line), []).append((line, levels))
     findings = [finding_text([(line, with_leds(at, leds)) for line, at in one], checked) for one in found.values()]
@@ -96,15 +97,15 @@ def finding_text(at: list[tuple[str, str]], checked: int) -> str:
     return f"{line} [{'; '.join([first, *others])}]"
 
 
-def trial_rate_rad_s(trial: Trial, testbed: Testbed) -> Floats | None:
+def trial_rate_rad_s(trial: Trial, lab: Lab) -> Floats | None:
     """(3,) rate of a trial of a single attitude in body axes; None for a flight, whose scene has its rates."""
     if isinstance(trial, FlightTrial):
         return None
     if not isinstance(trial, FrameTrial):
         return np.zeros(3)
     # A random axis is taken between the camera's x and y: rows of a rolling shutter are both sheared and stretched.
-    axis_cam = rate_axis(trial.rate_axis, math.pi / 4, testbed.mount)
-    return np.asarray(testbed.mount.cam_from_body.inv().apply(math.radians(trial.rate_deg_s) * axis_cam))
+    axis_cam = rate_axis(trial.rate_axis, math.pi / 4, lab.camera.mount)
+    return np.asarray(lab.camera.mount.cam_from_body.inv().apply(math.radians(trial.rate_deg_s) * axis_cam))
 
 
 def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:
@@ -135,15 +136,15 @@ def options(factor: Factor) -> list[tuple[object, dict[str, object]]]:
 # The table.
 
 
-def scene_rows(plan: Plan, testbed: Testbed, facts: Sequence[Fact]) -> list[tuple[str, str]]:
-    """The scene of a test bed, with what the check's facts say of its tracker; how the study varies and repeats it."""
-    study, scene = plan.study, testbed.scene
+def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> list[tuple[str, str]]:
+    """The scene of a lab, with what the check's facts say of its tracker; how the study varies and repeats it."""
+    study, scene = plan.study, lab.scene
     changed = "; ".join(f"{key}: {format_setting(value)}" for key, value in study.set.items())
     points = f"at each of {len(plan.points)} points" if plan.points else "a candidate"
     attitudes = f"{'the same' if study.paired else 'other'} attitudes at every point"
     return [
         ("scene", study.scene + (f", with {changed}" if changed else "")),
-        ("light", light_text(scene, testbed)),
+        ("light", light_text(scene, lab)),
         ("camera", camera_text(scene.camera)),
         ("exposure", f"{1e3 * scene.exposure.time_s:.4g} ms"),
         ("tracker", tracker_text(scene)),
@@ -155,7 +156,7 @@ def scene_rows(plan: Plan, testbed: Testbed, facts: Sequence[Fact]) -> list[tupl
     ]
 
 
-def light_text(scene: Scene, testbed: Testbed) -> str:
+def light_text(scene: Scene, lab: Lab) -> str:
     """The light source in words."""
     light = scene.light
     if isinstance(light, DomeConfig):
@@ -163,10 +164,10 @@ def light_text(scene: Scene, testbed: Testbed) -> str:
         apex_m = getattr(surface, "apex_m", None)
         height = f", {apex_m:.4g} m above the bearing" if apex_m else ""
         cap = f" within {layout.cap_deg:g}°" if getattr(layout, "cap_deg", None) else ""
-        return f"dome ({surface.kind}{height}) with {len(testbed.sources)} LEDs ({layout.kind}){cap}"
+        return f"dome ({surface.kind}{height}) with {len(lab.camera.sources)} LEDs ({layout.kind}){cap}"
     if isinstance(light, StarsConfig):
         limit = f" to V = {light.limit_mag:g}" if light.limit_mag is not None else ""
-        return f"{len(testbed.sources)} stars of {light.catalog}{limit}"
+        return f"{len(lab.camera.sources)} stars of {light.catalog}{limit}"
     return light.kind.replace("_", " ")
 
 

@@ -25,7 +25,7 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.results.files.builder.drawing import Circle, Drawing, Path, Shape, Text, to_dxf, to_svg
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
 from skysim.sources.dome.layouts.placing import project_from_bearing
 from skysim.sources.dome.layouts.string import directions
@@ -56,15 +56,15 @@ class Dome(NamedTuple):
     led_radius_m: float
 
 
-def template(testbed: Testbed, ending: str) -> str:
+def template(lab: Lab, ending: str) -> str:
     """The text of a template for a scene's dome, by its file's ending. Raises InputError without a dome."""
-    light = testbed.scene.light
+    light = lab.scene.light
     if not isinstance(light, DomeConfig):
         raise InputError("light.kind", f"{light.kind} has no {ending}", "dome")
     surface = build_surface(light.surface)
-    leds = design_leds(light, surface, testbed.band)
+    leds = design_leds(light, surface, lab.camera.band)
     cap_deg = max(float(getattr(light.layout, "cap_deg", 0.0)), max_tilt_deg(leds.place[:, :3]))  # boards stand out
-    dome = Dome(testbed.scene.name, surface, cap_deg, leds.id, leds.place[:, :3], light.led.disk_diameter_m / 2)
+    dome = Dome(lab.scene.name, surface, cap_deg, leds.id, leds.place[:, :3], light.led.disk_diameter_m / 2)
     return TEMPLATES[ending](dome)
 
 

@@ -47,9 +47,9 @@ def of(context: Context, samples: Samples) -> Lookalike | None:
 
 def why_not_compared(context: Context, samples: Samples) -> str:
     """Why fields are not compared; empty if they are."""
-    if not isinstance(context.testbed.scene.light, DomeConfig):
+    if not isinstance(context.lab.scene.light, DomeConfig):
         return "light.kind: stars: only the layout of a dome can be ambiguous; allowed: dome"
-    if context.testbed.scene.tracker.decoder is not None:
+    if context.lab.scene.tracker.decoder is not None:
         return "tracker.decoder: coded LEDs are named by their codes, so that no field is ambiguous; allowed: none"
     mean = float(samples.reach.counts().mean())
     if mean < MIN_LEDS:
@@ -63,7 +63,7 @@ def compared(context: Context, samples: Samples, least: float, most_work: int) -
     least : fraction below which none is sought;  most_work : fields compared, those at the least tilts, times LEDs in
     a field
     """
-    testbed, camera = context.testbed, context.camera.optics.camera
+    lab, camera = context.lab, context.camera.optics.camera
     sigma_px = [
         believed_sigma_px(view, Independent(centroid_variance(view, context)), context)
         for view in samples.reach.used
@@ -77,7 +77,7 @@ def compared(context: Context, samples: Samples, least: float, most_work: int) -
     tilt_rad = float(attitudes.tilts_rad(samples.reach.attitudes).max())
     found = field_ambiguity(
         place_m,
-        float(np.linalg.norm(testbed.mount.camera_body_m)),
+        float(np.linalg.norm(lab.camera.mount.camera_body_m)),
         min(tilt_rad, float(zenith_rad[most - 1])) if len(zenith_rad) >= most else tilt_rad,
         math.atan(math.sqrt(camera.width_px * camera.height_px / math.pi) / camera.focal_px),
         coincidence_m,

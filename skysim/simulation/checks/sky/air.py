@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from skysim.core.quantities.units import ARCSEC_RAD
+from skysim.core.constants import ARCSEC_RAD
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context
 from skysim.simulation.checks.facts import Samples, short
-from skysim.simulation.testbed import time_at
+from skysim.simulation.lab import time_at
 from skysim.tracking.external.interface import OWN
 
 MIN_RAISED_ARCSEC = 1.0  # of a refraction that matters
@@ -22,24 +22,24 @@ def refraction(context: Context, samples: Samples) -> str:
     The attitude errs by the refraction at the boresight, and the field's height is shortened by the difference of the
     refractions at its two ends.
     """
-    testbed, at = context.testbed, samples.frames.attitudes
-    if testbed.air is None or testbed.scene.tracker.refraction:
+    lab, at = context.lab, samples.frames.attitudes
+    if lab.camera.air is None or lab.scene.tracker.refraction:
         return ""
-    boresight = (at.lab_from_body * testbed.mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
-    zenith = np.array([testbed.air.at(time_at(testbed.scene, t)).zenith for t in at.t_s.tolist()])
+    boresight = (at.lab_from_body * lab.camera.mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
+    zenith = np.array([lab.camera.air.at(time_at(lab.scene, t)).zenith for t in at.t_s.tolist()])
     altitude_rad = np.arcsin(np.sum(boresight * zenith, axis=1))
     n = int(altitude_rad.argmin())
     zenith_rad, half_rad = math.pi / 2 - altitude_rad[n], context.camera.optics.field_rad
     around_rad = zenith_rad + np.array([0.0, half_rad, -half_rad])
-    middle, low, high = testbed.air.refraction.bending_rad(np.abs(around_rad)) * np.sign(around_rad) / ARCSEC_RAD
+    middle, low, high = lab.camera.air.refraction.bending_rad(np.abs(around_rad)) * np.sign(around_rad) / ARCSEC_RAD
     expected_arcsec = samples.frames.error.rms_arcsec()[0]
     if not middle > max(MIN_RAISED_ARCSEC, 0.0 if math.isnan(expected_arcsec) else expected_arcsec):
         return ""
-    where = attitudes.describe(at, n, testbed.scene, testbed.mount)
+    where = attitudes.describe(at, n, lab.scene, lab.camera.mount)
     text = (
         f"the air raises stars by {short(middle)}″ at {where}, {math.degrees(altitude_rad[n]):.1f}° above the horizon,"
         f" and shortens the field by {short(low - high, 2)}″, which the tracker does not know"
     )
-    if testbed.scene.tracker.name == OWN:
+    if lab.scene.tracker.name == OWN:
         return f"tracker.refraction: {text}; change it to true"
     return f"tracker.name: {text}; change it to own, with tracker.refraction: true, or point higher"

@@ -13,7 +13,7 @@ from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context, full_scale_e
 from skysim.simulation.checks.facts import Samples, short
 from skysim.simulation.checks.views import peak_share
-from skysim.simulation.testbed import bodies_during
+from skysim.simulation.lab import bodies_during
 from skysim.sources.solar_system.bodies import NAMES, BodyLight
 
 NEAR_DEG = {"sun": 60.0, "moon": 30.0}  # from the boresight, where their stray light would matter
@@ -21,21 +21,21 @@ NEAR_DEG = {"sun": 60.0, "moon": 30.0}  # from the boresight, where their stray 
 
 def bodies_near(context: Context, samples: Samples) -> Iterator[str]:
     """A line for each body: the frame at which it is nearest to the boresight, if it is in the field or near it."""
-    testbed, at = context.testbed, samples.frames.attitudes
-    cam_from_lab = testbed.mount.cam_from_body * at.lab_from_body.inv()
+    lab, at = context.lab, samples.frames.attitudes
+    cam_from_lab = lab.camera.mount.cam_from_body * at.lab_from_body.inv()
     closest: dict[str, tuple[float, int, BodyLight]] = {}
     for n, t_s in enumerate(at.t_s):
-        for body in bodies_during(testbed, float(t_s)):
+        for body in bodies_during(lab.camera, float(t_s)):
             z = float(cam_from_lab[n].apply(body.place.direction)[2])
             off = math.acos(max(min(z, 1.0), -1.0)), n, body
             closest[body.name] = min(closest.get(body.name, off), off, key=lambda found: found[0])
     for name, (off_rad, n, body) in closest.items():
-        seen, where = body.truth(), attitudes.describe(at, n, testbed.scene, testbed.mount)
+        seen, where = body.truth(), attitudes.describe(at, n, lab.scene, lab.camera.mount)
         what = f"light.bodies: {NAMES[body.id]} (V {seen.v_mag:.1f}, {short(seen.diameter_arcsec, 2)}″ wide)"
         far = f"{math.degrees(off_rad):.1f}° from the boresight at {where}"
-        if in_field(cam_from_lab[n].apply(body.place.direction), body.radius_rad, testbed.scene.camera):
+        if in_field(cam_from_lab[n].apply(body.place.direction), body.radius_rad, lab.scene.camera):
             yield f"{what} is in the field, {far}: {short(peak_fill(context, body), 2)} times saturation"
-        elif testbed.scene.camera.baffle is None and off_rad < math.radians(NEAR_DEG.get(name, 0.0)):
+        elif lab.scene.camera.baffle is None and off_rad < math.radians(NEAR_DEG.get(name, 0.0)):
             yield f"{what} is {far}; its stray light is not drawn: add camera.baffle, or a background of kind stray"
 
 
@@ -50,7 +50,7 @@ def in_field(direction_cam: Floats, radius_rad: float, camera: CameraConfig) -> 
 
 def peak_fill(context: Context, body: BodyLight) -> float:
     """Electrons in the brightest pixel of a body at rest over saturation; a phase is a disk of its bright area."""
-    camera, scene = context.camera, context.testbed.scene
+    camera, scene = context.camera, context.lab.scene
     lit = (1 + math.cos(body.place.phase_rad)) / 2
     radius_px = scene.camera.focal_px * math.tan(body.radius_rad) * math.sqrt(lit)
     lens2_px2, radius, none = np.array([camera.lens_px**2]), np.array([radius_px]), np.zeros(1)

@@ -24,7 +24,7 @@ LARGEST_FLOOR_PX = 1.0
 def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
     """Median of the expected NEES over some attitudes, with a least error of the centroids; NaN without lights."""
     found = []
-    cam_from_body = context.testbed.mount.cam_from_body
+    cam_from_body = context.lab.camera.mount.cam_from_body
     for view, lab_from_body in zip(sampled.used, sampled.attitudes.lab_from_body, strict=True):
         own = centroid_variance(view, context, prnu=0.0)
         sigma_px = np.sqrt(np.trace(own, axis1=1, axis2=2) / 2 + floor_px**2)
@@ -44,7 +44,7 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
 
 def claimed(context: Context, samples: Samples) -> float:
     """The expected NEES over the whole sky with the tracker's floor; NaN under other lights."""
-    if not isinstance(context.testbed.scene.light, StarsConfig):
+    if not isinstance(context.lab.scene.light, StarsConfig):
         return math.nan
     return expected_nees(samples.reach, context, context.settings.centroid_sigma_px)
 

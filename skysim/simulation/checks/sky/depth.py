@@ -21,12 +21,12 @@ SNR = 5.0
 
 def faintest_star(context: Context, samples: Samples) -> Fact | None:
     """V of the faintest star that the tracker detects, and of that with a signal-to-noise ratio of 5."""
-    scene, believed = context.testbed.scene, context.beliefs
+    scene, believed = context.lab.scene, context.beliefs
     if not isinstance(scene.light, StarsConfig):
         return None
     rate_deg_s = float(np.degrees(np.linalg.norm(samples.frames.attitudes.rate_body_rad_s, axis=1)).min())
     limit_mag, snr_mag = detection_limit_mag(context, samples), snr_limit_mag(context, samples)
-    sky = context.testbed.sources.magnitude
+    sky = context.lab.camera.sources.magnitude
     known = known_share(context, limit_mag)
     lines = [
         f"the tracker detects V {limit_mag:.1f} (like the Sun) in {1e3 * scene.exposure.time_s:.4g} ms at"
@@ -40,14 +40,14 @@ def faintest_star(context: Context, samples: Samples) -> Fact | None:
 
 def known_share(context: Context, limit_mag: float) -> float:
     """Share of the sky's stars brighter than a limit that are also brighter than the tracker's faintest one."""
-    sky = context.testbed.sources.magnitude
+    sky = context.lab.camera.sources.magnitude
     seen = sky < limit_mag
     return float((sky[seen] <= context.beliefs.faintest_mag).mean()) if seen.any() else 1.0
 
 
 def sky_too_shallow(context: Context, samples: Samples) -> str:
     """Warn where the camera detects fainter stars than the simulated sky holds."""
-    light, sky = context.testbed.scene.light, context.testbed.sources.magnitude
+    light, sky = context.lab.scene.light, context.lab.camera.sources.magnitude
     if not isinstance(light, StarsConfig) or not len(sky):
         return ""
     limit_mag, faintest_mag = detection_limit_mag(context, samples), float(np.nanmax(sky))
@@ -64,7 +64,7 @@ def sky_too_shallow(context: Context, samples: Samples) -> str:
 
 def tracker_too_shallow(context: Context, samples: Samples) -> str:
     """Warn where most of the stars that the tracker detects are fainter than those that it knows."""
-    if not isinstance(context.testbed.scene.light, StarsConfig):
+    if not isinstance(context.lab.scene.light, StarsConfig):
         return ""
     limit_mag, faintest_mag = detection_limit_mag(context, samples), context.beliefs.faintest_mag
     known = known_share(context, limit_mag)
@@ -88,7 +88,7 @@ def detection_limit_mag(context: Context, samples: Samples) -> float:
     peak_e = threshold_e(context) * math.exp(context.settings.min_area_px / (2 * math.pi * blur2_px2))
     none = np.zeros(1)
     share = peak_share(np.array([blur2_px2]), none, none, np.array([least_streak_px(samples)]))[0]
-    reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.testbed.band))
+    reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
     return 2.5 * math.log10(reference_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s * share / peak_e)
 
 
@@ -107,7 +107,7 @@ def snr_limit_mag(context: Context, samples: Samples) -> float:
         * math.hypot(2 * math.sqrt(math.pi) * camera.lens_px, least_streak_px(samples))
     )
     signal_e = (SNR**2 + math.sqrt(SNR**4 + 4 * SNR**2 * area_px * camera.noise_e**2)) / 2
-    reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.testbed.band))
+    reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
     return 2.5 * math.log10(reference_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s / signal_e)
 
 

@@ -13,7 +13,7 @@ from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context, full_scale_e
 from skysim.simulation.checks.facts import Samples, short
 from skysim.simulation.exposure import stray_light_e_s
-from skysim.simulation.testbed import bodies_during, observer_during
+from skysim.simulation.lab import bodies_during, observer_during
 from skysim.sources.orbit.earth import limb_elevation_rad
 from skysim.sources.solar_system.places import place
 
@@ -27,12 +27,13 @@ def stray_light(context: Context, samples: Samples) -> Iterator[str]:
     With n0 the noise without it and s electrons of it the noise is sqrt(n0^2 + s), and the faintest star brighter by
     1.25 log10(1 + s / n0^2) magnitudes.
     """
-    testbed, at = context.testbed, samples.frames.attitudes
-    if testbed.scene.camera.baffle is None:
+    lab, at = context.lab, samples.frames.attitudes
+    if lab.scene.camera.baffle is None:
         return
-    cam_from_lab = testbed.mount.cam_from_body * at.lab_from_body.inv()
+    cam_from_lab = lab.camera.mount.cam_from_body * at.lab_from_body.inv()
     by_frame = [
-        stray_light_e_s(testbed, bodies_during(testbed, t), cam_from_lab[n], t) for n, t in enumerate(at.t_s.tolist())
+        stray_light_e_s(lab.camera, bodies_during(lab.camera, t), cam_from_lab[n], t)
+        for n, t in enumerate(at.t_s.tolist())
     ]
     stray_e = context.camera.exposure_s * np.array([sum(one.values()) for one in by_frame])
     n, own_e2 = int(stray_e.argmax()), context.camera.noise_e**2 - context.camera.stray_e
@@ -41,22 +42,22 @@ def stray_light(context: Context, samples: Samples) -> Iterator[str]:
         return
     allowed_e = own_e2 * (10 ** (MAX_LOSS_MAG / 1.25) - 1)
     source = max(by_frame[n], key=lambda name: by_frame[n][name])
-    full_e = full_scale_e(testbed.scene.camera.detector)
+    full_e = full_scale_e(lab.scene.camera.detector)
     yield (
         f"camera.baffle.pst: stray light of {short(stray_e[n])} electrons in a pixel, most of it of"
         f" {NAMES.get(source, source.capitalize())}, of {full_e:.0f} at saturation,"
-        f" at {attitudes.describe(at, n, testbed.scene, testbed.mount)}; the faintest star is {loss_mag:.1f} mag"
+        f" at {attitudes.describe(at, n, lab.scene, lab.camera.mount)}; the faintest star is {loss_mag:.1f} mag"
         f" brighter; change it to {short(allowed_e / stray_e[n], 2)} times as much, or point farther away"
     )
 
 
 def exclusion(context: Context, samples: Samples) -> Iterator[str]:
     """Warn where a frame's boresight is within an exclusion angle of the orbit's tracker: the frame nearest to it."""
-    testbed, at = context.testbed, samples.frames.attitudes
-    limits = testbed.scene.orbit.exclusion if testbed.scene.orbit else None
+    lab, at = context.lab, samples.frames.attitudes
+    limits = lab.scene.orbit.exclusion if lab.scene.orbit else None
     if limits is None:
         return
-    boresight = (at.lab_from_body * testbed.mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
+    boresight = (at.lab_from_body * lab.camera.mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
     angles_deg = np.array([beside_deg(context, t, axis) for t, axis in zip(at.t_s.tolist(), boresight, strict=True)])
     for column, (name, limit_deg) in enumerate(
         (("sun", limits.sun_deg), ("earth", limits.earth_deg), ("moon", limits.moon_deg))
@@ -66,13 +67,13 @@ def exclusion(context: Context, samples: Samples) -> Iterator[str]:
             what = f"{NAMES[name]}'s limb" if name == "earth" else NAMES[name]
             yield (
                 f"orbit.exclusion.{name}_deg: {what} is {angles_deg[n, column]:.1f}° from the boresight at"
-                f" {attitudes.describe(at, n, testbed.scene, testbed.mount)}, within {limit_deg:g}°; point farther away"
+                f" {attitudes.describe(at, n, lab.scene, lab.camera.mount)}, within {limit_deg:g}°; point farther away"
             )
 
 
 def beside_deg(context: Context, t_s: float, boresight: Floats) -> Floats:
     """(3,) angles of a boresight from the Sun's center, the Earth's limb and the Moon's center at a time."""
-    here = observer_during(context.testbed, t_s)
+    here = observer_during(context.lab.camera, t_s)
     sun, moon = (float(angular_separation_deg(boresight, place(name, here).direction)) for name in ("sun", "moon"))
     limb_deg = math.degrees(float(limb_elevation_rad(here.from_earth.position_m, boresight)))
     return np.array([sun, limb_deg, moon])

@@ -13,9 +13,9 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.quantities.tolerance import scaled_errors
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import AimingConfig, FibersConfig

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
@@ -25,8 +26,6 @@ from skysim.sources.dome.led import (
 from skysim.sources.dome.placement.neighborhoods import unique_levels
 from skysim.sources.dome.shell.surface import Surface
 from skysim.sources.photometry import Band
-
-GOLDEN_ANGLE_RAD = np.pi * (3 - np.sqrt(5))
 
 Ints = NDArray[np.int64]
 

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
+from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.jit import jit
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.leds import Lobe
@@ -25,7 +26,6 @@ from skysim.sources.dome.led import LOBES
 from skysim.sources.dome.shell.surface import Surface
 
 PATCHES = 700  # on the wall, and as many on the floor
-GOLDEN_RAD = np.pi * (3 - np.sqrt(5))  # the golden angle
 MAX_DIRECTIONS = 20_000  # from the bearing, for a wall that fills little of its sky
 LOBE_SAMPLES = 2049  # of a lobe, at even cosines: within 1e-5 of cos^10
 
@@ -103,7 +103,7 @@ def wall_patches(wall: Surface, reflectance: float) -> Patches:
 def floor_patches(config: FloorConfig) -> Patches:
     """PATCHES patches of the floor, of equal area, on a spiral."""
     radius_m = config.radius_m * np.sqrt((np.arange(PATCHES) + 0.5) / PATCHES)
-    azimuth = np.arange(PATCHES) * GOLDEN_RAD
+    azimuth = np.arange(PATCHES) * GOLDEN_ANGLE_RAD
     place_m = np.column_stack([radius_m * np.cos(azimuth), radius_m * np.sin(azimuth), 0 * radius_m - config.depth_m])
     area_m2 = np.full(PATCHES, np.pi * config.radius_m**2 / PATCHES)
     return Patches(place_m, np.tile([0.0, 0.0, 1.0], (PATCHES, 1)), area_m2, np.full(PATCHES, config.share))
@@ -117,7 +117,7 @@ def joined(wall: Patches, floor: Patches) -> Patches:
 def spiral(count: int) -> Floats:
     """(N, 3) unit vectors of a Fibonacci spiral: all of nearly the same solid angle 4 pi / N."""
     z = 1 - (2 * np.arange(count) + 1) / count
-    azimuth = np.arange(count) * GOLDEN_RAD
+    azimuth = np.arange(count) * GOLDEN_ANGLE_RAD
     ring = np.sqrt(1 - z**2)
     return np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
 

@@ -16,11 +16,12 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
+from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 
 KEY = "light.surface.file"  # names the file of points
-UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 1e-3, "in": 0.0254}
+UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 1e-3, "in": INCH_M}
 POINTS_PER_TERM = 3  # fewer would leave too few degrees of freedom to judge the fit
 MAX_CONDITION = 1e3  # of the fit; points spread evenly over the disk have about 5
 SECTORS = 12  # of azimuth, in each of which points must reach the surface's edge

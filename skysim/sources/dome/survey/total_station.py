@@ -25,14 +25,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from skysim.core.constants import ARCSEC_RAD, PPM
 from skysim.core.errors import InputError
 from skysim.core.quantities.tolerance import scaled_errors
-from skysim.core.quantities.units import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.tracker import TotalStationConfig
 
 SETUP_ERRORS = 8  # centering 3, leveling 2, orientation, scale, zero point
-PPM = 1e-6
 
 
 def polar(config: TotalStationConfig, place_m: Floats) -> tuple[Floats, Floats, Floats]:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from skysim.core.constants import HOUR_S, PPM
 from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import LED_CLOCKS, random_stream
 from skysim.core.types import Floats, Sources
@@ -27,8 +28,7 @@ from skysim.scene.sections.layouts import Layout, OnPoints
 from skysim.scene.sections.leds import ClockConfig, DirectConfig, PwmConfig
 from skysim.scene.sections.light import DomeConfig, Light
 
-LONGEST_ON_S = 3600.0  # a controller was switched on up to so long before the run; many times any period
-PPM = 1e-6
+LONGEST_ON_S = HOUR_S  # a controller was switched on up to so long before the run; many times any period
 FILTER_STREAM = 4  # spawn key, under the hardware's seed, of the filters' errors
 
 
@@ -54,7 +54,7 @@ class Clocks:
         rng = random_stream(seed, stream)
         on_s = rng.uniform(0, LONGEST_ON_S, count)
         drift_ppm_h = scaled_errors(config.drift_ppm_h, rng.standard_normal(count))
-        return cls(on_s, PPM * offset_ppm, PPM / 3600 * drift_ppm_h)
+        return cls(on_s, PPM * offset_ppm, PPM / HOUR_S * drift_ppm_h)
 
     def lights_at(self, sources: Sources, t_s: float, exposure_s: float) -> Sources:
         """The sources with their pulse trains about t_s, or as their filters smooth them over an exposure about it.

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from skysim.experiments.dome_survey.results.findings import Coverage
     from skysim.experiments.dome_survey.survey_run import SurveyRun
     from skysim.scene.scene import Scene
-    from skysim.simulation.testbed import Testbed
+    from skysim.simulation.lab import Lab
 
 FRAMES, NEXT, CHECKS = 150, 12, 40
 
@@ -185,8 +185,8 @@ def survey_mode(
     return mode
 
 
-def planned(request: Request) -> tuple[Testbed, CalibrationPrior, Plan]:
-    """The test bed with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
+def planned(request: Request) -> tuple[Lab, CalibrationPrior, Plan]:
+    """The lab with the onboard model before a survey, whose errors are drawn, that model, and a plan."""
     from skysim.experiments.dome_survey import procedure
 
     return procedure.plan_survey(
@@ -217,8 +217,8 @@ def repeated(request: Request, repeat: int) -> dict[str, Any]:
     """The errors predicted and those of simulated surveys, side by side."""
     from skysim.experiments.dome_survey import procedure
 
-    testbed, _, plan = planned(request)
-    surveys = procedure.repeat_survey(testbed, request.uncertainty, plan, repeat)
+    lab, _, plan = planned(request)
+    surveys = procedure.repeat_survey(lab, request.uncertainty, plan, repeat)
     results = list(progress(surveys, repeat, "surveys"))
     errors = [one for one in results if isinstance(one, procedure.Errors)]
     failures = [one for one in results if isinstance(one, InputError)]
@@ -239,21 +239,21 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str
     """A simulated survey, compared with the truth."""
     from skysim.experiments.dome_survey import adjust, frames, prior, procedure, stops
     from skysim.experiments.dome_survey.results import findings, report
-    from skysim.simulation.testbed import build_tracker
+    from skysim.simulation.lab import build_tracker
     from skysim.tracking import factory
 
-    testbed, before, plan = planned(request)
-    uncertainty, first_tracker = request.uncertainty, build_tracker(testbed)
-    taken = procedure.simulated_frames(testbed, uncertainty, plan.lab_from_body, frames_to)
+    lab, before, plan = planned(request)
+    uncertainty, first_tracker = request.uncertainty, build_tracker(lab.camera)
+    taken = procedure.simulated_frames(lab, uncertainty, plan.lab_from_body, frames_to)
     observations = list(progress(taken, len(plan.shown), "rendering"))
     with progress_callback("adjusting") as update, coverage_shown(request, observations, before, plan.model.sigma_px):
         run = adjust.run_survey(observations, before, uncertainty, request.distortion, update)
-    statistics = write_results(request, run, before, testbed)
-    tracker = factory.build_tracker(prior.with_map(testbed.scene, statistics["map"]), testbed.mount, testbed.sources)
+    statistics = write_results(request, run, before, lab)
+    tracker = factory.build_tracker(prior.with_map(lab.scene, statistics["map"]), lab.camera.mount, lab.camera.sources)
     tests = frames.render_stops(
-        testbed, stops.stop_attitudes(testbed.scene, "checks", checks, request.tilt_deg), len(plan.shown)
+        lab, stops.stop_attitudes(lab.scene, "checks", checks, request.tilt_deg), len(plan.shown)
     )
-    statistics |= report.truth_statistics(run, before, testbed)
+    statistics |= report.truth_statistics(run, before, lab)
     statistics |= report.compare_trackers(
         {"before": first_tracker, "after": tracker}, progress(tests, checks, "comparing")
     )
@@ -269,13 +269,13 @@ def from_images(request: Request, images: Path, camera_file: Path, watch: bool) 
     """A survey from the images of a folder, with the LEDs of the scene as the list before it."""
     from skysim.experiments.dome_survey import prior, procedure
     from skysim.experiments.dome_survey.folder import images as survey_images
-    from skysim.simulation.testbed import build_testbed
+    from skysim.simulation.lab import build_lab
     from skysim.tracking import settings
 
     camera, gain_and_saturation = image_camera(camera_file)
-    testbed = build_testbed(prior.as_listed(request.scene))
-    before = prior.listed_prior(testbed, camera)
-    stages = settings.assumed_settings(testbed.scene)
+    lab = build_lab(prior.as_listed(request.scene))
+    before = prior.listed_prior(lab, camera)
+    stages = settings.assumed_settings(lab.scene)
     if gain_and_saturation is not None:
         gain_e_dn, saturation = gain_and_saturation
         stages = replace(stages, gain_e_dn=gain_e_dn, saturation=saturation)
@@ -360,9 +360,7 @@ def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> di
     }
 
 
-def write_results(
-    request: Request, run: SurveyRun, before: CalibrationPrior, testbed: Testbed | None
-) -> dict[str, Any]:
+def write_results(request: Request, run: SurveyRun, before: CalibrationPrior, lab: Lab | None) -> dict[str, Any]:
     """Write map and picture of a survey, and return its statistics; a simulated one is drawn with its errors."""
     from skysim.core.io import files
     from skysim.experiments.dome_survey import adjust, stops
@@ -376,7 +374,7 @@ def write_results(
     statistics = report.survey_statistics(run, before) | with_next(request, so_far, before)
     statistics |= {"scene": request.scene.name, "faults": asdict(faults), "map": str(path), "picture": str(picture)}
     further = stops.from_rows(statistics["next"])
-    errors = report.led_errors(run.survey, before, testbed) if testbed else None
+    errors = report.led_errors(run.survey, before, lab) if lab else None
     files.write_image(picture, report.survey_figure(so_far, faults, further, errors, report.list_shifts(run)))
     return statistics
 

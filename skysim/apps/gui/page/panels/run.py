@@ -168,13 +168,13 @@ class RunPanel:
         """Compute piece by piece, so that keys and other requests get their turn; return whether it was all."""
         session = self.tab.session
         step = await self.tab.await_result(session.run("begin_flight"))
-        while step is not None and step.phase != "done" and not self.stopping:
+        while step is not None and not step.is_done and not self.stopping:
             self.take(step)
             step = await self.tab.await_result(session.run("advance_flight", BUDGET_S))
         if step is not None:
             self.take(step)
         self.stopping = False
-        return step is not None and step.phase == "done"
+        return step is not None and step.is_done
 
     def take(self, step: FlightStep) -> None:
         """Take over what is new of the flight."""
@@ -182,11 +182,8 @@ class RunPanel:
         self.residuals += step.residuals
         self.times_s += [row.t_s for row in step.rows]
         self.log = step.log or self.log
-        self.bar.set_value(step.done / max(step.total, 1e-9))
-        if step.phase == "motion":
-            self.summary.set_text(f"motion: {step.done:.2f} of {step.total:.2f} s")
-        else:
-            self.summary.set_text(f"frames: {step.done:.0f} of {step.total:.0f}")
+        self.bar.set_value(step.t_s / max(step.duration_s, 1e-9))
+        self.summary.set_text(f"{step.t_s:.2f} of {step.duration_s:.2f} s, {len(self.rows)} frames")
         if time.monotonic() > self.drawn_s + DRAW_S and (step.rows or step.log):
             self.draw()
 

@@ -11,16 +11,16 @@ from skysim.apps.gui.messages import LabGeometry, LookFrom
 from skysim.core.types import Floats, Sources
 from skysim.dynamics import multibody
 from skysim.dynamics.multibody.view.mjcf_export import FOVY_DEG, LED_RADIUS_M, SKY_RADIUS_M
-from skysim.simulation.testbed import Testbed, export_mjcf
+from skysim.simulation.lab import Lab
 
 MAX_STARS, MAX_LEDS = 600, 4000
 WIDE_DEG = 100.0  # of the view from the bearing
 
 
-def lab_geometry(testbed: Testbed) -> LabGeometry:
-    """Geometry of a testbed: that of its MJCF file, its lights, and the places to look from."""
-    lab = multibody.laboratory(export_mjcf(testbed))
-    return LabGeometry(lab.shapes, *lights(testbed.sources), views(testbed, lab))
+def lab_geometry(lab: Lab) -> LabGeometry:
+    """Geometry of a lab: that of its MJCF file, its lights, and the places to look from."""
+    model = multibody.laboratory(lab.export_mjcf())
+    return LabGeometry(model.shapes, *lights(lab.camera.sources), views(lab, model))
 
 
 def lights(sources: Sources) -> tuple[NDArray[np.int64], Floats, Floats, NDArray[np.bool_]]:
@@ -38,19 +38,19 @@ def lights(sources: Sources) -> tuple[NDArray[np.int64], Floats, Floats, NDArray
     return sources.id[rows], position_m, radius_m, power[rows] > 0
 
 
-def views(testbed: Testbed, lab: multibody.Laboratory) -> dict[str, LookFrom]:
+def views(lab: Lab, model: multibody.Laboratory) -> dict[str, LookFrom]:
     """The places to look from: outside, from the camera along its boresight, from the bearing up, and from above."""
-    camera, mount = testbed.scene.camera, testbed.mount
+    camera, mount = lab.scene.camera, lab.camera.mount
     body_from_cam = mount.cam_from_body.inv()
-    pupil_m, height_m = mount.camera_body_m, np.linalg.norm(lab.eye_m - lab.target_m)
+    pupil_m, height_m = mount.camera_body_m, np.linalg.norm(model.eye_m - model.target_m)
     field_deg = 2 * math.degrees(math.atan(camera.height_px / 2 / camera.focal_px))
     up, north = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
     ahead, above = body_from_cam.apply([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     return {
-        "outside": look_from(lab.eye_m, lab.target_m, up, FOVY_DEG),
+        "outside": look_from(model.eye_m, model.target_m, up, FOVY_DEG),
         "camera": look_from(pupil_m, pupil_m + ahead, above, field_deg, on_vehicle=True),
         "bearing": look_from(np.zeros(3), up, north, WIDE_DEG),
-        "top": look_from(lab.target_m + height_m * up, lab.target_m, north, FOVY_DEG),
+        "top": look_from(model.target_m + height_m * up, model.target_m, north, FOVY_DEG),
     }
 
 

@@ -9,7 +9,7 @@ from estimator.core.types import Attitude
 from skysim.apps.gui.messages import Lens, Pose
 from skysim.core.types import Floats, Truth
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 from skysim.sources.dome.shell import surface
 from skysim.tracking.onboard_model import calibration
 
@@ -25,21 +25,21 @@ def lens_of(camera: Camera) -> Lens:
     return Lens(NODES, *(tuple(column.tolist()) for column in tangents.T))
 
 
-def scene_lens(testbed: Testbed) -> Lens:
+def scene_lens(lab: Lab) -> Lens:
     """The tables of a scene's true camera."""
-    return lens_of(calibration(testbed.scene.camera))
+    return lens_of(calibration(lab.scene.camera))
 
 
-def scene_pose(testbed: Testbed, lens: Lens, truth: Truth) -> Pose:
+def scene_pose(lab: Lab, lens: Lens, truth: Truth) -> Pose:
     """The true attitude of a frame's camera; under a dome also where its rays meet the surface."""
     lab_from_cam = truth.cam_from_lab.inv()
     rotation = tuple(lab_from_cam.as_matrix().ravel().tolist())
-    if not isinstance(testbed.scene.light, DomeConfig):
+    if not isinstance(lab.scene.light, DomeConfig):
         return Pose(rotation)
-    place_m = truth.lab_from_body.apply(testbed.mount.camera_body_m)
+    place_m = truth.lab_from_body.apply(lab.camera.mount.camera_body_m)
     rays_cam = np.column_stack([lens.x, lens.y, np.ones(len(lens.x))])
     length = np.linalg.norm(rays_cam, axis=1)
-    dome = surface.build_surface(testbed.scene.light.surface)
+    dome = surface.build_surface(lab.scene.light.surface)
     points_m = dome.meet(place_m, lab_from_cam.apply(rays_cam / length[:, None]))
     depth_m = np.linalg.norm(points_m - place_m, axis=1) / length  # along the boresight; NaN where a ray meets nothing
     return Pose(rotation, tuple(place_m.tolist()), tuple(rounded(depth_m)))

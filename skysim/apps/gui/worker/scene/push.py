@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,8 @@ from skysim.core.types import Floats, Trajectory
 from skysim.dynamics import multibody
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import CollimatedDisplayConfig
-from skysim.simulation.testbed import MARGIN_S, Testbed, exposure_window
+from skysim.simulation.lab import Lab
+from skysim.simulation.timing import MARGIN_S, exposure_window
 
 PULL_RAD_S = 1.5  # a held vehicle without gravity would swing at this angular frequency about where it is pulled to
 PERIOD_S = 0.01  # for which a torque is held in body axes
@@ -29,25 +29,25 @@ class Grip(NamedTuple):
 
 
 class Push:
-    """The motion of a testbed's vehicle from rest at an attitude, as long as the user lets it go on.
+    """The motion of a lab's vehicle from rest at an attitude, as long as the user lets it go on.
 
     simulation    : with gravity, drag, cable, tilt stop and the rotors' momentum; without disturbances and controller
     lab_from_body : the present attitude
     torque_nm     : (3,) of the grip in the last period, body axes
     """
 
-    def __init__(self, testbed: Testbed, lab_from_body: Rotation) -> None:
-        require_vehicle(testbed.scene)
-        self.testbed = testbed
+    def __init__(self, lab: Lab, lab_from_body: Rotation) -> None:
+        require_vehicle(lab.scene)
+        self.lab = lab
         kept_s = self.exposure_s + MAX_ADVANCE_S
-        self.simulation = multibody.Simulation(testbed.vehicle, lab_from_body, np.zeros(3), math.inf, kept_s)
+        self.simulation = multibody.Simulation(lab.vehicle, lab_from_body, np.zeros(3), math.inf, kept_s)
         self.lab_from_body, self.torque_nm = lab_from_body, np.zeros(3)
 
     @property
     def exposure_s(self) -> float:
         """How much of the motion a frame sees."""
-        window = exposure_window(self.testbed.scene, 0)
-        return window.close_s(self.testbed.scene.camera.height_px) - window.open_s + 2 * MARGIN_S
+        window = exposure_window(self.lab.scene, 0)
+        return window.close_s(self.lab.scene.camera.height_px) - window.open_s + 2 * MARGIN_S
 
     def advance(self, grip: Grip | None, elapsed_s: float) -> None:
         """Integrate for a time with a torque that follows the vehicle; without a grip there is none."""
@@ -56,16 +56,16 @@ class Push:
         steps = round(min(elapsed_s, MAX_ADVANCE_S) / simulation.step_s)
         for begin in range(0, steps, period):
             lab_from_body = Rotation.from_quat(simulation.lab_from_body_wxyz, scalar_first=True)
-            self.torque_nm = pull_torque_nm(grip, lab_from_body, self.testbed.vehicle.inertia_kg_m2)
+            self.torque_nm = pull_torque_nm(grip, lab_from_body, self.lab.vehicle.inertia_kg_m2)
             control = np.zeros((min(period, steps - begin), simulation.model.nu))
             control[:, simulation.vehicle.torques] = self.torque_nm
             simulation.advance(control)
         self.lab_from_body = Rotation.from_quat(simulation.lab_from_body_wxyz, scalar_first=True)
 
-    def seen(self, testbed: Testbed) -> Testbed:
-        """A test bed of the same scene whose frame 0 sees the motion until now; before it the vehicle was at rest."""
-        window = exposure_window(testbed.scene, 0)
-        end_s = window.close_s(testbed.scene.camera.height_px) + MARGIN_S
+    def seen(self) -> Trajectory:
+        """A motion of which frame 0 sees what happened until now; before it the vehicle was at rest."""
+        window = exposure_window(self.lab.scene, 0)
+        end_s = window.close_s(self.lab.scene.camera.height_px) + MARGIN_S
         begin = self.simulation.step - math.ceil(self.exposure_s / self.simulation.step_s)
         motion = self.simulation.trajectory(max(begin, self.simulation.first_step))
         t_s, attitudes, rates = motion.t_s + end_s - self.simulation.now_s, motion.lab_from_body, motion.rate_body_rad_s
@@ -73,7 +73,7 @@ class Push:
         if t_s[0] > start_s:
             t_s, rates = np.append(start_s, t_s), np.concatenate([np.zeros((1, 3)), rates])
             attitudes = Rotation.concatenate([attitudes[:1], attitudes])
-        return replace(testbed, trajectory=Trajectory(t_s, attitudes, rates))
+        return Trajectory(t_s, attitudes, rates)
 
 
 def pull_torque_nm(grip: Grip | None, lab_from_body: Rotation, inertia_kg_m2: Floats) -> Floats:

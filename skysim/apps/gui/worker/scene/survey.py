@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from estimator.calibration.survey_plan import Mask, SurveyAccuracy
 from estimator.core.types import Centroids
 from skysim.apps.gui.messages import SurveyFound, SurveyPlan
-from skysim.apps.gui.worker.playback import Flight
+from skysim.apps.gui.worker.playback import Playback
 from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
@@ -26,8 +26,7 @@ from skysim.experiments.dome_survey.results.findings import Coverage
 from skysim.experiments.dome_survey.survey_run import SurveyRun
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import HoldConfig, SlewConfig
-from skysim.simulation import exposure
-from skysim.simulation.testbed import Testbed
+from skysim.simulation.lab import Lab
 from skysim.tracking import dome_map_file, onboard_model
 from skysim.tracking import settings as tracker_settings
 
@@ -41,13 +40,13 @@ UNCERTAINTY = prior.survey_uncertainty()  # that `skysim survey` assumes
 class Survey:
     """A survey of a scene's dome, with the uncertainties that `skysim survey` assumes.
 
-    testbed, before : with the errors of the onboard model before the survey, and this model
+    lab, before : with the errors of the onboard model before the survey, and this model
     noise_px : standard deviation of a centroid's coordinates, by which attitudes are chosen
     taken : the frames that were flown;  run : the newest adjustment that succeeded
     """
 
     scene: Scene
-    testbed: Testbed
+    lab: Lab
     before: CalibrationPrior
     noise_px: float
     taken: list[TakenFrame] = field(default_factory=list)
@@ -57,7 +56,7 @@ class Survey:
         """Whether a scene is the surveyed one, but for its sections `motion` and `exposure`."""
         return self.scene.model_copy(update={"motion": scene.motion, "exposure": scene.exposure}) == scene
 
-    def adjust(self, flight: Flight, count: int) -> SurveyFound:
+    def adjust(self, flight: Playback, count: int) -> SurveyFound:
         """Adjust the dome to all frames so far and those of a flight, and plan `count` further attitudes.
 
         Raises InputError if the flight has no further frames; the survey is then as before.
@@ -73,7 +72,7 @@ class Survey:
             run, refusal = None, str(error)
             so_far = findings.coverage_before(frames, self.before, UNCERTAINTY, self.noise_px)
         counts = findings.coverage_statistics(so_far)
-        truth = report.truth_statistics(run, self.before, self.testbed) if run else {}
+        truth = report.truth_statistics(run, self.before, self.lab) if run else {}
         found = SurveyFound(
             frames=len(taken),
             connected=int(run.survey.tied.sum()) if run else 0,
@@ -94,7 +93,7 @@ class Survey:
         self.taken, self.run = taken, run or self.run
         return found
 
-    def new_frames(self, flight: Flight) -> tuple[list[TakenFrame], int]:
+    def new_frames(self, flight: Playback) -> tuple[list[TakenFrame], int]:
         """The frames of a flight at which the vehicle rests, one of each hold, and the number of holds without one.
 
         Raises InputError if there are none, or the survey has them already.
@@ -109,13 +108,12 @@ class Survey:
         known = {frame.row for frame in self.taken if frame.flown == flight.bench.scene}
         if known >= set(rows):
             raise InputError("survey", "it has the frames of this flight", "a flight of the next attitudes")
-        settings = tracker_settings.assumed_settings(self.testbed.scene)
-        camera = onboard_model.assumed_camera(self.testbed.scene)
-        assert flight.moved is not None
+        settings = tracker_settings.assumed_settings(self.lab.scene)
+        camera = onboard_model.assumed_camera(self.lab.scene)
         new = []
         for row in (row for row in rows if row not in known):
             view = flight.frames[row].view
-            frame, _ = exposure.render_frame(flight.moved, row, exposure_s=view.exposure_s)
+            frame, _ = flight.flight.render(row)
             lab_from_body = quaternion.to_rotation(np.array(view.body_wxyz))
             lights = detect_lights(settings, camera, frame.image_dn)
             new.append(TakenFrame(flight.bench.scene, row, lab_from_body, lights))
@@ -157,9 +155,9 @@ class TakenFrame:
 def begin(scene: Scene, frames: int) -> tuple[Survey, SurveyPlan]:
     """A new survey of a scene's dome and its first attitudes. Raises InputError."""
     allow(frames)
-    testbed, before, plan = procedure.plan_survey(scene, UNCERTAINTY, frames, tilt_deg(scene))
+    lab, before, plan = procedure.plan_survey(scene, UNCERTAINTY, frames, tilt_deg(scene))
     steps = tuple(plan_step(*step) for step in plan.steps())
-    survey = Survey(scene, testbed, before, plan.model.sigma_px)
+    survey = Survey(scene, lab, before, plan.model.sigma_px)
     return survey, survey_plan(plan.lab_from_body, plan.shown, steps)
 
 
@@ -194,14 +192,14 @@ def known_share(run: SurveyRun | None) -> Floats:
     return np.where(run.accuracy.measured, np.clip(share, 0.0, 1.0), 0.0)
 
 
-def frames_at_rest(flight: Flight) -> tuple[list[int], int]:
+def frames_at_rest(flight: Playback) -> tuple[list[int], int]:
     """Rows of a flight's frames at which the vehicle rests, of each hold the last one, and the number of holds.
 
     It rests if its image moves by less than REST_PX during the exposure, as its true rate says: a controller may not
     reach the attitude, or not hold it.
     """
     motion = flight.bench.scene.motion
-    if flight.moved is None or not all(isinstance(one, SlewConfig | HoldConfig) for one in motion.maneuver):
+    if not flight.flight.is_over or not all(isinstance(one, SlewConfig | HoldConfig) for one in motion.maneuver):
         return [], 0
     reference, by_hold = guidance.plan(motion), dict[int, int]()
     holds = {leg for leg, one in enumerate(motion.maneuver) if isinstance(one, HoldConfig)}
@@ -209,7 +207,7 @@ def frames_at_rest(flight: Flight) -> tuple[list[int], int]:
         begin_s, exposure_s = kept.view.t_s, kept.view.exposure_s
         leg = int(np.searchsorted(reference.start_s, begin_s, side="right")) - 1
         if leg in holds and begin_s + exposure_s <= reference.start_s[leg + 1]:
-            rate_rad_s = np.linalg.norm(flight.moved.trajectory.rate_at(begin_s + exposure_s / 2))
+            rate_rad_s = np.linalg.norm(flight.flight.trajectory().rate_at(begin_s + exposure_s / 2))
             if rate_rad_s * exposure_s * flight.bench.scene.camera.focal_px < REST_PX:
                 by_hold[leg] = row
     return list(by_hold.values()), len(holds)

@@ -1,138 +1,38 @@
-"""Command laws of wheels, fans and control moment gyroscopes: torque on the body to actuator commands.
-
-MuJoCo simulates the rotors. Here every vector is in body axes and a set's n members are the columns of (3, n). A
-torque T is on the body; the stored momentum h changes by its opposite, dh/dt = -T. Stored momentum also acts on a
-rotating body, with -rate x h; the actuators do not compensate this: the controller adds +rate x h to its command.
-
-The inertia that responds to the torque is that of the body without its rotors' inertia about their axles, which do
-not follow the body about these: J - sum inertia axle axle^T.
-"""
+"""Control moment gyroscopes: hinge joints `gimbal_*`, each carrying a hinge joint `rotor_*` with the same suffix."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
+import mujoco
 import numpy as np
 
+from skysim.core.constants import RPM_RAD_S
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.scene.sections.motion import DesaturationConfig
+from skysim.dynamics.multibody.actuators.elements import Hinges, add_motor, joints, member_values
+from skysim.dynamics.multibody.actuators.kind import (
+    RANK_TOLERANCE,
+    ActuatorKind,
+    ControlInput,
+    positive_values,
+    scale_to_limit,
+    unit_columns,
+)
+from skysim.scene.sections.vehicle import CmgsConfig
+
+GIMBAL, ROTOR = "gimbal_", "rotor_"
 
 # Generalized singularity-robust inverse and the weights of variable-speed CMGs: the sizes are `assumed`.
 DAMPING = 0.01  # lambda at a singularity, in units of the rotors' momentum squared
 DITHER = 0.01  # off-diagonal part of the damping
 DITHER_RAD_S = math.pi / 2
 DAMPING_DECAY = 10.0  # of both away from a singularity: exp(-DAMPING_DECAY det A A^T)
-RANK_TOLERANCE = 1e-6  # directions with a smaller fraction of the largest singular value get no torque
-
-
-@jit
-def scale_to_limit(command: Floats, limit: float) -> Floats:
-    """Scale all elements of a command by one factor, so that none exceeds the limit and the direction is kept."""
-    peak = np.abs(command).max()
-    return command * (limit / peak if peak > limit else 1.0)
-
-
-def unit_columns(axes: Floats, name: str) -> Floats:
-    """(3, n) floats; raises InputError unless they are unit vectors."""
-    columns = np.ascontiguousarray(axes, dtype=float)  # one layout, or numba compiles for each
-    if columns.ndim != 2 or len(columns) != 3 or not columns.size:
-        raise InputError(name, f"shape {columns.shape}", "(3, n), one column each")
-    norm = np.linalg.norm(columns, axis=0)
-    if not np.all(np.abs(norm - 1) < 1e-6):
-        raise InputError(name, f"lengths {np.round(norm, 6).tolist()}", "unit vectors")
-    return columns
-
-
-def positive_values(value: Floats, n: int, name: str) -> Floats:
-    """(n,) positive floats; raises InputError otherwise."""
-    values = np.asarray(value, dtype=float)
-    if values.shape != (n,) or not np.all(values > 0):
-        raise InputError(name, values.tolist(), f"{n} positive numbers")
-    return values
-
-
-@dataclass(frozen=True, slots=True)
-class WheelSet:
-    """Reaction wheels: a motor's torque on its wheel acts oppositely on the body, T = -sum axis u.
-
-    axes : (3, n) unit vectors; a positive speed is right-handed about them
-    inertia_kg_m2 : (n,) of each wheel about its axle
-    speed_limit_rad_s : relative to the body
-    Raises InputError (one line) for axes that are not unit vectors and inertias that are not positive.
-    """
-
-    axes: Floats
-    inertia_kg_m2: Floats
-    torque_limit_nm: float
-    speed_limit_rad_s: float
-    motor_from_torque: Floats = field(init=False, repr=False)  # (n, 3) minus the pseudo-inverse of the axes
-
-    def __post_init__(self) -> None:
-        axes = unit_columns(self.axes, "wheel axes")
-        object.__setattr__(self, "axes", axes)
-        inertia = positive_values(self.inertia_kg_m2, axes.shape[1], "wheel inertia_kg_m2")
-        object.__setattr__(self, "inertia_kg_m2", inertia)
-        object.__setattr__(self, "motor_from_torque", -np.linalg.pinv(axes, rcond=RANK_TOLERANCE))
-
-    def momentum(self, speed_rad_s: Floats) -> Floats:
-        """Angular momentum (3,) that the wheels (n,) hold relative to the body: sum axis inertia speed."""
-        return self.axes @ (self.inertia_kg_m2 * speed_rad_s)
-
-    def drive(self, torque_nm: Floats, speed_rad_s: Floats, period_s: float) -> Floats:
-        """Motor torques (n,) on the wheels that give torque_nm (3,) on the body for the next period_s.
-
-        The smallest ones that do; if the axes do not span space (n < 3, or all in a plane), those nearest in
-        least squares.
-        Beyond the torque limit all are scaled together, which keeps the direction. A torque that would carry a wheel
-        beyond its speed limit is then reduced to what just reaches it (I d(speed)/dt = u, without the body's own
-        acceleration): a wheel at its limit can only be braked, and the direction is not kept.
-        """
-        # Scaling keeps the torque's direction; the clip to the speed limits afterwards may change it.
-        motor = scale_to_limit(self.motor_from_torque @ torque_nm, self.torque_limit_nm)
-        torque_per_speed = self.inertia_kg_m2 / period_s
-        upper = np.maximum(torque_per_speed * (self.speed_limit_rad_s - speed_rad_s), 0.0)
-        lower = np.minimum(-torque_per_speed * (self.speed_limit_rad_s + speed_rad_s), 0.0)
-        return np.minimum(np.maximum(motor, lower), upper)
-
-
-@dataclass(frozen=True, slots=True)
-class FanSet:
-    """Fans: thrust with a lever arm about the bearing's center rotates the vehicle, T = sum position x axis thrust.
-
-    force_axes : (3, n) unit vectors along which a positive thrust pushes the body
-    positions_m: (3, n) from the center of rotation
-    Raises InputError (one line) for axes that are not unit vectors and positions of another shape.
-    """
-
-    force_axes: Floats
-    positions_m: Floats
-    thrust_limit_n: float
-    torque_per_thrust_m: Floats = field(init=False, repr=False)  # (3, n) lever arms, N m per N
-    thrust_from_torque: Floats = field(init=False, repr=False)  # (n, 3)
-
-    def __post_init__(self) -> None:
-        axes, positions = unit_columns(self.force_axes, "fan axes"), np.asarray(self.positions_m, dtype=float)
-        if positions.shape != axes.shape:
-            raise InputError("fan positions_m", f"shape {positions.shape}", f"{axes.shape}, as the axes")
-        arms = np.cross(positions, axes, axis=0)
-        object.__setattr__(self, "torque_per_thrust_m", arms)
-        object.__setattr__(self, "thrust_from_torque", np.linalg.pinv(arms, rcond=RANK_TOLERANCE))
-
-    def torque(self, thrust_n: Floats) -> Floats:
-        """Torque (3,) on the body of thrusts (n,)."""
-        return self.torque_per_thrust_m @ thrust_n
-
-    def drive(self, torque_nm: Floats) -> Floats:
-        """Thrusts (n,), the smallest that give the torque (3,), or the nearest to it in least squares.
-
-        Beyond the limit all are scaled together, which keeps the direction. Each fan can blow either way. The
-        bearing takes the net force.
-        """
-        return scale_to_limit(self.thrust_from_torque @ torque_nm, self.thrust_limit_n)
 
 
 @jit
@@ -313,19 +213,75 @@ class CmgSet:
         return scale_to_limit(rate, self.gimbal_rate_limit_rad_s), np.zeros_like(rate)
 
 
-@dataclass(slots=True)
-class Desaturator:
-    """Momentum dumping by fans: torque -h / time on the body, once the stored momentum h exceeds a threshold.
+class CmgActuator:
+    """Control moment gyroscopes as the flight computer commands them, see `CmgSet`."""
 
-    The controller holds the body still against this torque, so that the wheels or CMGs absorb it and h decays as
-    exp(-t / time). Stateful: one motion each.
+    def __init__(self, model: Any, config: CmgsConfig) -> None:
+        self.gimbals = Hinges.from_model(model, GIMBAL)
+        self.rotors = Hinges.from_model(model, ROTOR)
+        self.rotor_rad_s = config.rotor_rpm * RPM_RAD_S
+        self.model = CmgSet(
+            self.gimbals.axes,
+            self.rotors.axes,
+            self.rotors.inertia_kg_m2,
+            math.radians(config.gimbal_rate_limit_deg_s),
+            config.rotor_torque_limit_nm,
+            config.steering,
+        )
+
+    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
+        angle, spin = inputs.angles_rad[self.gimbals.qpos], inputs.speeds_rad_s[self.rotors.dof]
+        rate, torque = self.model.drive(torque_nm, inputs.rate_body_rad_s, angle, spin, inputs.t_s)
+        control[self.gimbals.motor] = rate
+        achieved_nm = -self.model.jacobian(angle, spin) @ rate
+        if self.model.rotor_torque_limit_nm is not None:
+            control[self.rotors.motor] = torque
+            achieved_nm -= self.model.momentum(angle, torque / self.model.rotor_inertia_kg_m2)
+        return achieved_nm
+
+    def command_map(self) -> tuple[Floats, float]:
+        jacobian = self.model.jacobian(np.zeros(len(self.gimbals)), np.full(len(self.rotors), self.rotor_rad_s))
+        return np.asarray(np.linalg.pinv(jacobian), dtype=np.float64), self.model.gimbal_rate_limit_rad_s
+
+    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
+        return self.model.momentum(angles_rad[self.gimbals.qpos], speeds_rad_s[self.rotors.dof])
+
+
+def check_rotor_pairs(spec: Any, path: Path) -> None:
+    """Check that each rotor is on the gimbal with the same suffix. Raises InputError."""
+    for gimbal in joints(spec, GIMBAL):
+        suffix = gimbal.name.removeprefix(GIMBAL)
+        rotor = spec.joint(ROTOR + suffix)
+        if rotor is None or rotor.parent.parent != gimbal.parent:
+            raise InputError(path, f"joint {gimbal.name} has no joint {ROTOR}{suffix} on a child body of its own")
+    if len(joints(spec, ROTOR)) != len(joints(spec, GIMBAL)):
+        raise InputError(path, f"a joint {ROTOR}* has no joint {GIMBAL}* of the same suffix")
+
+
+def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
+    """A rate servo at each gimbal, and a motor at each variable-speed rotor; other rotors keep their momentum.
+
+    The servo's set-point is the integral of the commanded rate. A critically damped spring pulls the gimbal to it
+    with the scene's time constant, so that the rate is held against gyroscopic torque from the vehicle's rotation;
+    a damper alone would not hold it.
     """
+    tau_s = cmgs.gimbal_time_constant_s
+    for joint, inertia in zip(joints(spec, GIMBAL), Hinges.from_model(model, GIMBAL).inertia_kg_m2, strict=True):
+        servo = spec.add_actuator(name=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name)
+        servo.set_to_intvelocity(kp=inertia / tau_s**2, kv=2 * inertia / tau_s)
+    for joint in joints(spec, ROTOR):
+        if cmgs.rotor_torque_limit_nm:
+            add_motor(spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name, cmgs.rotor_torque_limit_nm)
 
-    config: DesaturationConfig
-    running: bool = False
 
-    def torque(self, momentum_nms: Floats) -> Floats:
-        """Torque (3,) that the fans should give on the body: zero until |h| > start, then -h / time down to stop."""
-        magnitude = math.sqrt(float(momentum_nms @ momentum_nms))
-        self.running = magnitude >= self.config.stop_nms if self.running else magnitude > self.config.start_nms
-        return momentum_nms * (-1.0 / self.config.time_s) if self.running else np.zeros(3)
+def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:
+    """Set the gimbals' angles at the start, and the rotors' speed."""
+    gimbals = Hinges.from_model(model, GIMBAL)
+    angles = np.radians(member_values(config.start_deg, len(gimbals), "vehicle.cmgs.start_deg"))
+    data.qpos[gimbals.qpos] = angles
+    driven = gimbals.motor >= 0
+    data.act[model.actuator_actadr[gimbals.motor[driven]]] = angles[driven]  # servo set-points
+    data.qvel[Hinges.from_model(model, ROTOR).dof] = config.rotor_rpm * RPM_RAD_S
+
+
+CMGS = ActuatorKind("cmgs", add_cmgs, CmgActuator, joints=(GIMBAL, ROTOR), start=start_cmgs, check=check_rotor_pairs)

@@ -1,0 +1,96 @@
+"""What the flight computer and the model ask of a kind of actuator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from skysim.core.errors import InputError
+from skysim.core.jit import jit
+from skysim.core.types import Floats
+
+RANK_TOLERANCE = 1e-6  # directions with a smaller fraction of the largest singular value get no torque
+
+
+class ControlInput(NamedTuple):
+    """The controller's inputs at the start of a control period: measured body rate (3,), all of qpos and qvel.
+
+    Of the latter only angles and speeds of wheels and gimbals are used, as encoders without errors.
+    """
+
+    t_s: float
+    period_s: float
+    rate_body_rad_s: Floats
+    angles_rad: Floats
+    speeds_rad_s: Floats
+
+
+class Actuators(Protocol):
+    """An actuator set: converts a torque (3,) on the body to entries of the controls (nu,)."""
+
+    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
+        """Write the commands; return (3,) the torque that they will give."""
+        ...
+
+    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
+        """(3,) stored angular momentum, in body axes."""
+        ...
+
+    def command_map(self) -> tuple[Floats, float]:
+        """(n, 3) commands per torque on the body with every gimbal at zero, and the limit of each command."""
+        ...
+
+
+def nothing(*_: Any) -> None:
+    """Default of the functions that a kind does not need."""
+
+
+@dataclass(frozen=True, slots=True)
+class ActuatorKind:
+    """A kind of actuator.
+
+    key     : of its section in the scene's `vehicle`, which switches it on
+    joints, sites : beginnings of the names of its joints and sites in the vehicle's file
+    add     : adds its motors to a spec; (spec, the compiled spec, config)
+    control : makes the set that the flight computer commands; (compiled model, config)
+    start   : sets the joints' angles and speeds in the data of a model; (model, data, config)
+    check   : raises InputError for joints that do not fit together; (spec, path of the file)
+    """
+
+    key: str
+    add: Callable[[Any, Any, Any], None]
+    control: Callable[[Any, Any], Actuators]
+    joints: tuple[str, ...] = ()
+    sites: tuple[str, ...] = ()
+    start: Callable[[Any, Any, Any], None] = nothing
+    check: Callable[[Any, Path], None] = nothing
+
+
+@jit
+def scale_to_limit(command: Floats, limit: float) -> Floats:
+    """Scale all elements of a command by one factor, so that none exceeds the limit and the direction is kept."""
+    peak = np.abs(command).max()
+    return command * (limit / peak if peak > limit else 1.0)
+
+
+def unit_columns(axes: Floats, name: str) -> Floats:
+    """(3, n) floats; raises InputError unless they are unit vectors."""
+    columns = np.ascontiguousarray(axes, dtype=float)  # one layout, or numba compiles for each
+    if columns.ndim != 2 or len(columns) != 3 or not columns.size:
+        raise InputError(name, f"shape {columns.shape}", "(3, n), one column each")
+    norm = np.linalg.norm(columns, axis=0)
+    if not np.all(np.abs(norm - 1) < 1e-6):
+        raise InputError(name, f"lengths {np.round(norm, 6).tolist()}", "unit vectors")
+    return columns
+
+
+def positive_values(value: Floats, n: int, name: str) -> Floats:
+    """(n,) positive floats; raises InputError otherwise."""
+    values = np.asarray(value, dtype=float)
+    if values.shape != (n,) or not np.all(values > 0):
+        raise InputError(name, values.tolist(), f"{n} positive numbers")
+    return values

@@ -1,0 +1,391 @@
+"""A lab in flight: its motion, the exposures of its cameras as they become due, and what the vehicle recorded.
+
+Every control period the flight computer reads the true or the estimated attitude and sets the actuators, MuJoCo
+integrates the equations of motion, and the IMU samples the motion (motion.py). A frame is rendered once, when its
+exposure and its latency have passed; it is solved, and with a filter the solution updates the attitude that the
+controller may use in the next period.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.core.types import RateEstimate
+from estimator.trackers.pipeline import Clock, Report
+from skysim.camera.render import Window
+from skysim.core.errors import InputError
+from skysim.core.types import Floats, Frame, Telemetry, Trajectory, Truth
+from skysim.dynamics import imu
+from skysim.scene.scene import Scene
+from skysim.simulation import timing
+from skysim.simulation.exposure import render_frame
+from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
+from skysim.simulation.motion import Motion, history_s
+from skysim.simulation.user_parts import NO_PARTS, UserParts, with_parts
+from skysim.tracking import factory, gyro
+from skysim.tracking.exposure_control import ExposureController
+
+FIRST_OBSERVATION = 1_000_000  # index of the first frame beside the schedule; it selects the frame's noise
+
+Progress = Callable[[float, float], None]
+FrameSelector = Callable[[int, float], bool]
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One exposure: its frame and truth, and what the star tracker made of it.
+
+    report        : of the tracker; None if the frame was not solved
+    rate          : of the gyro as the tracker got it; None without `tracker.gyro`
+    update_status : the filter's verdict on the solution; empty without a filter
+    seconds       : by stage of the rendering
+    """
+
+    camera: StarCamera
+    frame: Frame
+    truth: Truth
+    report: Report | None
+    rate: RateEstimate | None
+    update_status: str
+    seconds: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """The vehicle now, in truth.
+
+    lab_from_body  : attitude;  rate_body_rad_s : (3,) in body axes
+    wheel_rad_s, gimbal_rad : (n,) speeds of the wheels, angles of the CMGs' gimbals
+    """
+
+    t_s: float
+    lab_from_body: Rotation
+    rate_body_rad_s: Floats
+    wheel_rad_s: Floats
+    gimbal_rad: Floats
+
+
+class Schedule:
+    """The exposures of one camera in a flight.
+
+    index       : of the next frame
+    exposures_s : exposure times by index, of the frames that were exposed
+    """
+
+    def __init__(self, camera: StarCamera, number: int, frames: float) -> None:
+        self.camera = camera
+        self.number = number
+        self.frames = frames
+        self.exposure_control = ExposureController(camera.scene)
+        self.latency_s = camera.scene.filter.latency_s if camera.scene.filter else 0.0
+        self.index = 0
+        self.exposures_s: dict[int, float] = {}
+
+    @property
+    def window(self) -> Window:
+        """Of the next frame."""
+        return timing.exposure_window(self.camera.scene, self.index, self.exposure_control.exposure_s)
+
+    def due_s(self, window: Window) -> float:
+        """When the next frame is due: exposed, its solution ready, and the time come that it is tagged with."""
+        scene = self.camera.scene
+        rows = scene.camera.height_px
+        tagged_s = window.middle_s(rows) + timing.time_tag_error_s(scene, self.index)
+        return max(window.close_s(rows) + self.latency_s, tagged_s)
+
+
+class Flight:
+    """A lab in motion, from t = 0 on. The only object that has a state; use one for one motion.
+
+    parts         : what the user gives in place of the scene's parts
+    endless       : frames continue without end, whatever the scene's number
+    keeps_history : keep all past states, for telemetry and trajectory; else only those that the next frame needs
+
+    Raises InputError for a maneuver that the vehicle cannot follow. Close it, or use it as a context manager: an
+    external controller has a process.
+    """
+
+    def __init__(
+        self, lab: Lab, parts: UserParts = NO_PARTS, *, endless: bool = False, keeps_history: bool = True
+    ) -> None:
+        self.lab = lab
+        self.parts = parts
+        self.duration_s = math.inf if endless else lab.duration_s
+        self.motion = Motion(lab, parts.controllers, self.duration_s, None if keeps_history else history_s(lab))
+        self.schedules = [
+            Schedule(camera, number, math.inf if endless else camera.scene.exposure.frames)
+            for number, camera in enumerate(lab.cameras)
+        ]
+        self.trackers: dict[int, factory.Estimator] = {}
+        self.observations = 0
+        self.is_in_shots = False
+        self.flown: Trajectory | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the process of an external controller."""
+        self.motion.close()
+
+    # The motion
+
+    @property
+    def now_s(self) -> float:
+        """Time since the scene's start."""
+        return self.motion.simulation.now_s
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the motion has reached its end."""
+        return self.motion.simulation.steps_left == 0
+
+    @property
+    def state(self) -> State:
+        """The vehicle now."""
+        simulation = self.motion.simulation
+        vehicle = self.lab.vehicle
+        return State(
+            self.now_s,
+            Rotation.from_quat(simulation.lab_from_body_wxyz, scalar_first=True),
+            simulation.rate_body_rad_s.copy(),
+            simulation.speeds_rad_s[vehicle.wheels.dof],
+            simulation.angles_rad[vehicle.gimbals.qpos],
+        )
+
+    def step(self, torque_nm: Floats | None = None) -> list[Shot]:
+        """Simulate one control period. Returns the exposures that updated the filter in it; none without a filter.
+
+        torque_nm : (3,) in body axes that the scene's actuators are to give, in place of the controller's; the ideal
+            actuator gives it where the scene has no controller
+        Raises InputError inside a loop over `shots`, at the end of the motion, and for a torque on a prescribed motion.
+        """
+        if self.is_in_shots:
+            raise InputError("step", "inside a loop over shots, which steps by itself", "observe, or steps alone")
+        if self.is_over:
+            raise InputError("step", f"the motion has ended at {self.now_s:g} s", "more frames, or endless")
+        if torque_nm is not None and self.lab.scene.motion.is_prescribed:
+            raise InputError("step", "a prescribed motion takes no torque", "another motion.control.law")
+        torque = None if torque_nm is None else np.asarray(torque_nm, dtype=np.float64).reshape(3)
+        self.motion.advance(self.motion.period_steps, torque)
+        return [shot for schedule in self.filter_schedules for shot in self.capture_due(schedule)]
+
+    def simulate_motion(self, progress: Progress | None = None) -> Self:
+        """Simulate the rest of the motion. Only the frames that a filter needs are rendered.
+
+        progress : called as progress(t_s, duration_s) as the motion goes on
+        """
+        for _ in self.events(self.filter_schedules, progress=progress):
+            pass
+        return self
+
+    def advance(self, schedules: Sequence[Schedule]) -> None:
+        """Simulate one control period; as many as the next exposure needs if nothing depends on the motion."""
+        motion = self.motion
+        periods = 1
+        if motion.is_free:
+            due_s = min((one.due_s(one.window) for one in schedules if one.index < one.frames), default=math.inf)
+            left_s = min(due_s, self.duration_s) - self.now_s
+            periods = max(math.ceil(left_s / motion.flight_computer.period_s), 1)
+        motion.advance(periods * motion.period_steps)
+
+    @property
+    def filter_schedules(self) -> list[Schedule]:
+        """Of the cameras whose solutions the filter needs: with a filter all, else none."""
+        return self.schedules if self.lab.scene.filter and self.motion.navigation else []
+
+    def trajectory(self) -> Trajectory:
+        """The motion until now, with the vibration; of a flight without history its last part."""
+        if not self.is_over:
+            return self.motion.trajectory()
+        if self.flown is None:
+            self.flown = self.motion.trajectory()
+        return self.flown
+
+    def telemetry(self) -> Telemetry:
+        """True and estimated states at the ticks of the flight computer. Raises InputError without history."""
+        recorder = self.motion.recorder
+        if recorder is None:
+            raise InputError("telemetry", "this flight keeps no history", "keeps_history=True")
+        reference = self.motion.reference if self.lab.scene.motion.control else None
+        return recorder.telemetry(reference, self.lab.cameras)
+
+    def imu_samples(self, since_s: float = -math.inf) -> imu.Increments | None:
+        """The IMU's samples since about a time, as far as they are kept; None without an IMU."""
+        return self.motion.navigation.imu_samples(since_s) if self.motion.navigation else None
+
+    # The exposures
+
+    def shots(
+        self,
+        *,
+        cameras: Sequence[int] | None = None,
+        solves: bool = True,
+        selects: FrameSelector | None = None,
+        progress: Progress | None = None,
+    ) -> Iterator[Shot]:
+        """Simulate the rest of the motion; yield every exposure as it becomes due.
+
+        cameras  : numbers of the cameras whose exposures are yielded; all if left out
+        solves   : solve the frames; with a filter they are solved in any case
+        selects(index, close_s) : whether to render a frame of the main camera. Skipping one does not change the others,
+            except that exposure control and filter do not see it
+        progress : called as progress(t_s, duration_s) as the motion goes on
+        """
+        wanted = [n for n in range(len(self.schedules)) if cameras is None or n in cameras]
+        schedules = self.filter_schedules or [self.schedules[n] for n in wanted]
+        for shot in self.events(schedules, solves, selects, progress):
+            if shot is not None and shot.camera in [self.schedules[n].camera for n in wanted]:
+                yield shot
+
+    def events(
+        self,
+        schedules: Sequence[Schedule],
+        solves: bool = False,
+        selects: FrameSelector | None = None,
+        progress: Progress | None = None,
+    ) -> Iterator[Shot | None]:
+        """The shots of some cameras as in `shots`, and None whenever the motion has gone on."""
+        self.is_in_shots = True
+        try:
+            while not self.is_over:
+                self.advance(schedules)
+                for schedule in schedules:
+                    yield from self.capture_due(schedule, solves, selects)
+                yield None
+                if progress:
+                    progress(self.now_s, self.duration_s)
+            for schedule in schedules:
+                yield from self.capture_late(schedule, solves, selects)
+        finally:
+            self.is_in_shots = False
+
+    def capture_due(
+        self, schedule: Schedule, solves: bool = False, selects: FrameSelector | None = None
+    ) -> Iterator[Shot]:
+        """Yield the exposures of a camera that are due and not yet rendered; with a filter they update it."""
+        has_filter = bool(self.filter_schedules)
+        while schedule.index < schedule.frames and schedule.due_s(schedule.window) <= self.now_s:
+            yield from self.capture_next(schedule, solves or has_filter, selects, updates_filter=has_filter)
+
+    def capture_late(
+        self, schedule: Schedule, solves: bool = False, selects: FrameSelector | None = None
+    ) -> Iterator[Shot]:
+        """Yield the exposures that were over at the end of the motion, but due only later; no filter gets them."""
+        rows = schedule.camera.scene.camera.height_px
+        while schedule.index < schedule.frames and schedule.window.close_s(rows) <= self.now_s:
+            yield from self.capture_next(schedule, solves, selects, updates_filter=False)
+
+    def capture_next(
+        self, schedule: Schedule, solves: bool, selects: FrameSelector | None, updates_filter: bool
+    ) -> Iterator[Shot]:
+        """Yield the next exposure of a camera, unless it is not selected."""
+        index = schedule.index
+        window = schedule.window
+        schedule.index += 1
+        close_s = window.close_s(schedule.camera.scene.camera.height_px)
+        if selects and schedule.number == 0 and not selects(index, close_s):
+            return
+        schedule.exposures_s[index] = window.exposure_s
+        shot = self.capture(schedule, index, window, solves, updates_filter)
+        schedule.exposure_control.update(shot.frame)
+        yield shot
+
+    def capture(self, schedule: Schedule, index: int, window: Window, solves: bool, updates_filter: bool) -> Shot:
+        """Render an exposure, solve it, and update the filter with the solution."""
+        camera = schedule.camera
+        clock = Clock()
+        trajectory = self.trajectory() if self.is_over else self.motion.trajectory(window.open_s)
+        frame, truth = render_frame(camera, trajectory.since(window.open_s), index, clock, window)
+        rate = self.measured_rate(camera, window)
+        report = None
+        if solves:
+            tracker = self.tracker_of(schedule, frame)
+            report = factory.solve_frame(tracker, frame, rate=rate)
+        update_status = ""
+        if updates_filter and report and self.motion.navigation:
+            # The filter takes the solution at its mid-exposure time, although it arrives later.
+            update_status = self.motion.navigation.update_filter(frame.t_mid_s, report.attitude, schedule.number)
+        return Shot(camera, frame, truth, report, rate, update_status, clock.seconds)
+
+    def tracker_of(self, schedule: Schedule, frame: Frame) -> factory.Estimator:
+        """The tracker of a camera, compiled by a first solution of the frame, so that times are those of solving.
+
+        External trackers are not: each frame must reach them once, in order.
+        """
+        number = schedule.number
+        if number not in self.trackers:
+            own = self.parts.tracker if number == 0 else None
+            self.trackers[number] = own or build_tracker(schedule.camera, self.parts.programs)
+            if not isinstance(self.trackers[number], factory.UserTracker):
+                factory.solve_frame(self.trackers[number], frame)
+        return self.trackers[number]
+
+    def measured_rate(self, camera: StarCamera, window: Window) -> RateEstimate | None:
+        """The gyro's rate during an exposure as the tracker gets it; None without `tracker.gyro`."""
+        scene = camera.scene
+        config = scene.vehicle.imu
+        if config is None or not scene.tracker.gyro:
+            return None
+        samples = self.imu_samples(window.open_s)
+        if samples is None:
+            return None
+        return gyro.rate_of_frame(samples, window, scene.camera.height_px, config, camera.mount)
+
+    def render(self, index: int, camera: int = 0) -> tuple[Frame, Truth]:
+        """Render an exposure of the schedule from the motion so far; bit for bit that of `shots`.
+
+        Raises InputError for a frame that automatic exposure has not exposed yet.
+        """
+        schedule = self.schedules[camera]
+        scene = schedule.camera.scene
+        exposure_s = schedule.exposures_s.get(index)
+        if exposure_s is None and scene.tracker.exposure_control:
+            raise InputError("render", f"frame {index} has no exposure time yet", "after it came from shots")
+        window = timing.exposure_window(scene, index, exposure_s)
+        return render_frame(schedule.camera, self.trajectory(), index, None, window)
+
+    def observe(self, camera: int = 0, *, solves: bool = True) -> Shot:
+        """Render and solve an exposure that ends now, beside the schedule; the filter does not get it.
+
+        Each has noise of its own. Before t = 0 the vehicle has turned at the rate of its start.
+        """
+        schedule = self.schedules[camera]
+        scene = schedule.camera.scene
+        window = timing.window_from(scene, 0.0, schedule.exposure_control.exposure_s)
+        window = window._replace(open_s=self.now_s - window.close_s(scene.camera.height_px))
+        index = FIRST_OBSERVATION + self.observations
+        self.observations += 1
+        return self.capture(schedule, index, window, solves, updates_filter=False)
+
+
+def open_flight(
+    scene: Scene,
+    *,
+    controller: Any = None,
+    tracker: Any = None,
+    profile: Any = None,
+    programs: Mapping[str, str] = factory.NO_PROGRAMS,
+    endless: bool = False,
+    keeps_history: bool = True,
+) -> Flight:
+    """Build the lab of a scene and open a flight of it; the parts are those of `skysim.simulate`.
+
+    Raises InputError for a part that cannot be used, before any long work.
+    """
+    scene, parts = with_parts(scene, programs, controller, tracker, profile)
+    return Flight(build_lab(scene, parts), parts, endless=endless, keeps_history=keeps_history)
+
+
+def simulate_motion(scene: Scene, progress: Progress | None = None) -> Flight:
+    """A flight of the scene at its end. Only the frames that a filter needs are rendered."""
+    return open_flight(scene).simulate_motion(progress)

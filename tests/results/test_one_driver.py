@@ -1,0 +1,40 @@
+"""The command line and Python run a scene by the same code: what they write is the same."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+from astropy.table import Table
+from typer.testing import CliRunner
+
+import skysim
+from skysim.apps.cli.main import app
+
+TIMES = ("time_ms",)  # of this run, not of the scene
+
+
+def digest(path: Path) -> str:
+    """Hash of a file; of a table without the times that its run took."""
+    if path.name != "solutions.ecsv":
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    table = Table.read(path)
+    table.remove_columns(TIMES)
+    return hashlib.sha256(repr(table.as_array().tolist()).encode()).hexdigest()
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Of all files but the reports, which name their command."""
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix != ".html"]
+    return {str(path.relative_to(folder)): digest(path) for path in files}
+
+
+@pytest.mark.parametrize(("name", "frames"), [("shefex2", 2), pytest.param("two_heads", 2, marks=pytest.mark.slow)])
+def test_the_command_and_python_write_the_same_files(tmp_path: Path, name: str, frames: int) -> None:
+    by_command = CliRunner().invoke(app, ["run", name, "--frames", str(frames), "--out", str(tmp_path / "command")])
+    assert by_command.exit_code == 0, by_command.output
+    skysim.simulate(skysim.load_scene(name, {"exposure.frames": frames})).save(tmp_path / "python")
+    written = digests(tmp_path / "command")
+    assert written == digests(tmp_path / "python")
+    assert "frame_0001.fits" in written
