@@ -149,7 +149,7 @@ def datetime_from_iso(text: str | None) -> datetime.datetime | None:
     try:
         return datetime.datetime.fromisoformat(text)
     except ValueError:
-        raise InputError("--time", text, "ISO 8601, e.g. 2012-06-22T21:00:00") from None
+        raise InputError(f"--time {text}", "", "ISO 8601, e.g. 2012-06-22T21:00:00") from None
 
 
 def with_location(finding: str, loaded: Loaded | None = None) -> str:

@@ -119,7 +119,7 @@ def pipe_writer(path: str) -> Callable[[Packet], None]:
     The pipe is opened at the first packet, which blocks until a reader opens it. Raises InputError if it is no pipe.
     """
     if path != "-" and not Path(path).is_fifo():
-        raise InputError("--pipe", f"{path} is not a named pipe", "- or a pipe made by mkfifo")
+        raise InputError(f"--pipe {path}", "not a named pipe", "- or a pipe made by mkfifo")
 
     @functools.cache
     def stream() -> BinaryIO:

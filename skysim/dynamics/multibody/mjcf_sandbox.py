@@ -159,7 +159,7 @@ def is_moderate(word: str) -> bool:
 
 def unreadable(path: Path, error: Exception) -> InputError:
     """The error for a file that cannot be read, or is not UTF-8 or not XML."""
-    return InputError(path, f"not a MuJoCo model: {' '.join(str(error).split())}")
+    return InputError(path, f"not a MuJoCo model: {error}")
 
 
 def require(path: Path, condition: bool, allowed: str) -> None:

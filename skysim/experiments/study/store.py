@@ -438,8 +438,7 @@ def sqlite_errors_as_input_error(path: Path, what: str = "") -> Iterator[None]:
     try:
         yield
     except (sqlite3.DatabaseError, UnicodeDecodeError, MemoryError) as error:
-        message = " ".join(str(error).split()) or "not enough memory"
-        raise InputError(path, f"{what}{message}") from None
+        raise InputError(path, f"{what}{str(error) or 'not enough memory'}") from None
 
 
 @contextmanager

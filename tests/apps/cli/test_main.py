@@ -664,5 +664,5 @@ def test_compare_takes_options_of_any_of_its_trackers() -> None:
     for trackers in (["own"], ["mine"]):
         with pytest.raises(InputError, match="has no effect"):
             load("shefex2", 1, None, words, trackers)
-    with pytest.raises(InputError, match=r"tracker.assumed_camera_body: has no effect.*\(--set\)"):
+    with pytest.raises(InputError, match=r"tracker.assumed_camera_body: has no effect.*\(overrides\)"):
         load("shefex2", 1, None, ["tracker.assumed_camera_body=[1 m, 0 m, 0 m]"], both)

@@ -111,7 +111,7 @@ def camera_show(
 
     lens, body = read_camera(file, set_)
     if lens is None and out:
-        raise InputError("--out", f"{file} has no lens", "--set camera.focal_length='16 mm'")
+        raise InputError(f"--out {out}", f"{file} has no lens", "--set camera.focal_length='16 mm'")
     if lens is not None and out:
         files.make_folder(out.parent)
         files.write_text(out, opencv_calibration.text(lens))
@@ -140,7 +140,7 @@ def read_camera(name: str, overrides: list[str] | None) -> tuple[Calibration | N
 
     if opencv_calibration.looks_like_calibration(Path(name)):
         if overrides:
-            raise InputError("--set", f"has no effect: {name} is a calibration", "a scene, a camera")
+            raise InputError(f"--set {overrides[0]}", f"has no effect: {name} is a calibration", "a scene, a camera")
         lens = opencv_calibration.read(Path(name))
         return lens, {"width_px": lens.width_px, "height_px": lens.height_px}
     values = parse_overrides(overrides)
@@ -198,7 +198,7 @@ def camera_new(
     from skysim.scene.data_sheet import sheet
 
     if out.suffix not in (".yaml", ".yml") or out.exists():
-        raise InputError("--out", f"{out} {'exists' if out.exists() else 'is no .yaml file'}", "a new .yaml file")
+        raise InputError(f"--out {out}", "exists" if out.exists() else "no .yaml file", "a new .yaml file")
     answers = {key: context.params[key] for key in QUESTIONS if context.params[key] is not None}
     if not answers:
         answers = ask_all()
@@ -230,7 +230,7 @@ def ask_all() -> dict[str, str]:
                     sheet.outstanding(answers | {name: text})
                     answers[name] = text
                 elif required:
-                    raise InputError(f"answers.{name}", "required")
+                    raise InputError(name.replace("_", "-"), "required")
                 break
             except InputError as error:
                 print_error(str(as_typed(error)))

@@ -34,7 +34,7 @@ def gui(
 
     load(scene)
     if not folder.is_dir():
-        raise InputError("--folder", f"{folder} does not exist")
+        raise InputError(f"--folder {folder}", "folder does not exist")
     try:
         from skysim.apps.gui import server
     except ModuleNotFoundError as error:

@@ -51,7 +51,7 @@ def stream(
     if folder is None and http is None and pipe is None:
         raise InputError("", "no output", "--folder DIR, --http PORT or --pipe PATH")
     if http is None and host != HOST:
-        raise InputError("--host", "has no effect without --http", f"--http PORT --host {host}")
+        raise InputError(f"--host {host}", "has no effect without --http", f"--http PORT --host {host}")
     if endless and frames is not None:
         raise InputError("--endless", "has no effect with --frames", "one of the two")
     flight = open_flight(load(scene, frames, seed, set_), endless=endless, keeps_history=False)

@@ -401,7 +401,7 @@ def create_engine(name: str, workers: int | None, scheduler: str) -> Engine:
     if name not in ENGINES:
         raise InputError("--engine", *unknown_name("engine", name, ENGINES))
     if workers is not None and name != "pool":
-        raise InputError("--workers", f"{workers} has no effect with --engine {name}", "--engine pool")
+        raise InputError(f"--workers {workers}", f"has no effect with --engine {name}", "--engine pool")
     if (name == "dask") != bool(scheduler):
         raise InputError("--scheduler", "required with --engine dask and only then", "tcp://HOST:PORT")
     return ENGINES[name](workers, scheduler)

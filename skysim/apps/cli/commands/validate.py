@@ -59,7 +59,7 @@ def validate(
         from skysim.apps.cli import json_schema
 
         if schema not in KINDS:
-            raise InputError("--schema", schema, ", ".join(KINDS))
+            raise InputError(f"--schema {schema}", "", ", ".join(KINDS))
         print_json(json_schema.json_schema(schema))
         return
     if not files:

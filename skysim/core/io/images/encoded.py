@@ -40,7 +40,7 @@ def decode_image(path: Path, data: bytes) -> NDArray:
         with silent_stderr():
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise InputError(path, f"cannot be decoded: {' '.join(str(error).split())}") from None
+        raise InputError(path, f"cannot be decoded: {error}") from None
     if image is None:
         raise InputError(path, "cannot be decoded; it may be truncated or not an image")
     return image

@@ -84,7 +84,7 @@ def read_fits_image(path: Path) -> FitsImage:
     except InputError:
         raise
     except Exception as error:  # a damaged header makes astropy raise exceptions of many types, KeyError too
-        raise InputError(path, f"not a complete FITS file: {' '.join(str(error).split())}") from None
+        raise InputError(path, f"not a complete FITS file: {error}") from None
     raise InputError(path, "a FITS file without an image")
 
 
