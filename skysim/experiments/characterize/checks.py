@@ -109,7 +109,7 @@ def check_flats(flats: Stack, usable: Mask, black_dn: float) -> None:
     if signals.min() > 0.95 * top and times.max() > 1.2 * times.min():
         raise InputError(
             flats.folder,
-            f"all flats saturated, at {top + black_dn:.0f} DN",
+            f"all saturated, at {top + black_dn:.0f} DN",
             f"{LEAST_LEVELS} levels or more below: exposures shorter than {times.min():.3g} s",
         )
     if below.sum() < LEAST_LEVELS:
@@ -117,7 +117,7 @@ def check_flats(flats: Stack, usable: Mask, black_dn: float) -> None:
         longest = float(times[signals >= top].min())
         raise InputError(
             flats.folder,
-            f"{int(below.sum())} levels of flats from 1 to {100 * FIT_RANGE:.0f} % of the brightest",
+            f"{int(below.sum())} levels from 1 to {100 * FIT_RANGE:.0f} % of the brightest",
             f"{LEAST_LEVELS} or more: add pairs at {lacking} exposures from {0.05 * longest:.2g} to"
             f" {0.6 * longest:.2g} s",
         )

@@ -24,7 +24,7 @@ from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.execution.outcomes import FAILED
 from skysim.experiments.study.execution.runner import Progress, Watch, run_points
 from skysim.experiments.study.execution.setups import code_version, seed_of
-from skysim.experiments.study.execution.trials import Row
+from skysim.experiments.study.execution.trials import REFUSED, Row
 from skysim.experiments.study.factors import Distribution, Range, Value
 from skysim.experiments.study.plan import Constraint, Plan, Search, Study
 from skysim.experiments.study.store import Store
@@ -125,8 +125,7 @@ def evaluate_candidate(plan: Plan, number: int, point: Point, columns: Columns) 
     violated = [one.response for one in config.constraints if violation(one, values[one.response]) > 0]
     violated += [f"no {one.response}" for one in config.objectives if math.isnan(values[one.response])]
     refused = scene_error(columns)
-    message = last_line(refused).partition(f"{InputError.__name__}: ")[2] if refused else unpriced
-    why = message or ", ".join(violated)
+    why = refused or unpriced or ", ".join(violated)
     return Candidate(number, point.levels, objectives, figures, price, not why, bool(refused), why)
 
 
@@ -140,18 +139,9 @@ def violation(limit: Constraint, value: float) -> float:
 
 
 def scene_error(columns: Columns) -> str:
-    """Traceback of the InputError with which a candidate's scene was rejected; empty if the scene is valid.
-
-    Trials of an invalid scene have an empty scene hash.
-    """
+    """Why a candidate's scene was rejected; empty if the scene is valid."""
     errors = zip(columns["scene"], columns["error"], strict=True)
-    refused = (error for scene, error in errors if not scene and error and InputError.__name__ in last_line(error))
-    return next(refused, "")
-
-
-def last_line(traceback: str) -> str:
-    """Last line of a traceback."""
-    return traceback.strip().splitlines()[-1]
+    return next((str(error) for scene, error in errors if scene == REFUSED), "")
 
 
 def front(config: Search, candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -337,7 +327,7 @@ def failed_rows(plan: Plan, store: Store, number: int) -> list[Row]:
     """Rows for the remaining trials of a candidate with an invalid scene: failed, with the error of the first one."""
     columns, replicates = store.point_columns(number), plan.study.replicates
     missing = np.setdiff1d(np.arange(replicates), columns["replicate"]).tolist()
-    failed = Row(0, number, 0, 0, "", code_version(), FAILED, scene_error(columns), 0.0)
+    failed = Row(0, number, 0, 0, REFUSED, code_version(), FAILED, scene_error(columns), 0.0)
     return [
         failed._replace(trial=number * replicates + k, replicate=k, seed=seed_of(plan.spec, number, k)) for k in missing
     ]

@@ -16,7 +16,7 @@ from skysim.core.io import files as file_io
 from skysim.core.types import Frame, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.setups import Setup, prepared_setup
-from skysim.experiments.study.execution.trials import Row, Segment
+from skysim.experiments.study.execution.trials import REFUSED, Row, Segment
 from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Plan
 from skysim.experiments.study.store import Store, to_sql
 from skysim.results.files import frames
@@ -57,7 +57,7 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     now = {name: to_sql(getattr(row.outcome, name)) for name in row.outcome.__slots__}
     changed = [name for name, value in now.items() if stored and stored[name] != value]
     files, pictures = [], []
-    if row.scene:  # an invalid scene has no lab
+    if row.scene not in ("", REFUSED):  # an invalid scene has no lab
         setup = prepared_setup(plan.spec, segment.settings)
         frames.remove_results(file_io.make_folder(folder))
         try:
