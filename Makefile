@@ -14,7 +14,7 @@ $(READY): pyproject.toml
 	$(PIP) -e '.[dev,catalog]'
 	touch $@
 
-.PHONY: reference bench demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
+.PHONY: reference baseline bench demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers docs figures gui recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -35,6 +35,11 @@ test-slow: $(READY)
 
 test-long: $(READY)
 	$(PYTEST) -m long
+
+# What a refactoring must not change: frames, truth, solutions, studies, JSON, streams, surveys, messages. RECORD=1 after
+# an intended change, which goes into tests/baseline/CHANGES.md. AREAS="scenes messages"; ALL=1 adds what takes minutes.
+baseline: $(READY)
+	$(BIN)/python -m tests.baseline $(AREAS) $(if $(RECORD),--record) $(if $(ALL),--all)
 
 # Other people's instruments. astrometry.net is no Python package: docs/findings/oracles.md tells how to get it.
 oracle: $(READY)

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from benchmarks.timing import verdict
 from skysim.core.io.files import make_folder
-from skysim.experiments.study import loader, store
-from skysim.experiments.study.execution import runner
+from skysim.experiments.study import loader
+from skysim.experiments.study.execution import runner, store
 from skysim.results.files import row_parts
 
 STUDY = """

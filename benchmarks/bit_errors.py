@@ -25,7 +25,7 @@ from estimator.trackers.pipeline import Clock, detect_and_centroid
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.exposure import render_frame
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.timing import exposure_window
 from skysim.sources.dome.led import lit_moments_s
@@ -85,7 +85,7 @@ CASES = (
 )
 
 
-def testbed_of(case: Case, depth: float) -> Lab:
+def lab_of(case: Case, depth: float) -> Lab:
     return build_lab(loader.load("coded_spiral", SETTINGS | case.settings | {"light.led.code.depth": str(depth)}))
 
 
@@ -112,8 +112,8 @@ def measure(frames: int = FRAMES) -> list[dict[str, Any]]:
 
 def bit_error_rate(case: Case, frames: int) -> tuple[float, float]:
     """Measured and theoretical rate of a case."""
-    _, _, full_e = read_lights(testbed_of(case, 0.5), 20)
-    lab = testbed_of(case, case.depth or float(3 / np.sqrt(np.nanmedian(full_e))))
+    _, _, full_e = read_lights(lab_of(case, 0.5), 20)
+    lab = lab_of(case, case.depth or float(3 / np.sqrt(np.nanmedian(full_e))))
     light, bits, full_e = read_lights(lab, frames)
     usable = np.isfinite(light).sum(axis=0) > 0.9 * frames
     light, bits, full_e = light[:, usable], bits[:, usable], np.nanmedian(full_e[:, usable], axis=0)
@@ -130,7 +130,7 @@ def window_noise_e2(lab: Lab) -> float:
     The sky's level is that of SAMPLE_ROWS rows of a tile after the binomial filter [1 2 1], which leaves 6/16 of the
     variance, and is interpolated between tiles, which leaves 4/9 of it on average.
     """
-    frame, _ = render_frame(lab.at_rest(lab.start, 0), 0)
+    frame, _ = render_at_rest(lab.camera, lab.start)
     settings, detector = assumed_settings(lab.scene), lab.scene.camera.detector
     blobs = DETECTORS[settings.detector](
         frame.image_dn, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, NO_PRIORS
@@ -144,12 +144,11 @@ def window_noise_e2(lab: Lab) -> float:
 def read_lights(lab: Lab, frames: int) -> tuple[Floats, NDArray[np.bool_], Floats]:
     """(F, N) light of each LED in each frame, NaN where it is not detected; the bit in the middle of the exposure; and
     the expected electrons of a 1."""
-    lab = lab.at_rest(lab.start, frames)
     camera, settings = calibration(lab.scene.camera), assumed_settings(lab.scene)
     assert lab.camera.codes is not None
     codes, rows = lab.camera.codes, []
     for number in range(frames):
-        frame, truth = render_frame(lab, number)
+        frame, truth = render_at_rest(lab.camera, lab.start, number)
         centroids = detect_and_centroid(frame.image_dn, camera, settings, Clock())
         light, full_e = np.full((2, len(lab.camera.sources)), np.nan)
         row = np.searchsorted(lab.camera.sources.id, truth.sources.id)

@@ -9,7 +9,7 @@ rendered too, and other codes, levels and clocks are tried.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -102,11 +102,11 @@ class Bench:
         t_s = np.array([exposure_window(scene, n).open_s - MARGIN_S for n in (begin, last)])
         body_from_lab = Rotation.from_rotvec(turn_rad_s * (t_s - t_s[0])[:, None]) * start
         trajectory = Trajectory(t_s, body_from_lab.inv(), np.tile(-turn_rad_s, (2, 1)))
-        lab = replace(self.lab.in_run(seed), trajectory=trajectory)
+        camera = self.lab.in_run(seed).camera
         first, wrong, fewest = 0, False, 99
         self.tracker.last_s = None
         for n in range(begin, last):
-            frame, truth = render_frame(lab, n)
+            frame, truth = render_frame(camera, trajectory, n)
             report = factory.solve_frame(self.tracker, frame)
             fewest = min(fewest, len(report.centroids))
             if report.attitude.solved:

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.timing import verdict
-from skysim.experiments.study import loader, store
-from skysim.experiments.study.execution import engines, runner
+from skysim.experiments.study import loader
+from skysim.experiments.study.execution import engines, runner, store
 from skysim.experiments.study.execution.engines import Chunk, Chunks, Engine, Job
 from skysim.experiments.study.execution.outcomes import FIELDS, Outcome
 from skysim.experiments.study.execution.trials import Row, Segment

@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.timing import verdict, versus
 from skysim.scene import loader
-from skysim.simulation import run
+from skysim.simulation.flight import Flight, simulate_motion
 from skysim.simulation.lab import build_lab
 
 FLOWN_S = 5.0
@@ -46,7 +46,7 @@ def open_loop(name: str, more: dict[str, str]) -> dict[str, Any]:
             mujoco.mj_step(model, data)
 
     what = f"fly {FLOWN_S:g} s open loop, {name}"
-    return versus(what, lambda: run.simulate_motion(lab), "bare mj_step", bare, bar=0.9)
+    return versus(what, lambda: Flight(lab).simulate_motion(), "bare mj_step", bare, bar=0.9)
 
 
 def closed_loops() -> list[dict[str, Any]]:
@@ -55,16 +55,16 @@ def closed_loops() -> list[dict[str, Any]]:
 
 
 def closed_loop(name: str) -> dict[str, Any]:
-    lab = run.prepare(loader.load(name, {"exposure.frames": "3"}))
-    ratio = float(lab.trajectory.t_s[-1]) / best(lambda: run.simulate_motion(lab), 30)
+    lab = build_lab(loader.load(name, {"exposure.frames": "3"}))
+    ratio = lab.duration_s / best(lambda: Flight(lab).simulate_motion(), 30)
     return verdict(f"{name} closed loop, 100 Hz", ratio, "x real time", "the clock", 30.0, least=True)
 
 
 def poses() -> dict[str, Any]:
     """Time to interpolate the attitudes at POSES moments of one exposure."""
-    flight = run.prepare(loader.load("simsat_slew", {"exposure.frames": "1"})).trajectory
+    trajectory = simulate_motion(loader.load("simsat_slew", {"exposure.frames": "1"})).trajectory()
     moments = np.linspace(0.5, 0.51, POSES)
-    return verdict(f"{POSES} poses in an exposure", 1e3 * best(lambda: flight.attitude_at(moments)), "ms", "", 0.3)
+    return verdict(f"{POSES} poses in an exposure", 1e3 * best(lambda: trajectory.attitude_at(moments)), "ms", "", 0.3)
 
 
 def best(work: Callable[[], Any], repeats: int = 30) -> float:

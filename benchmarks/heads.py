@@ -14,14 +14,14 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from skysim.simulation.run import simulate_motion
 
 from estimator.core.types import Attitude
 from estimator.filter.mekf import AttitudeFilter, GyroModel
 from skysim.core.constants import ARCSEC_RAD
 from skysim.results.metrics import normalized_error_squared
 from skysim.scene.loader import load_scene
-from skysim.simulation.exposure import render_frame
+from skysim.simulation.exposure import render_at_rest
+from skysim.simulation.flight import simulate_motion
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking.factory import solve_frame
 
@@ -75,8 +75,8 @@ def measured_pairs(count: int, seed: int) -> list[Pair]:
     main, R = lab.camera.mount.cam_from_body, lab.camera.mount.cam_from_body.as_matrix()
     for _ in range(count):
         lab_from_body = Rotation.random(random_state=rng)
-        bed = lab.in_run(int(rng.integers(2**31)))
-        frames = [render_frame(camera.at_rest(lab_from_body), 0)[0] for camera in bed.cameras]
+        cameras = lab.in_run(int(rng.integers(2**31))).cameras
+        frames = [render_at_rest(camera, lab_from_body)[0] for camera in cameras]
         solutions = [solve_frame(tracker, frame).attitude for tracker, frame in zip(trackers, frames, strict=True)]
         if not all(solution.solved for solution in solutions):
             continue
@@ -106,11 +106,11 @@ def drift_errors_arcsec(flights: int, seed: int) -> np.ndarray:
     """(flights, 2) errors at the end of the scene: side boresight relative to the main one, and that to the gyro."""
     errors = []
     for n in range(flights):
-        lab = simulate_motion(build_lab(load_scene("two_heads", {"seed": seed + n})))
-        cameras = zip(lab.cameras, ("main", "side"), strict=True)
+        flight = simulate_motion(load_scene("two_heads", {"seed": seed + n}))
+        mountings = flight.telemetry().mountings
         row = []
-        for camera, name in cameras:
-            mounting = lab.log.mountings[name]
+        for camera in flight.lab.cameras:
+            mounting = mountings[camera.name]
             error = camera.mount.cam_from_body.apply(mounting.estimate_rad[-1] - mounting.true_rad[-1])
             row.append(np.linalg.norm(error[:2]) / ARCSEC_RAD)
         errors.append(row[::-1])

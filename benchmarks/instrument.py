@@ -1,4 +1,7 @@
-"""Frame rendering speed against getframes, GalSim and NumPy; scaling of time and memory; noise against random bytes."""
+"""Frame rendering speed against getframes, GalSim and NumPy; scaling of time and memory; noise against random bytes.
+
+Of every shipped scene also how often a run renders each of its frames.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import resource
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,7 +21,10 @@ from skysim.camera.glow.background import fill
 from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render
 from skysim.core.types import Floats, Mount, Sources, Trajectory
+from skysim.results.simulate import simulate
+from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
+from skysim.simulation import exposure
 
 AT_CENTER = Mount(np.zeros(3), Rotation.identity())
 EXPOSURE_S = 0.01
@@ -104,8 +111,8 @@ def light_of(lens: CameraConfig, sources: Sources, rate_rad_s: float) -> Floats:
 
 
 def measure() -> list[dict[str, Any]]:
-    """Results for the dome frame, the sky frame, the noise alone, and the scaling."""
-    return [*dome_frame(), *sky_frame(), noise_floor(), *growth()]
+    """Results for the dome frame, the sky frame, the noise alone, the scaling, and the runs of the shipped scenes."""
+    return [*dome_frame(), *sky_frame(), noise_floor(), *growth(), *renders_a_frame()]
 
 
 def dome_frame() -> list[dict[str, Any]]:
@@ -251,3 +258,17 @@ def memory_frames() -> float:
     camera_shot(lens, lights(lens, 500, np.full(500, 1e4)), 0.0)()
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     return float(grown * 1024 / (6000 * 6000 * 4))
+
+
+def renders_a_frame() -> list[dict[str, Any]]:
+    """Calls of `render_frame` for a frame in a run of each scene, with a filter or without; 1 is the least."""
+    what = "renders of a frame in a run, {}"
+    return [verdict(what.format(name), renders_in_run(name), "", "one", 1.0) for name in loader.list_scenes()]
+
+
+def renders_in_run(name: str) -> float:
+    """Calls of `render_frame` over frames of all cameras; each call exposes the detector once."""
+    scene = loader.load(name, {"exposure.frames": "2"})
+    with mock.patch.object(exposure, "expose", wraps=exposure.expose) as exposed:
+        run = simulate(scene)
+    return float(exposed.call_count / sum(len(one) for one in (run, *run.heads.values())))

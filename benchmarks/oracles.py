@@ -16,7 +16,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +31,12 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.camera import Camera
 from skysim.core.constants import ARCSEC_RAD, SPEED_OF_LIGHT_KM_S
-from skysim.core.types import Frame, Trajectory, Truth
+from skysim.core.types import Frame, Truth
 from skysim.results.files import frames as frame_files
 from skysim.results.metrics import WRONG_RAD
 from skysim.scene import loader
 from skysim.scene.scene import Scene
-from skysim.simulation.exposure import render_frame
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import build_lab
 from skysim.tracking import onboard_model
 from skysim.tracking import settings as tracker_settings
@@ -150,8 +150,7 @@ def render_frames(scene: Scene, seed: int) -> Iterator[tuple[Frame, Truth]]:
     lab = build_lab(scene)
     for n in range(scene.exposure.frames):
         cam_from_icrs = Rotation.random(rng=np.random.default_rng([seed, n]))
-        still = Trajectory.at_rest(cam_from_icrs.inv() * lab.camera.mount.cam_from_body, lab.duration_s)
-        yield render_frame(replace(lab, trajectory=still), n)
+        yield render_at_rest(lab.camera, cam_from_icrs.inv() * lab.camera.mount.cam_from_body, n)
 
 
 def lattice(width_px: int, height_px: int) -> NDArray:

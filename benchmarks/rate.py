@@ -21,11 +21,11 @@ WORK = Work("SHEFEX", "shefex2", "80 us", 200, {"exposure.time": "50 ms"})
 
 def measure(rates_deg_s: tuple[float, ...] = RATES_DEG_S, frames: int = WORK.frames) -> list[dict[str, Any]]:
     """Share of the frames that tell the rate, its error across the boresight and its NEES, for each rate."""
-    bed, rows = WORK.lab(False), []
+    lab, rows = WORK.lab(False), []
     for rate_deg_s in rates_deg_s:
         errors, nees = [], []
         for seed in range(frames):
-            frame, truth, tracker = frame_of(WORK, bed, rate_deg_s, seed)
+            frame, truth, tracker = frame_of(WORK, lab, rate_deg_s, seed)
             rate = factory.solve_frame(tracker, frame).attitude.rate
             if rate is None:
                 continue

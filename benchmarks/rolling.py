@@ -12,7 +12,7 @@ of the roll with what it were if the rate were known, which no tracker of one fr
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,7 +30,7 @@ from skysim.core.types import Floats, Frame, Truth
 from skysim.experiments.study.execution.trials import constant_rate
 from skysim.results import metrics
 from skysim.scene.loader import load
-from skysim.simulation import exposure
+from skysim.simulation.exposure import render_frame
 from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import factory
 
@@ -90,10 +90,10 @@ def measure(works: tuple[Work, ...] = WORKS, rates_deg_s: tuple[float, ...] = RA
     """NEES, error ratios and solved share of each scene, rate and source of the rate."""
     rows = []
     for work in works:
-        beds = work.lab(True), work.lab(False)
+        labs = work.lab(True), work.lab(False)
         pooled: dict[str, list[tuple[Floats, Floats]]] = {}
         for n, rate_deg_s in enumerate(rates_deg_s):
-            for mode, ours, peer in _compare(work, beds, rate_deg_s, n * work.frames):
+            for mode, ours, peer in _compare(work, labs, rate_deg_s, n * work.frames):
                 rows += _rows(f"{work.name}, {rate_deg_s:g} deg/s, {mode}", ours, peer)
                 pooled.setdefault(mode, []).append((ours[:, 0], peer[:, 0]))
         for mode, nees in pooled.items():
@@ -103,13 +103,13 @@ def measure(works: tuple[Work, ...] = WORKS, rates_deg_s: tuple[float, ...] = RA
 
 
 def _compare(
-    work: Work, beds: tuple[Lab, Lab], rate_deg_s: float, first_seed: int
+    work: Work, labs: tuple[Lab, Lab], rate_deg_s: float, first_seed: int
 ) -> Iterator[tuple[str, Floats, Floats]]:
     """Yield each source of the rate with (N, 5) rows of Solved under the rolling and under the global shutter."""
     errors: dict[tuple[str, int], list[Solved]] = {}
     for seed in range(first_seed, first_seed + work.frames):
-        for n, bed in enumerate(beds):
-            frame, truth, tracker = frame_of(work, bed, rate_deg_s, seed)
+        for n, lab in enumerate(labs):
+            frame, truth, tracker = frame_of(work, lab, rate_deg_s, seed)
             for mode, rate in ("gyro", gyro(truth, seed)), ("frame only", None):
                 report = factory.solve_frame(tracker, frame, None, rate)
                 solved = score(report.attitude, truth)
@@ -120,10 +120,10 @@ def _compare(
         yield mode, np.array(errors[mode, 0]), np.array(errors[mode, 1])
 
 
-def frame_of(work: Work, bed: Lab, rate_deg_s: float, seed: int) -> tuple[Frame, Truth, factory.Estimator]:
+def frame_of(work: Work, lab: Lab, rate_deg_s: float, seed: int) -> tuple[Frame, Truth, factory.Estimator]:
     """One frame at a random attitude and axis, and its tracker; a dome is surveyed anew for each."""
     rng = np.random.default_rng([seed, 1])
-    bed = bed.in_run(int(rng.integers(2**62)))
+    camera = lab.in_run(int(rng.integers(2**62))).camera
     middle = Rotation.random(rng=rng)
     if work.tilt_deg is not None:
         azimuth, yaw = rng.uniform(0, 2 * np.pi, 2)
@@ -131,12 +131,12 @@ def frame_of(work: Work, bed: Lab, rate_deg_s: float, seed: int) -> tuple[Frame,
         middle = Rotation.from_rotvec(tilt) * Rotation.from_rotvec([0, 0, yaw])
     axis = rng.standard_normal(3) * ([1, 1, ROLL_SHARE] if work.tilt_deg is None else [1, 1, 1])
     rate_cam = np.radians(rate_deg_s) * axis / np.linalg.norm(axis)
-    trajectory = constant_rate(bed.scene, middle, bed.mount.cam_from_body.inv().apply(rate_cam))
-    frame, truth = exposure.render_frame(replace(bed, trajectory=trajectory), 0)
-    tracker = bed.scene.tracker
+    trajectory = constant_rate(camera.scene, middle, camera.mount.cam_from_body.inv().apply(rate_cam))
+    frame, truth = render_frame(camera, trajectory, 0)
+    tracker = camera.scene.tracker
     surveyed = tracker.model_copy(update={"survey": tracker.survey.model_copy(update={"seed": seed})})
-    scene = bed.scene.model_copy(update={"tracker": surveyed})
-    return frame, truth, factory.build_tracker(scene, bed.mount, bed.sources)
+    scene = camera.scene.model_copy(update={"tracker": surveyed})
+    return frame, truth, factory.build_tracker(scene, camera.mount, camera.sources)
 
 
 def gyro(truth: Truth, seed: int) -> RateEstimate:

@@ -18,7 +18,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import yaml
-from skysim.simulation.run import prepare, simulate_motion
 
 from benchmarks import coordination
 from benchmarks.studies import CENTROIDS, run_study
@@ -31,6 +30,8 @@ from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study.execution import engines, trials
 from skysim.experiments.study.plan import Plan
 from skysim.scene import loader
+from skysim.simulation.flight import Flight
+from skysim.simulation.lab import build_lab
 
 SIZE = {"camera.width_px": "1024", "camera.height_px": "1024"}
 # 20 degrees and stars to V 7, as in benchmarks/instrument.py, with all noise of a CMOS chip: shot and read noise, dark
@@ -174,15 +175,15 @@ def centroids() -> list[dict[str, Any]]:
 
 def closed_loop() -> list[dict[str, Any]]:
     """SimSat on its wheels under control, against the clock, and against mj_step alone with the same model."""
-    lab = prepare(loader.load("afit_simsat", {"exposure.frames": "3"}))
-    model, flown_s = lab.vehicle.model, float(lab.trajectory.t_s[-1])
+    lab = build_lab(loader.load("afit_simsat", {"exposure.frames": "3"}))
+    model, flown_s = lab.vehicle.model, lab.duration_s
 
     def bare() -> None:
         data = mujoco.MjData(model)
         for _ in range(round(flown_s / model.opt.timestep)):
             mujoco.mj_step(model, data)
 
-    row = versus("closed loop on wheels", lambda: simulate_motion(lab), "bare mj_step", bare, repeats=20)
+    row = versus("closed loop on wheels", lambda: Flight(lab).simulate_motion(), "bare mj_step", bare, repeats=20)
     speed = flown_s / (row["value"] / 1e3)
     limit = f"mj_step alone: {flown_s / (row['peer_value'] / 1e3):.0f}x"
     return [row, verdict("closed loop on wheels", speed, "x real time", limit, 100.0, True)]

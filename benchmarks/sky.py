@@ -11,7 +11,6 @@ import math
 import tempfile
 import time
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from benchmarks.timing import verdict
 from skysim.experiments.study.api import run_study
 from skysim.experiments.study.execution.trials import visible_rows
 from skysim.scene.loader import load
-from skysim.simulation.exposure import render_frame
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
 from skysim.sources import gaia
 
@@ -121,16 +120,16 @@ def frame_time() -> dict[str, Any]:
     focal_mm = SHEFEX_MM * SHEFEX_DEG / 3
     keys = {"light.catalog": str(DEEP.resolve()), "camera.focal_length": f"{focal_mm:.4g} mm"}
     whole = build_lab(load("shefex2", keys))
-    boresight = whole.mount.cam_from_body.inv().apply([0, 0, 1.0])
-    direction = whole.trajectory.attitude_at(0.0).apply(boresight)
-    near = whole.sources.place[:, :3] @ direction > math.cos(math.radians(10))
-    part = replace(whole, sources=whole.sources.take(near))
+    boresight = whole.camera.mount.cam_from_body.inv().apply([0, 0, 1.0])
+    direction = whole.start.apply(boresight)
+    near = whole.camera.sources.place[:, :3] @ direction > math.cos(math.radians(10))
+    part = whole.with_camera(sources=whole.camera.sources.take(near))
     seconds: list[list[float]] = [[], []]
     for _ in range(40):
         for side, lab in enumerate((whole, part)):
             began = time.perf_counter()
-            render_frame(lab, 0)
+            render_at_rest(lab.camera, lab.start)
             seconds[side].append(time.perf_counter() - began)
     ratio = min(seconds[0]) / min(seconds[1])
-    what = f"{len(whole.sources)} stars over {int(near.sum())}"
+    what = f"{len(whole.camera.sources)} stars over {int(near.sum())}"
     return verdict("frame of 3 deg, time in a deep sky over that of its stars alone", ratio, "", what, 1.1)

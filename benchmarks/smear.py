@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,7 +23,7 @@ from skysim.core.paths import CATALOGS
 from skysim.core.types import Frame, Trajectory
 from skysim.results.metrics import WRONG_RAD
 from skysim.scene.loader import load
-from skysim.simulation import exposure
+from skysim.simulation.exposure import render_frame
 from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking.onboard_model import calibration
 
@@ -50,7 +49,7 @@ def frames(lab: Lab, rate_deg_s: float, count: int, seed: int) -> Iterator[tuple
         turned = Rotation.from_rotvec(np.outer(t_s - n * FRAME_S - 0.025, rate_body))
         lab_from_body = middle.inv() * lab.camera.mount.cam_from_body * turned
         trajectory = Trajectory(t_s, lab_from_body, np.tile(rate_body, (len(t_s), 1)))
-        frame, truth = exposure.render_frame(replace(lab, trajectory=trajectory), n)
+        frame, truth = render_frame(lab.camera, trajectory, n)
         yield frame, truth.cam_from_lab, streak_of(rate_cam, lab)
 
 

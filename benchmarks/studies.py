@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.timing import verdict
-from skysim.experiments.study import loader, store
-from skysim.experiments.study.execution import engines, runner
+from skysim.experiments.study import loader
+from skysim.experiments.study.execution import engines, runner, store
 from skysim.experiments.study.execution.engines import Chunks, Job, Pool
 from skysim.experiments.study.execution.trials import Row
 

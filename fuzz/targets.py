@@ -31,7 +31,7 @@ from skysim.dynamics.profiles.spline import fit_spline
 from skysim.experiments.characterize.frames import read_settings
 from skysim.experiments.dome_survey.folder import images as survey_images
 from skysim.experiments.study import loader as study_loader
-from skysim.experiments.study import store
+from skysim.experiments.study.execution import store
 from skysim.results.files import recording
 from skysim.results.files.builder.prices import read_prices
 from skysim.scene import loader, opencv_calibration

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import lazy_loader
 
+from skysim.core import __version__ as __version__
+
 # Idle threads of compiled loops sleep: on a busy machine spinning threads take the core that the others wait for, and
 # a frame takes three times as long (measured). Read when the first loop runs.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-
-__version__ = "0.1.0"
 
 # Loaded on first use, so that `import skysim` is quick.
 __getattr__, __dir__, __all__ = lazy_loader.attach(

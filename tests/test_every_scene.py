@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -18,11 +18,13 @@ from skysim.experiments.study.execution.setups import Setup
 from skysim.experiments.study.execution.trials import run_frame_trial
 from skysim.experiments.study.plan import FrameTrial
 from skysim.results import metrics
+from skysim.results.simulate import render
 from skysim.scene import loader
+from skysim.scene.scene import Scene
 from skysim.scene.sections.light import CollimatedDisplayConfig, StarsConfig
 from skysim.scene.sections.vehicle import VehicleConfig
-from skysim.simulation import exposure, run
-from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.flight import Flight, Shot, open_flight, simulate_motion
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.simulation.timing import exposure_window
 from skysim.tracking import onboard_model
 
@@ -38,17 +40,29 @@ NOT_ALL_ALONG = {PAIR, CODED, "afit_test3"}
 MODELS = sorted(path.name for path in (SCENES / "vehicles").glob("*.xml"))
 
 
-def prepared(name: str, frames: int, **overrides: str) -> Lab:
-    return run.prepare(loader.load(name, overrides | {"exposure.frames": str(frames)}))
+def scene_of(name: str, frames: int, **overrides: str) -> Scene:
+    return loader.load(name, overrides | {"exposure.frames": str(frames)})
+
+
+class Flown(NamedTuple):
+    """A flight at its end, and the exposures of its main camera."""
+
+    flight: Flight
+    shots: list[Shot]
+
+    @property
+    def scene(self) -> Scene:
+        return self.flight.lab.scene
 
 
 @pytest.fixture(scope="module", params=NAMES)
-def lab(request: pytest.FixtureRequest) -> Lab:
-    return prepared(request.param, 2)
+def flown(request: pytest.FixtureRequest) -> Flown:
+    flight = open_flight(scene_of(request.param, 2))
+    return Flown(flight, list(flight.shots(cameras=[0])))
 
 
 def test_there_are_scenes() -> None:
-    flown = {"afit_simsat", "shefex2", "simsat_slew", "simsat_cmg", "simsat_bump", "tas2_vscmg"}
+    steered = {"afit_simsat", "shefex2", "simsat_slew", "simsat_cmg", "simsat_bump", "tas2_vscmg"}
     lit = {
         "afit_test1",
         "afit_test2",
@@ -58,28 +72,28 @@ def test_there_are_scenes() -> None:
         "celestial_dome",
         "collimated_display",
     }
-    assert flown | lit <= set(NAMES)
+    assert steered | lit <= set(NAMES)
 
 
 @pytest.mark.slow
-def test_it_says_what_it_is(lab: Lab) -> None:
-    assert lab.scene.name in NAMES
-    assert 10 < len(lab.scene.title) < 80
+def test_it_says_what_it_is(flown: Flown) -> None:
+    assert flown.scene.name in NAMES
+    assert 10 < len(flown.scene.title) < 80
 
 
 @pytest.mark.slow
-def test_its_first_frame_shows_at_least_five_sources_or_what_was_published(lab: Lab) -> None:
-    frame, truth = exposure.render_frame(lab, 0)
-    camera, detector = lab.scene.camera, lab.scene.camera.detector
+def test_its_first_frame_shows_at_least_five_sources_or_what_was_published(flown: Flown) -> None:
+    frame, truth = flown.shots[0].frame, flown.shots[0].truth
+    camera, detector = flown.scene.camera, flown.scene.camera.detector
     assert frame.image_dn.shape == (camera.height_px, camera.width_px)
     above_noise = truth.sources.peak_e > 5 * np.hypot(detector.read_noise_e, np.sqrt(truth.sources.peak_e))
-    assert above_noise.sum() >= 5 or above_noise.sum() == SHOWN[lab.scene.name]
+    assert above_noise.sum() >= 5 or above_noise.sum() == SHOWN[flown.scene.name]
     # And none of them blinds the chip.
     assert np.mean(frame.image_dn >= frame.saturation_dn) < 1e-3
 
 
 @pytest.mark.slow
-def test_its_light_is_on_the_frame(lab: Lab) -> None:
+def test_its_light_is_on_the_frame(flown: Flown) -> None:
     """Sum above offset, dark and the chip's own pattern, against the truth's electrons, to five sigmas.
 
     A display's black pixels glow beside them.
@@ -89,21 +103,22 @@ def test_its_light_is_on_the_frame(lab: Lab) -> None:
     Sensitivity is the one part of the pattern that goes with the light: a source of E electrons over A pixels has
     it as prnu E / sqrt(A).
     """
-    told = lab.scene.camera.detector
+    told = flown.scene.camera.detector
     step_e = told.full_well_e / 60000
     offset_dn = told.offset_dn * told.gain_e_dn / step_e  # the same in electrons, or noise would be cut off at 0
     fine = {"bits": "16", "gain_e_dn": str(step_e), "offset_dn": str(offset_dn)}
     fine = {f"camera.detector.{key}": value for key, value in fine.items()}
-    lab = prepared(lab.scene.name, 1, **fine)
-    frame, truth = exposure.render_frame(lab, 0)
-    part, detector, pixels = lab.scene.camera.detector, lab.camera.detector, frame.image_dn.size
-    assert lab.scene.background == ()
+    flight = simulate_motion(scene_of(flown.scene.name, 1, **fine))
+    frame, truth = flight.render(0)
+    scene, camera = flight.lab.scene, flight.lab.camera
+    part, detector, pixels = scene.camera.detector, camera.detector, frame.image_dn.size
+    assert scene.background == ()
     pattern_e = detector.dark_e_s.sum(dtype=float) * frame.exposure_s
     pattern_e += len(frame.image_dn) * detector.column_offset_e.sum(dtype=float)
     found_e = (frame.image_dn.sum(dtype=float) - pixels * part.offset_dn) * part.gain_e_dn - pattern_e
     light_e = truth.sources.electrons
-    camera_m = truth.lab_from_body.apply(lab.camera.mount.camera_body_m)
-    glow_e_s = black_glow(lab.scene.light, lab.camera.optics, truth.cam_from_lab, camera_m, lab.camera.band)
+    camera_m = truth.lab_from_body.apply(camera.mount.camera_body_m)
+    glow_e_s = black_glow(scene.light, camera.optics, truth.cam_from_lab, camera_m, camera.band)
     glow_e = 0.0 if glow_e_s is None else float(glow_e_s.sum()) * frame.exposure_s
     read = pixels * (part.read_noise_e**2 + part.reset_noise_e**2 + part.gain_e_dn**2 / 12)
     shot = light_e.sum() + glow_e + detector.dark_e_s.sum(dtype=float) * frame.exposure_s
@@ -114,30 +129,32 @@ def test_its_light_is_on_the_frame(lab: Lab) -> None:
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(lab: Lab) -> None:
-    name, image = lab.scene.name, exposure.render_frame(lab, 0)[0].image_dn
-    again = exposure.render_frame(prepared(name, 2), 0)[0].image_dn
-    other = exposure.render_frame(prepared(name, 2, seed=str(lab.scene.seed + 1)), 0)[0].image_dn
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(flown: Flown) -> None:
+    name, image = flown.scene.name, flown.shots[0].frame.image_dn
+    again = render(scene_of(name, 2), 0)[0].image_dn
+    other = render(scene_of(name, 2, seed=str(flown.scene.seed + 1)), 0)[0].image_dn
     assert image.tobytes() == again.tobytes()
     assert np.mean(image != other) > 0.1
 
 
 @pytest.mark.long
-def test_a_frame_alone_is_the_frame_of_a_sequence(lab: Lab) -> None:
-    sequence = [shot.frame.image_dn for shot in run.run(lab, build_tracker(lab.camera))]
-    alone, _ = exposure.render_frame(prepared(lab.scene.name, 2), 1)
-    assert alone.image_dn.tobytes() == sequence[1].tobytes()
+def test_a_frame_alone_is_the_frame_of_a_sequence(flown: Flown) -> None:
+    """Also one that is rendered again from the whole motion."""
+    sequence = flown.shots[1].frame.image_dn.tobytes()
+    assert render(scene_of(flown.scene.name, 2), 1)[0].image_dn.tobytes() == sequence
+    assert flown.flight.render(1)[0].image_dn.tobytes() == sequence
 
 
-def test_its_first_frames_are_solved_and_right(lab: Lab) -> None:
-    for shot in run.run(lab, build_tracker(lab.camera)):
+def test_its_first_frames_are_solved_and_right(flown: Flown) -> None:
+    assert len(flown.shots) == 2
+    for shot in flown.shots:
         answer = shot.report.attitude
-        if lab.scene.name in SHOWN:  # seen, each where it is, to half a pixel; two alone are no attitude
+        if flown.scene.name in SHOWN:  # seen, each where it is, to half a pixel; two alone are no attitude
             found_px, seen_px = shot.report.centroids.xy_px, shot.truth.sources.xy_px
             apart_px = np.linalg.norm(found_px[:, None] - seen_px, axis=2)
-            assert len(found_px) == len(seen_px) == SHOWN[lab.scene.name]
+            assert len(found_px) == len(seen_px) == SHOWN[flown.scene.name]
             assert apart_px.min(axis=1).max() < 0.5
-            assert lab.scene.name != PAIR or answer.status == "too few stars detected"
+            assert flown.scene.name != PAIR or answer.status == "too few stars detected"
             continue
         assert answer.status == "solved"
         true_attitude = shot.truth.cam_from_lab
@@ -165,8 +182,7 @@ def test_an_ideal_scene_s_tracker_knows_its_dome(name: str) -> None:
 
 def test_a_square_of_equal_leds_is_never_solved_wrong() -> None:
     """AFIT's nine LEDs are their own picture after a quarter turn, but for 0.12 mm of glue: 1.3 px."""
-    lab = prepared(GRID, 4)
-    for shot in run.run(lab, build_tracker(lab.camera)):
+    for shot in open_flight(scene_of(GRID, 4)).shots():
         answer = shot.report.attitude
         if answer.solved:
             assert np.degrees((answer.cam_from_ref * shot.truth.cam_from_lab.inv()).magnitude()) < 10 / 60
@@ -188,12 +204,13 @@ def test_its_claimed_error_is_the_one_it_makes(name: str) -> None:
     300 frames at random attitudes and the median rate of the scene's motion. Every three have a new survey of the dome,
     or another sky on the display: these errors are the same in all frames of one laboratory.
     """
-    flown = run.prepare(loader.load(name, NO_EYES.get(name)))
-    t_s = [exposure_window(flown.scene, index).open_s for index in range(flown.scene.exposure.frames)]
-    turned = flown.trajectory.attitude_at(np.array(t_s)).inv() * flown.trajectory.attitude_at(np.array(t_s) + 0.01)
+    flight = simulate_motion(loader.load(name, NO_EYES.get(name)))
+    flown, motion = flight.lab.scene, flight.trajectory()
+    t_s = np.array([exposure_window(flown, index).open_s for index in range(flown.exposure.frames)])
+    turned = motion.attitude_at(t_s).inv() * motion.attitude_at(t_s + 0.01)
     trial = FrameTrial(
         kind="frames",
-        dec_deg=BENCH_DEG if isinstance(flown.scene.light, CollimatedDisplayConfig) else (-90.0, 90.0),
+        dec_deg=BENCH_DEG if isinstance(flown.light, CollimatedDisplayConfig) else (-90.0, 90.0),
         tilt_deg=TILT_DEG.get(name.removesuffix("_ideal"), (0.0, 25.0)),
         rate_deg_s=float(np.degrees(np.median(turned.magnitude())) / 0.01),
     )
@@ -205,8 +222,8 @@ def test_its_claimed_error_is_the_one_it_makes(name: str) -> None:
             scene = with_config(scene, "light", axis_ra_deg=rng.uniform(0, 360), axis_dec_deg=dec_deg)
             lab = build_lab(scene)
         if survey == 0 or not isinstance(scene.light, StarsConfig):
-            tracker = build_tracker(replace(lab, scene=scene))
-        setup = Setup(replace(lab, scene=scene), tracker, trial, "")
+            tracker = build_tracker(lab.with_scene(scene).camera)
+        setup = Setup(lab.with_scene(scene), tracker, trial, "")
         outcomes += [run_frame_trial(setup, survey * FRAMES + frame) for frame in range(FRAMES)]
     nees = np.array([one.nees for one in outcomes if one.solved])
     assert sum(one.wrong for one in outcomes) == 0
@@ -218,36 +235,36 @@ STEERED = [name for name in NAMES if loader.load(name).motion.control]
 
 
 @pytest.fixture(scope="module", params=STEERED)
-def whole(request: pytest.FixtureRequest) -> Lab:
+def whole(request: pytest.FixtureRequest) -> Flight:
     """A scene flown to its last frame, none of which is rendered."""
-    return run.prepare(loader.load(request.param, NO_EYES.get(request.param)))
+    return simulate_motion(loader.load(request.param, NO_EYES.get(request.param)))
 
 
 @pytest.mark.long
-def test_the_camera_sees_five_leds_all_along_the_maneuver(whole: Lab) -> None:
+def test_the_camera_sees_five_leds_all_along_the_maneuver(whole: Flight) -> None:
     """In every frame, at geometry alone: what is on the chip, by the tracker's map."""
-    if isinstance(whole.scene.light, StarsConfig):
+    if isinstance(whole.lab.scene.light, StarsConfig):
         pytest.skip("no LEDs")
-    eyes, counts = build_tracker(whole), []
-    for index in range(whole.scene.exposure.frames):
-        body_from_lab = whole.trajectory.attitude_at(exposure_window(whole.scene, index).open_s).inv()
+    motion = whole.trajectory()
+    eyes, counts = build_tracker(whole.lab.camera), []
+    for index in range(whole.lab.scene.exposure.frames):
+        body_from_lab = motion.attitude_at(exposure_window(whole.lab.scene, index).open_s).inv()
         pixels = project(body_from_lab, eyes.leds.position_m, eyes.lever, eyes.camera)
         counts.append(int(eyes.camera.contains(np.nan_to_num(pixels, nan=-1e9), 12).sum()))
     assert len(counts) >= 20
-    assert min(counts) >= 5 or whole.scene.name in NOT_ALL_ALONG
+    assert min(counts) >= 5 or whole.lab.scene.name in NOT_ALL_ALONG
 
 
 @pytest.mark.long
-def test_it_is_steered_to_where_it_is_told_and_off_its_stop(whole: Lab) -> None:
-    telemetry = whole.telemetry
-    assert telemetry is not None
+def test_it_is_steered_to_where_it_is_told_and_off_its_stop(whole: Flight) -> None:
+    telemetry = whole.telemetry()
     assert telemetry.lab_from_ref is not None
     error_deg = np.degrees((telemetry.lab_from_ref.inv() * telemetry.lab_from_body).magnitude())
     assert error_deg[-1] < 0.1  # some are still on their way
     assert np.median(error_deg) < 0.05
     up = telemetry.lab_from_body.as_matrix()[:, 2, 2]
     tilt_deg = np.degrees(np.arccos(np.clip(up, -1, 1)))
-    assert whole.scene.vehicle.mount == "free" or tilt_deg.max() < 29
+    assert whole.lab.scene.vehicle.mount == "free" or tilt_deg.max() < 29
 
 
 # --- the vehicles, at the hands of chance -------------------------------------------------------------------

@@ -12,14 +12,14 @@ from skysim.core.errors import InputError
 from skysim.core.types import Telemetry
 from skysim.results import telemetry_report
 from skysim.scene import loader
-from skysim.simulation import run
+from skysim.simulation.flight import open_flight, simulate_motion
 
 QUIET = "{time: 1 ms, rate_hz: 10, frames: 1, first: %s s}"
 
 
-def off_deg(believed: Rotation | None, log: Telemetry) -> np.ndarray:
+def off_deg(believed: Rotation | None, telemetry: Telemetry) -> np.ndarray:
     assert believed is not None
-    return np.degrees((believed.inv() * log.lab_from_body).magnitude())
+    return np.degrees((believed.inv() * telemetry.lab_from_body).magnitude())
 
 
 @pytest.mark.long
@@ -38,10 +38,10 @@ def test_a_blow_far_beyond_the_torque_s_reach_is_braked_and_the_vehicle_comes_ba
         "exposure": QUIET % 50,
         **more,
     }
-    log = run.prepare(loader.load("afit_simsat", overrides)).log
-    rate = np.degrees(np.linalg.norm(log.rate_body_rad_s, axis=1))
+    telemetry = simulate_motion(loader.load("afit_simsat", overrides)).telemetry()
+    rate = np.degrees(np.linalg.norm(telemetry.rate_body_rad_s, axis=1))
     assert rate.max() > 75
-    assert off_deg(log.lab_from_ref, log)[-1] < 0.01
+    assert off_deg(telemetry.lab_from_ref, telemetry)[-1] < 0.01
     assert rate[-1] < 0.01
 
 
@@ -54,14 +54,14 @@ def test_steered_by_gyros_at_their_limit_the_vehicle_still_brakes() -> None:
         "motion.maneuver": "[{kind: bump, rate_deg_s: [0, 0, 60], duration: 40 ms}]",
         "exposure": QUIET % 40,
     }
-    log = run.prepare(loader.load("afit_simsat", overrides)).log
-    assert np.degrees(np.linalg.norm(log.rate_body_rad_s[-1])) < 0.05
+    telemetry = simulate_motion(loader.load("afit_simsat", overrides)).telemetry()
+    assert np.degrees(np.linalg.norm(telemetry.rate_body_rad_s[-1])) < 0.05
 
 
 def test_a_maneuver_beyond_the_stop_is_refused_before_the_flight() -> None:
     overrides = {"motion.maneuver": "[{kind: slew, roll_deg: 45, rate_deg_s: 10}]", "exposure": QUIET % 20}
     with pytest.raises(InputError, match=r"motion.maneuver: tilt of 30\.\d deg at \d+\.\d+ s; allowed: up to"):
-        run.prepare(loader.load("afit_simsat", overrides))
+        open_flight(loader.load("afit_simsat", overrides))
 
 
 def test_what_cannot_be_stepped_is_told_in_one_line_and_leaves_no_file(
@@ -70,7 +70,7 @@ def test_what_cannot_be_stepped_is_told_in_one_line_and_leaves_no_file(
     monkeypatch.chdir(tmp_path)
     overrides = {"vehicle.disturbances": "{cable: {stiffness: 1e8 N m / rad}}", "exposure": QUIET % 0.3}
     with pytest.raises(InputError, match="motion: not integrable at a step of 1 ms: MuJoCo warned before"):
-        run.prepare(loader.load("afit_simsat", overrides))
+        simulate_motion(loader.load("afit_simsat", overrides))
     assert not list(tmp_path.iterdir())
 
 
@@ -86,16 +86,16 @@ def test_the_gyros_apparent_bias_is_what_the_navigator_drifts_by() -> None:
         "vehicle.center_of_mass": "[0 m, 0 m, 0 m]",
         "exposure": QUIET % 20,
     }
-    log = run.prepare(loader.load("afit_simsat", overrides)).log
-    assert log.lab_from_imu is not None
-    assert log.bias_rad_s is not None
-    off = (log.lab_from_imu * log.lab_from_body.inv()).as_rotvec()[-1]
-    drift = log.lab_from_body.apply(log.bias_rad_s)[:-1].sum(axis=0) * log.period_s
+    telemetry = simulate_motion(loader.load("afit_simsat", overrides)).telemetry()
+    assert telemetry.lab_from_imu is not None
+    assert telemetry.bias_rad_s is not None
+    off = (telemetry.lab_from_imu * telemetry.lab_from_body.inv()).as_rotvec()[-1]
+    drift = telemetry.lab_from_body.apply(telemetry.bias_rad_s)[:-1].sum(axis=0) * telemetry.period_s
     assert np.linalg.norm(drift) > 1e-3
     np.testing.assert_allclose(off, drift, rtol=0, atol=2e-3 * np.linalg.norm(drift))
 
 
 def test_a_vehicle_of_one_tick_is_reported_too() -> None:
     overrides = {"vehicle.imu": "{}", "exposure": "{time: 1 ms, rate_hz: 10, frames: 1, first: 0 s}"}
-    lab = run.prepare(loader.load("afit_simsat", overrides))
-    assert telemetry_report.summary(lab.log)["gyro_saturated_s"] == 0
+    telemetry = simulate_motion(loader.load("afit_simsat", overrides)).telemetry()
+    assert telemetry_report.summary(telemetry)["gyro_saturated_s"] == 0

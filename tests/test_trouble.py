@@ -25,7 +25,7 @@ from skysim.core.errors import InputError
 from skysim.core.io import files
 from skysim.results.files import export, frames, recording
 from skysim.scene import loader
-from skysim.simulation import run
+from skysim.simulation.flight import open_flight
 
 SKYSIM = [sys.executable, "-m", "skysim"]
 SMALL = ["--set", "light.limit_mag=5"]
@@ -77,9 +77,9 @@ def test_a_full_disk_is_named_and_what_was_written_is_whole(mounted: Path) -> No
 def flown(tmp_path_factory: pytest.TempPathFactory) -> recording.Recording:
     """Three frames with their truth."""
     folder = tmp_path_factory.mktemp("flown")
-    lab = run.prepare(loader.load("shefex2", {"exposure.frames": "3", "light.limit_mag": "5"}))
-    for frame, truth, _ in run.render_frames(lab):
-        frames.write_frame(folder, frame, truth, lab.scene)
+    scene = loader.load("shefex2", {"exposure.frames": "3", "light.limit_mag": "5"})
+    for shot in open_flight(scene).shots(solves=False):
+        frames.write_frame(folder, shot.frame, shot.truth, scene)
     return recording.open_recording(folder)
 
 

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,9 @@ def test_a_wheel_runs_a_scene_outside_of_the_checkout(tmp_path: Path) -> None:
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
     subprocess.run([*pip, "wheel", "--no-deps", "-w", wheels, ROOT], check=True)
     wheel = next(wheels.glob("skysim-*.whl"))
+    scripts = {path.relative_to(ROOT).as_posix() for path in (ROOT / "skysim").rglob("*.js")}
+    assert scripts
+    assert scripts <= set(zipfile.ZipFile(wheel).namelist())  # of the page
     subprocess.run([*pip, "install", "--no-deps", "--target", there, wheel], check=True)
     environment = os.environ | {"PYTHONPATH": str(there)}
 

@@ -9,8 +9,7 @@ from estimator.core.types import Centroids
 from estimator.trackers.dome_tracker import DomeTracker
 from skysim.results import metrics
 from skysim.scene import loader
-from skysim.simulation import run
-from skysim.simulation.lab import build_tracker
+from skysim.simulation.lab import build_lab, build_tracker
 
 FIELDS = 60
 
@@ -18,7 +17,7 @@ FIELDS = 60
 @pytest.fixture(scope="module")
 def afit() -> DomeTracker:
     """The tracker of the AFIT scene: patch boards that repeat one 8 mm lattice all over the dome."""
-    tracker = build_tracker(run.prepare(loader.load("afit_simsat", {"exposure.frames": "1"})))
+    tracker = build_tracker(build_lab(loader.load("afit_simsat")).camera)
     assert isinstance(tracker, DomeTracker)
     return tracker
 

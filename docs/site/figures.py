@@ -20,8 +20,8 @@ from skysim.dynamics import multibody
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.orbit import ExclusionConfig
-from skysim.simulation import exposure, run
 from skysim.simulation.exposure import stray_light_e_s
+from skysim.simulation.flight import simulate_motion
 from skysim.simulation.lab import bodies_during, build_lab
 from skysim.sources import stars as star_sources
 from skysim.sources.air import scintillation, starlight
@@ -285,10 +285,11 @@ def bodies(path: Path) -> None:
     for ax, (name, time, settings, title) in zip(all_axes, views, strict=True):
         small = {"camera.focal_length": "200 mm", "camera.width_px": "240", "camera.height_px": "240"}
         settings |= small | {"light.bodies": "{}", "start_time": time, "motion.rate_deg_s": "[0, 0, 0]"}
-        shown = next(b for b in bodies_during(build_lab(loader.load("shefex2", settings)), 0.0) if b.name == name)
+        camera = build_lab(loader.load("shefex2", settings)).camera
+        shown = next(b for b in bodies_during(camera, 0.0) if b.name == name)
         start = f"{{ra_deg: {shown.truth().ra_deg}, dec_deg: {shown.truth().dec_deg}}}"
-        lab = run.prepare(loader.load("shefex2", settings | {"motion.start": start, "exposure.frames": "1"}))
-        image = exposure.render_frame(lab, 0)[0].image_dn.astype(float)
+        scene = loader.load("shefex2", settings | {"motion.start": start, "exposure.frames": "1"})
+        image = simulate_motion(scene).render(0)[0].image_dn.astype(float)
         dark = np.percentile(image, 5)
         ax.imshow(np.sqrt(np.clip(image - dark, 0, None)), cmap="gray")
         ax.set(xticks=[], yticks=[], title=title)
@@ -367,12 +368,13 @@ def orbit(path: Path) -> None:
         "start_time": "2012-06-24T21:00:00",
     }
     lab = build_lab(loader.load("shefex2", settings))
-    assert lab.camera.orbit is not None
-    cam_from_lab = lab.camera.mount.cam_from_body * lab.start.inv()
+    camera = lab.camera
+    assert camera.orbit is not None
+    cam_from_lab = camera.mount.cam_from_body * lab.start.inv()
     boresight, t_s = cam_from_lab.inv().apply([0.0, 0.0, 1.0]), np.arange(0, 2 * 5677, 20.0)
-    seen = sample(lab.camera.orbit, lab.scene.start_time, t_s, Pointing("inertial", boresight), boresight[None], 0.1)
+    seen = sample(camera.orbit, lab.scene.start_time, t_s, Pointing("inertial", boresight), boresight[None], 0.1)
     limits = ExclusionConfig(sun_deg=60, earth_deg=25, moon_deg=20)
-    stray = [stray_light_e_s(lab, bodies_during(lab, t), cam_from_lab, t) for t in t_s.tolist()]
+    stray = [stray_light_e_s(camera, bodies_during(camera, t), cam_from_lab, t) for t in t_s.tolist()]
     fig, (angles, light) = plt.subplots(2, 1, figsize=(8.5, 5.4), sharex=True, layout="constrained")
     outside = seen.outside(limits)
     usable = outside["Sun"] & outside["Earth"] & outside["Moon"]
@@ -400,8 +402,7 @@ def reflections(path: Path) -> None:
     fig, both = plt.subplots(1, 2, figsize=(10, 3.7), layout="constrained")
     titles = "black wall, clean lens", "satin wall that mirrors 10 %, one ghost"
     for ax, changes, title in zip(both, ({}, wall | lens), titles, strict=True):
-        lab = run.prepare(loader.load("apl_dome", settings | changes))
-        frame, truth = exposure.render_frame(lab, 0)
+        frame, truth = simulate_motion(loader.load("apl_dome", settings | changes)).render(0)
         light = frame.image_dn.astype(float)
         light -= np.median(light)
         # Every pixel as large as seven, on a logarithmic scale, so that LEDs and ghosts are seen.

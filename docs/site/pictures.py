@@ -9,9 +9,9 @@ import cv2
 
 from skysim.core.io import files
 from skysim.dynamics.multibody.view.picture import picture
-from skysim.results import report, telemetry_report
+from skysim.results import annotate, telemetry_report
 from skysim.scene import loader
-from skysim.simulation import exposure, run
+from skysim.simulation.flight import simulate_motion
 
 IMAGES = Path(__file__).parents[1] / "images"
 OUT = Path(__file__).parents[2] / "out"
@@ -27,7 +27,7 @@ def frame(rate_deg_s: float):  # type: ignore[no-untyped-def]
         "exposure": "{time: 50 ms, rate_hz: 10, frames: 1, first: 0 s}",
     }
     loaded = loader.load("shefex2", overrides)
-    return exposure.render_frame(run.prepare(loaded), 0)
+    return simulate_motion(loaded).render(0)
 
 
 def main() -> None:
@@ -36,16 +36,17 @@ def main() -> None:
         width = 1200
         size = (width, round(width * annotated.shape[0] / annotated.shape[1]))
         files.write_image(IMAGES / f"{name}.jpg", cv2.resize(annotated, size, interpolation=cv2.INTER_AREA))
-    lab = run.prepare(loader.load("simsat_slew"))
-    rendered = picture(lab.export_mjcf(), lab.log.joints[700])
+    flight = simulate_motion(loader.load("simsat_slew"))
+    rendered = picture(flight.lab.export_mjcf(), flight.telemetry().joints[700])
     files.write_image(IMAGES / "lab.jpg", rendered[:, :, ::-1])
-    (IMAGES / "bump.png").write_bytes(telemetry_report.figure(run.prepare(loader.load("simsat_bump")).log))
+    bumped = simulate_motion(loader.load("simsat_bump"))
+    (IMAGES / "bump.png").write_bytes(telemetry_report.figure(bumped.telemetry()))
     exposures = [frame(rate) for rate in RATES_DEG_S]
     captions = [
         f"{rate} deg/s, {truth.sources.streak_px.max():.1f} px"
         for rate, (_, truth) in zip(RATES_DEG_S, exposures, strict=True)
     ]
-    sheet = report.contact_sheet([image.image_dn[WINDOW] for image, _ in exposures], captions, scale=3)
+    sheet = annotate.contact_sheet([image.image_dn[WINDOW] for image, _ in exposures], captions, scale=3)
     files.write_image(IMAGES / "smear.png", sheet)
     screenshots()
 

@@ -4,7 +4,7 @@ The raw YAML tree is built in layers, the later ones over the earlier: the `base
 keys, then the overrides of `--set`. A layer that names a camera preset also drops the keys that this preset defines
 from the layers below (`over_base`). Next, the camera section is merged over its preset, and a calibration file's
 values over both (`with_preset`). Only then does pydantic validate the tree. Last, an option that has no effect is
-refused (`keys.unused`). Every error becomes an InputError of one line with key, file and line.
+refused (`unused`). Every error becomes an InputError of one line with key, file and line.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from skysim.core.io import yaml_reader
 from skysim.core.io.yaml_reader import Files, check_version, explain, is_file, read_yaml, set_key, where_of
 from skysim.core.paths import DATA, SCENES
 from skysim.core.quantities.units import ConfigModel, quantity
-from skysim.scene.keys import unused
+from skysim.scene import unused
 from skysim.scene.opencv_calibration import read as read_calibration
 from skysim.scene.scene import HEAD_SECTIONS, NAME_ALIAS, Scene
 from skysim.scene.sections.camera import CameraConfig, focus_distance
@@ -165,7 +165,7 @@ def over_base(
     motion, moving = own.get("motion"), base.get("motion")
     if isinstance(motion, dict) and isinstance(moving, dict):
         start = motion.get("start")
-        if getattr(start, "value", start) == "profile":  # in `keys.provenance` a value has its origin beside it
+        if getattr(start, "value", start) == "profile":  # in `provenance` a value has its origin beside it
             base = base | {"motion": {key: value for key, value in moving.items() if key != "rate_deg_s"}}
     return merge(base, own)
 
@@ -199,7 +199,7 @@ def find(name: str) -> Path:
 def load(name: str | Path, overrides: Mapping[str, str] | None = None, refuses_unused: bool = True) -> Scene:
     """Read, override (`path.to.key` -> YAML value) and validate a scene.
 
-    refuses_unused : whether an option that has no effect is an error (scene/keys/unused.py)
+    refuses_unused : whether an option that has no effect is an error (scene/unused.py)
     Raises InputError with one line: the key, what is wrong with it, what is allowed, the file and line.
     """
     path, overrides = find(str(name)), overrides or {}

@@ -23,7 +23,7 @@ from skysim.apps.plate_solver import diagnosis
 from skysim.core.io import images
 from skysim.core.paths import CATALOGS
 from skysim.scene import loader
-from skysim.simulation import exposure, run
+from skysim.simulation.flight import simulate_motion
 from skysim.sources import stars
 
 FOV_DEG = 14.87  # of the SHEFEX-2 camera with its own lens
@@ -39,7 +39,7 @@ def photograph(focal: str = "25 mm", ra_deg: float = 83.0, dec_deg: float = 2.0)
         "camera.focal_length": focal,
         "motion.start": f"{{ra_deg: {ra_deg}, dec_deg: {dec_deg}, roll_deg: 20}}",
     }
-    return exposure.render_frame(run.prepare(loader.load("shefex2", changes)), 0)[0].image_dn
+    return simulate_motion(loader.load("shefex2", changes)).render(0)[0].image_dn
 
 
 def spread(kernel: NDArray) -> Change:

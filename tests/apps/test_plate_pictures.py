@@ -29,7 +29,7 @@ from skysim.core.types import Frame, Truth
 from skysim.results.files import frames
 from skysim.scene import loader
 from skysim.scene.scene import Scene
-from skysim.simulation import exposure, run
+from skysim.simulation.flight import simulate_motion
 from skysim.sources import stars
 
 PIXEL_UM, WIDTH_PX, HEIGHT_PX = 9.9, 659, 493  # of the SHEFEX-2 camera
@@ -45,8 +45,8 @@ STORED = {
 def photographed(focal: str = "25 mm") -> tuple[Scene, Frame, Truth]:
     """The SHEFEX-2 camera at rest behind a lens."""
     still = {"exposure.frames": "1", "motion.rate_deg_s": "[0, 0, 0]", "camera.focal_length": focal}
-    lab = run.prepare(loader.load("shefex2", still))
-    return lab.scene, *exposure.render_frame(lab, 0)
+    scene = loader.load("shefex2", still)
+    return scene, *simulate_motion(scene).render(0)
 
 
 @pytest.fixture(scope="module")

@@ -19,9 +19,9 @@ from skysim.apps.plate_solver import solver as searching
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
+from skysim.core.types import Frame, Truth
 from skysim.scene import loader
-from skysim.simulation import exposure, run
-from skysim.simulation.lab import Lab
+from skysim.simulation.flight import simulate_motion
 from skysim.sources import stars
 
 ATTITUDE = Rotation.from_rotvec([0.1, 0.2, 0.3])
@@ -137,17 +137,17 @@ def blind() -> plate_solver.Solver:
     return plate_solver.make_solver(None, None)
 
 
-def photographed(focal: str) -> Lab:
-    """The SHEFEX-2 camera at rest behind a lens."""
+def photographed(focal: str) -> tuple[Frame, Truth]:
+    """A frame of the SHEFEX-2 camera at rest behind a lens."""
     still = {"exposure.frames": "1", "motion.rate_deg_s": "[0, 0, 0]"}
-    return run.prepare(loader.load("shefex2", still | {"camera.focal_length": focal}))
+    return simulate_motion(loader.load("shefex2", still | {"camera.focal_length": focal})).render(0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("focal", "fov_deg"), [("10 mm", 36.12), ("25 mm", 14.84), ("45 mm", 8.28)])
 def test_a_rendered_field_is_solved_with_nothing_told(blind: plate_solver.Solver, focal: str, fov_deg: float) -> None:
     """2 atan(658 x 9.9 um / 2 f) between the middles of the edge columns, to half a per cent; three arc-minutes."""
-    frame, truth = exposure.render_frame(photographed(focal), 0)
+    frame, truth = photographed(focal)
     found, _ = plate_solver.solve_array(frame.image_dn, blind, None)
     solution = plate_solver.solution_fields(found)
     ours = stars.cam_from_icrs(solution["ra_deg"], solution["dec_deg"], solution["roll_deg"])
@@ -160,11 +160,11 @@ def test_a_rendered_field_is_solved_with_nothing_told(blind: plate_solver.Solver
 def test_smeared_frames_of_a_known_camera_are_placed_by_their_streaks() -> None:
     """14 px of unmodeled smear: error below 100" and consistent with the covariance; round-star fits roll 400" off."""
     fast = {"exposure.frames": "16", "motion.rate_deg_s": "[4.8, 6.4, 0]"}
-    lab = run.prepare(loader.load("scoreboard", fast))
+    flight = simulate_motion(loader.load("scoreboard", fast))
     camera = plate_solver.make_solver(None, SCENES / "shefex2.yaml")
     for n in (5, 15):
-        frame, truth = exposure.render_frame(lab, n)
-        found = plate_solver.solve_array(frame.image_dn, camera, lab.scene.start_time)[0].attitude
+        frame, truth = flight.render(n)
+        found = plate_solver.solve_array(frame.image_dn, camera, flight.lab.scene.start_time)[0].attitude
         assert found.cam_from_ref is not None
         error_rad = (found.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec()
         assert np.abs(error_rad).max() < 100 * ARCSEC_RAD
@@ -174,7 +174,7 @@ def test_smeared_frames_of_a_known_camera_are_placed_by_their_streaks() -> None:
 @pytest.mark.long
 def test_a_sky_seen_in_a_mirror_is_refused(blind: plate_solver.Solver) -> None:
     """No rotation maps the sky to its mirror image, so every solution would be wrong."""
-    frame, _ = exposure.render_frame(photographed("25 mm"), 0)
+    frame, _ = photographed("25 mm")
     found, _ = plate_solver.solve_array(np.ascontiguousarray(frame.image_dn[:, ::-1]), blind, None)
     assert not found.attitude.solved
     assert len(found.centroids) >= 4

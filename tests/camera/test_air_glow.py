@@ -15,7 +15,7 @@ from skysim.simulation.lab import Lab, build_lab, sky_during
 SITE = "{latitude_deg: 53.1, longitude_deg: 8.8, height: 10 m}"
 
 
-def bed(time: str, **glow: str) -> Lab:
+def lab_of(time: str, **glow: str) -> Lab:
     keys = {"start_time": time, "site": SITE, "light.air.glow.twilight": "true"}
     return build_lab(load("shefex2", keys | {f"light.air.{key}": value for key, value in glow.items()}))
 
@@ -70,8 +70,8 @@ def test_the_moon_lights_the_sky_only_above_the_horizon() -> None:
     mean = {}
     for name, time in (("up", full_up), ("down", full_down)):
         for moonlight in ("true", "false"):
-            lab = bed(time, **{"glow.moonlight": moonlight, "glow.twilight": "false"})
-            sky = sky_during(lab, 0.0)
+            lab = lab_of(time, **{"glow.moonlight": moonlight, "glow.twilight": "false"})
+            sky = sky_during(lab.camera, 0.0)
             assert sky is not None
             moon = sky.altitude_rad(seen_place("moon", sky).direction[None])[0]
             assert (moon > 0) == (name == "up")
@@ -85,7 +85,7 @@ def test_the_moon_lights_the_sky_only_above_the_horizon() -> None:
 
 def up_pointing(lab: Lab) -> Rotation:
     """cam_from_icrs of a camera that looks at the zenith."""
-    sky = sky_during(lab, 0.0)
+    sky = sky_during(lab.camera, 0.0)
     assert sky is not None
     north, east, up = sky.axes
     return Rotation.from_matrix(np.stack([-east, -north, up]))
@@ -93,8 +93,8 @@ def up_pointing(lab: Lab) -> Rotation:
 
 @pytest.mark.slow
 def test_below_the_skyline_there_is_no_glow() -> None:
-    lab = bed("2012-06-24T23:00:00")
-    sky = sky_during(lab, 0.0)
+    lab = lab_of("2012-06-24T23:00:00")
+    sky = sky_during(lab.camera, 0.0)
     assert sky is not None
     north, east, up = sky.axes
     level = Rotation.from_matrix(np.stack([east, -up, north]))  # looks north along the ground
@@ -108,8 +108,8 @@ def test_below_the_skyline_there_is_no_glow() -> None:
 @pytest.mark.slow
 def test_dark_glow_is_that_of_the_told_sky() -> None:
     """At the zenith, moonless and at night: as a background of kind sky of the same magnitude."""
-    lab = bed("2012-12-13T23:00:00", **{"glow.dark_mag_arcsec2": "21", "extinction_mag": "0"})
-    ours = glow_map((), lab.camera.optics, up_pointing(lab), lab.camera.band, sky_light(sky_during(lab, 0.0)))
+    lab = lab_of("2012-12-13T23:00:00", **{"glow.dark_mag_arcsec2": "21", "extinction_mag": "0"})
+    ours = glow_map((), lab.camera.optics, up_pointing(lab), lab.camera.band, sky_light(sky_during(lab.camera, 0.0)))
     told = SkyGlowConfig(kind="sky", mag_arcsec2=21)
     even = glow_map((told,), lab.camera.optics, up_pointing(lab), lab.camera.band)
     center = tuple(size // 2 for size in ours.shape)

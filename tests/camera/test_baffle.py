@@ -14,7 +14,7 @@ from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.scene.sections.camera import BaffleConfig
 from skysim.scene.sections.orbit import EarthConfig
-from skysim.simulation.exposure import render_frame, stray_light_e_s
+from skysim.simulation.exposure import render_at_rest, stray_light_e_s
 from skysim.simulation.lab import Lab, bodies_during, build_lab
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
@@ -38,19 +38,18 @@ def in_space(ra_deg: float, dec_deg: float, **keys: str) -> Lab:
     start = f"{{ra_deg: {ra_deg}, dec_deg: {dec_deg}, roll_deg: 0}}"
     given = {"camera.baffle": TABLE, "motion.start": start, "start_time": "2012-06-24T21:00:00", "background": "[]"}
     overrides = given | {key.replace("__", "."): value for key, value in keys.items()}
-    lab = build_lab(loader.load("shefex2", overrides))
-    return lab.at_rest(lab.start, 0)
+    return build_lab(loader.load("shefex2", overrides))
 
 
 def stray_of(lab: Lab, t_s: float = 0.0) -> dict[str, float]:
     cam_from_lab = lab.camera.mount.cam_from_body * lab.start.inv()
-    return stray_light_e_s(lab, bodies_during(lab, t_s), cam_from_lab, t_s)
+    return stray_light_e_s(lab.camera, bodies_during(lab.camera, t_s), cam_from_lab, t_s)
 
 
 def test_the_sun_s_light_is_its_irradiance_times_the_transmittance() -> None:
     """1361 W/m2 of a black body of 5772 K, counted in photons: Kopp & Lean 2011; V = -26.74 gives 4 % more."""
     lab = in_space(90.0, -20.0, light__bodies="{moon: false, planets: false}")
-    sun = bodies_during(lab, 0.0)[0]
+    sun = bodies_during(lab.camera, 0.0)[0]
     m = np.linalg.norm(np.cross(sun.place.direction, [0.0, np.cos(np.radians(20)), np.sin(np.radians(-20))]))
     angle_deg = np.degrees(np.arcsin(m))
     assert 40 < angle_deg < 50
@@ -116,9 +115,11 @@ def test_a_frame_has_the_stray_light_in_every_pixel() -> None:
     lit = in_space(90.0, -5.0, **keys)
     e_s = sum(stray_of(lit, lit.scene.exposure.time_s / 2).values())
     dark = in_space(90.0, -5.0, **keys, camera__baffle="null")
-    more = render_frame(lit, 0)[0].image_dn - render_frame(dark, 0)[0].image_dn
+    bright_dn, dark_dn = (render_at_rest(lab.camera, lab.start)[0].image_dn for lab in (lit, dark))
     detector = lit.scene.camera.detector
-    assert np.median(more) == pytest.approx(e_s * lit.scene.exposure.time_s / detector.gain_e_dn, rel=1e-3)
+    assert np.median(bright_dn - dark_dn) == pytest.approx(
+        e_s * lit.scene.exposure.time_s / detector.gain_e_dn, rel=1e-3
+    )
     assert e_s > 1
 
 

@@ -190,7 +190,7 @@ def test_bodies_and_satellites_have_their_colors() -> None:
     """Mars is redder than the Sun and Uranus bluer; a satellite is as the Sun."""
     lens = {"camera.chromatic": LENS, "light.bodies": "{}"}
     lab = build_lab(loader.load("shefex2", lens))
-    lights = {body.name: points_of(body, np.zeros((2, 2))).chromatic for body in bodies_during(lab, 0.0)}
+    lights = {body.name: points_of(body, np.zeros((2, 2))).chromatic for body in bodies_during(lab.camera, 0.0)}
     assert lights["mars"][1, 2] > lights["sun"][1, 2] + 0.02
     assert lights["uranus"][1, 2] < lights["sun"][1, 2] - 0.02
     path = np.array([0.0, 0, 1]), np.zeros((2, 3))

@@ -10,7 +10,7 @@ from skysim.camera.glow.earth_glow import LAYER, earth_radiance
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.scene import loader
 from skysim.scene.sections.orbit import EarthConfig
-from skysim.simulation.exposure import render_frame
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import build_lab
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 
@@ -67,8 +67,7 @@ def test_the_limb_is_where_its_dip_says() -> None:
         "background": "[]",
     }
     lab = build_lab(loader.load("shefex2", keys | {"start_time": "2012-06-22T09:00:00"}))
-    lab = lab.at_rest(lab.start, 0)
-    frame, _ = render_frame(lab, 0)
+    frame, _ = render_at_rest(lab.camera, lab.start)
     camera, image = lab.scene.camera, frame.image_dn
     middle = image[:, round(camera.center_px[0])] - image.min()
     assert middle.max() > 0

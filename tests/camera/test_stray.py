@@ -17,8 +17,7 @@ from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig, GlareConfig
 from skysim.scene.sections.leds import CosineLobeConfig
 from skysim.scene.sections.light import ReflectionConfig
-from skysim.simulation import run
-from skysim.simulation.exposure import render_frame
+from skysim.simulation.flight import simulate_motion
 from skysim.simulation.lab import build_lab
 from skysim.sources.dome.reflection.dome import ReflectingDome
 from skysim.sources.dome.reflection.interreflection import diffuse_light, spiral
@@ -75,7 +74,7 @@ def test_reflections_are_in_the_frame_and_its_truth() -> None:
     lights = truth.sources
     false = lights.id > MIRRORED
     assert false.sum() >= 5
-    assert set(lights.id[false] % MIRRORED) <= set(build_lab(loader.load("apl_dome", DEEP)).sources.id)
+    assert set(lights.id[false] % MIRRORED) <= set(build_lab(loader.load("apl_dome", DEEP)).camera.sources.id)
     gain = loader.load("apl_dome").camera.detector.gain_e_dn
     assert gained.sum() * gain == pytest.approx(lights.electrons[false].sum(), rel=2e-3)
     for n in np.flatnonzero(false):
@@ -84,9 +83,8 @@ def test_reflections_are_in_the_frame_and_its_truth() -> None:
 
 
 def frame(scene: str, settings: dict[str, str]) -> tuple[Frame, Truth]:
-    """The first frame of a scene; a copy, as the next one overwrites it."""
-    rendered, truth = render_frame(run.prepare(loader.load(scene, settings)), 0)
-    return Frame(0, rendered.image_dn.copy(), 0.0, rendered.exposure_s, rendered.saturation_dn), truth
+    """The first frame of a scene."""
+    return simulate_motion(loader.load(scene, settings)).render(0)
 
 
 SKY = {"camera.detector.noise": "false", "exposure.frames": "1", "camera.detector.prnu": "0"}

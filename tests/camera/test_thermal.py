@@ -15,8 +15,7 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Mount, Sources
 from skysim.scene import loader
 from skysim.scene.sections.thermal import ThermalConfig
-from skysim.simulation import run
-from skysim.simulation.exposure import render_frame
+from skysim.simulation.flight import simulate_motion
 
 MOUNT = {"mount_arcsec_k": [3.0, -2.0, 1.0]}
 LINEAR = {"kind": "linear", "start_c": 20.0, "rate_c_h": 2.0}
@@ -86,16 +85,17 @@ def test_boresight_drifts_by_its_coefficient_in_the_truth() -> None:
         "exposure.rate_hz": "1",
         "camera.detector.noise": "false",
     }
-    lab = run.prepare(loader.load("shefex2", settings))
+    flight = simulate_motion(loader.load("shefex2", settings))
+    camera = flight.lab.camera
     for index in range(3):
-        _, truth = render_frame(lab, index)
-        nominal = lab.camera.mount.cam_from_body * truth.lab_from_body.inv()
+        _, truth = flight.render(index)
+        nominal = camera.mount.cam_from_body * truth.lab_from_body.inv()
         drift_k = -1 + truth.t_s  # 2 K an hour, 1800 times as fast
         turned = (truth.cam_from_lab * nominal.inv()).as_rotvec() / ARCSEC_RAD
         np.testing.assert_allclose(turned, np.array([300.0, -200.0, 100.0]) * drift_k, atol=1e-6)
-        stars = lab.camera.sources.take(np.isin(lab.camera.sources.id, truth.sources.id))
+        stars = camera.sources.take(np.isin(camera.sources.id, truth.sources.id))
         rows = np.searchsorted(truth.sources.id, stars.id, sorter=np.argsort(truth.sources.id))
-        xy_px = lab.camera.optics.project(truth.cam_from_lab.apply(stars.place[:, :3]))
+        xy_px = camera.optics.project(truth.cam_from_lab.apply(stars.place[:, :3]))
         found = truth.sources.xy_px[np.argsort(truth.sources.id)[rows]]
         np.testing.assert_allclose(found, xy_px, atol=1e-6)
 

@@ -26,14 +26,14 @@ from skysim.core.io.files import HOST, TEMPORARY_NAME
 from skysim.core.types import BodyTruth, Frame, Truth
 from skysim.results.files import ccsds_aem, frames
 from skysim.scene import loader, scene
-from skysim.simulation import exposure, run
+from skysim.simulation.flight import simulate_motion
 
 Shot = tuple[scene.Scene, Frame, Truth]
 
 
 def shoot(name: str, **overrides: str) -> Shot:
     loaded = loader.load(name, {key.replace("__", "."): value for key, value in overrides.items()})
-    frame, truth = exposure.render_frame(run.prepare(loaded), 0)
+    frame, truth = simulate_motion(loaded).render(0)
     return loaded, frame, truth
 
 
@@ -204,11 +204,12 @@ def test_a_shorter_run_leaves_no_frames_of_a_longer_one(tmp_path: Path, sky: Sho
 def test_astropy_puts_the_true_stars_on_their_true_pixels(tmp_path: Path, pointing: dict[str, str]) -> None:
     """Directions from the scene's own sources, pixels by astropy's WCS of the header alone."""
     loaded = loader.load("shefex2", {k.replace("__", "."): v for k, v in pointing.items()})
-    lab = run.prepare(loaded)
-    frame, truth = exposure.render_frame(lab, 0)
+    flight = simulate_motion(loaded)
+    frame, truth = flight.render(0)
     frames.write_fits(tmp_path / "f.fits", frame, truth, loaded)
-    rows = {hip: n for n, hip in enumerate(lab.camera.sources.id)}
-    direction = lab.camera.sources.place[[rows[hip] for hip in truth.sources.id], :3]
+    sources = flight.lab.camera.sources
+    rows = {hip: n for n, hip in enumerate(sources.id)}
+    direction = sources.place[[rows[hip] for hip in truth.sources.id], :3]
     ra, dec = np.degrees([np.arctan2(direction[:, 1], direction[:, 0]), np.arcsin(direction[:, 2])])
     x, y = WCS(fits.getheader(tmp_path / "f.fits")).all_world2pix(ra, dec, 0)
     assert len(x) > 20

@@ -16,7 +16,7 @@ from skysim.dynamics.attitude_control import Pid, build_controller
 from skysim.dynamics.guidance import Reference, plan
 from skysim.scene import loader
 from skysim.scene.sections.motion import ControlConfig, MotionConfig
-from skysim.simulation import run
+from skysim.simulation.flight import simulate_motion
 
 INERTIA = np.array([6.0, 6.5, 9.0])
 AXES = Rotation.from_rotvec([0.2, -0.4, 0.3]).as_matrix()
@@ -210,11 +210,10 @@ def test_a_great_step_is_taken_without_swinging() -> None:
         "vehicle.center_of_mass": "[0 m, 0 m, 0 m]",
         "exposure": "{time: 10 ms, rate_hz: 1, frames: 1, first: 25 s}",
     }
-    flown = run.prepare(loader.load("afit_simsat", step)).telemetry
-    assert flown is not None
-    yaw_deg = np.degrees(flown.lab_from_body.as_rotvec()[:, 2])
+    telemetry = simulate_motion(loader.load("afit_simsat", step)).telemetry()
+    yaw_deg = np.degrees(telemetry.lab_from_body.as_rotvec()[:, 2])
     quickest_s = 2 * math.sqrt(math.radians(60) * 9.0 / 1.0)
-    arrived_s = flown.t_s[np.argmax(yaw_deg > 59.9)]
+    arrived_s = telemetry.t_s[np.argmax(yaw_deg > 59.9)]
     assert quickest_s < arrived_s < 1.3 * quickest_s
     assert yaw_deg.max() < 60.5
     assert abs(yaw_deg[-1] - 60) < 1e-3
@@ -241,11 +240,10 @@ def test_an_unbalanced_bearing_needs_the_integral(law: str) -> None:
         "motion.maneuver": "[]",
         "exposure": "{time: 10 ms, rate_hz: 1, frames: 1, first: 25 s}",
     }
-    lab = run.prepare(loader.load("afit_simsat", out_of_balance))
-    assert lab.telemetry is not None
-    left_deg = np.degrees(lab.telemetry.lab_from_body[-1].as_rotvec())
+    telemetry = simulate_motion(loader.load("afit_simsat", out_of_balance)).telemetry()
+    left_deg = np.degrees(telemetry.lab_from_body[-1].as_rotvec())
     tilt = math.radians(1.03)
     expected = {"pd": -1.03 * math.cos(tilt), "pid": 0.0}[law]  # towards the heavy side
     np.testing.assert_allclose(left_deg, [expected, 0, 0], rtol=0, atol=1e-4)
-    torque = lab.telemetry.torque_nm[-1]
+    torque = telemetry.torque_nm[-1]
     np.testing.assert_allclose(torque, [WEIGHT_N * OFFSET_M * math.cos(expected * tilt), 0, 0], atol=1e-5)

@@ -16,8 +16,7 @@ from skysim.dynamics.guidance import Impulse
 from skysim.dynamics.imu import earth_rate_lab_rad_s
 from skysim.scene import loader
 from skysim.scene.sections.vehicle import AirCurrentConfig, DisturbancesConfig, SiteConfig
-from skysim.simulation import run
-from skysim.simulation.lab import Lab
+from skysim.simulation.flight import Flight, simulate_motion
 
 AXES = Rotation.from_rotvec([0.2, -0.4, 0.3]).as_matrix()
 TENSOR = AXES @ np.diag([6.0, 6.5, 9.0]) @ AXES.T  # of a vehicle whose principal axes are not the body's
@@ -26,11 +25,11 @@ BALANCED = {"vehicle.center_of_mass": "[0 m, 0 m, 0 m]", "motion.control": "none
 QUIET = DisturbancesConfig()
 
 
-def flown(duration_s: float, **changes: str) -> Lab:
-    """SimSat, balanced and flown by nobody."""
+def flown(duration_s: float, **changes: str) -> Flight:
+    """SimSat, balanced and without a controller."""
     until = {"exposure": f"{{time: 10 ms, rate_hz: 1, frames: 1, first: {duration_s - 0.012} s}}"}
     given = BALANCED | until | {key.replace("__", "."): value for key, value in changes.items()}
-    return run.prepare(loader.load("afit_simsat", given))
+    return simulate_motion(loader.load("afit_simsat", given))
 
 
 def room(
@@ -99,15 +98,12 @@ def test_a_steady_wind_and_the_turbine_blow_along_the_lab_s_axes() -> None:
 
 def test_turbine_spins_a_vehicle_up() -> None:
     """w = T t / J about z: 2e-3 N m for 4 s on 9 kg m2."""
-    lab = flown(4.0, vehicle__disturbances="{turbine: [0 N m, 0 N m, 2 mN m]}")
-    expected = 2e-3 / 9 * lab.trajectory.t_s[-1]
-    np.testing.assert_allclose(lab.trajectory.rate_body_rad_s[-1], [0, 0, expected], rtol=1e-9, atol=1e-12)
-    assert lab.telemetry is not None
-    np.testing.assert_allclose(
-        lab.telemetry.disturbance_nm,
-        np.tile([0, 0, 2e-3], (400, 1))[: len(lab.telemetry.t_s)],
-        atol=1e-12,
-    )
+    flight = flown(4.0, vehicle__disturbances="{turbine: [0 N m, 0 N m, 2 mN m]}")
+    motion, telemetry = flight.trajectory(), flight.telemetry()
+    expected = 2e-3 / 9 * motion.t_s[-1]
+    np.testing.assert_allclose(motion.rate_body_rad_s[-1], [0, 0, expected], rtol=1e-9, atol=1e-12)
+    wanted = np.tile([0, 0, 2e-3], (400, 1))[: len(telemetry.t_s)]
+    np.testing.assert_allclose(telemetry.disturbance_nm, wanted, atol=1e-12)
 
 
 # --- the Earth ----------------------------------------------------------------------------------------------
@@ -176,17 +172,16 @@ def test_a_flown_vehicle_feels_the_earth_turn() -> None:
     """Let go with no turn among the stars, it turns in the lab with -15.04 deg/h about the Earth's axis."""
     earth = earth_rate_lab_rad_s(SiteConfig(latitude_deg=39.8, x_azimuth_deg=90))
     rate = str((-np.degrees(earth)).tolist())
-    lab = flown(20.0, vehicle__disturbances="{earth_rotation: true}", motion__rate_deg_s=rate)
-    t_s = lab.trajectory.t_s[-1]
-    turned = lab.trajectory.lab_from_body[-1].as_rotvec()
+    motion = flown(20.0, vehicle__disturbances="{earth_rotation: true}", motion__rate_deg_s=rate).trajectory()
+    t_s = motion.t_s[-1]
+    turned = motion.lab_from_body[-1].as_rotvec()
     np.testing.assert_allclose(turned, -earth * t_s, rtol=0, atol=1e-6 * np.linalg.norm(earth) * t_s)
     spinning = '{start_rpm: [3000, 0, 0], torque_limit: "0.5 N m"}'
-    pushed = flown(2.0, vehicle__disturbances="{earth_rotation: true}", vehicle__wheels=spinning)
-    assert pushed.telemetry is not None
+    pushed = flown(2.0, vehicle__disturbances="{earth_rotation: true}", vehicle__wheels=spinning).telemetry()
     # At rest in the lab the momentum among the stars, nearly all of it the wheel's, makes the torque.
-    whole = pushed.telemetry.momentum_nms[0] + np.diag([6.0, 6.5, 9.0]) @ earth
+    whole = pushed.momentum_nms[0] + np.diag([6.0, 6.5, 9.0]) @ earth
     expected = -np.cross(earth, whole)
-    np.testing.assert_allclose(pushed.telemetry.disturbance_nm[0], expected, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(pushed.disturbance_nm[0], expected, rtol=1e-9, atol=1e-15)
 
 
 # --- knocks -------------------------------------------------------------------------------------------------
@@ -202,10 +197,10 @@ def bump(**more: str) -> str:
 
 def test_a_knock_changes_the_rate_by_what_the_scene_says() -> None:
     """On a sphere about three axes at once, beginning and ending within steps and ticks."""
-    lab = flown(0.5, motion__maneuver=f"[{HOLD}, {bump()}]", **SPHERE)
-    rate = np.degrees(lab.trajectory.rate_body_rad_s)
+    motion = flown(0.5, motion__maneuver=f"[{HOLD}, {bump()}]", **SPHERE).trajectory()
+    rate = np.degrees(motion.rate_body_rad_s)
     np.testing.assert_allclose(rate[-1], [3, -2, 14], rtol=1e-6, atol=0)
-    t_s = lab.trajectory.t_s
+    t_s = motion.t_s
     assert (rate[t_s < 0.1234] == 0).all()
     # A half-sine: its integral is (1 - cos(pi x)) / 2 of the whole. Every step has its exact share.
     x = np.clip((t_s - 0.1234) / 0.040, 0, 1)
@@ -216,15 +211,15 @@ def test_a_knock_changes_the_rate_by_what_the_scene_says() -> None:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_knock_is_felt_by_each_moment_of_inertia(axis: int) -> None:
     rate = (5.0 * np.eye(3)[axis]).tolist()
-    lab = flown(0.3, motion__maneuver=f'[{{kind: bump, rate_deg_s: {rate}, duration: "30 ms"}}]')
-    np.testing.assert_allclose(np.degrees(lab.trajectory.rate_body_rad_s[-1]), rate, rtol=1e-6, atol=1e-12)
+    motion = flown(0.3, motion__maneuver=f'[{{kind: bump, rate_deg_s: {rate}, duration: "30 ms"}}]').trajectory()
+    np.testing.assert_allclose(np.degrees(motion.rate_body_rad_s[-1]), rate, rtol=1e-6, atol=1e-12)
 
 
 def test_a_caught_vehicle_is_at_rest_again_and_somewhere_else() -> None:
     """Turned by rate times the time between the knocks: 14.5 deg/s for 0.2 s, 2.9 deg."""
-    lab = flown(0.6, motion__maneuver=f"[{HOLD}, {bump(caught_after='0.2 s')}]", **SPHERE)
-    assert np.degrees(np.abs(lab.trajectory.rate_body_rad_s[-1])).max() < 1e-6
-    turned = np.degrees(lab.trajectory.lab_from_body[-1].as_rotvec())
+    motion = flown(0.6, motion__maneuver=f"[{HOLD}, {bump(caught_after='0.2 s')}]", **SPHERE).trajectory()
+    assert np.degrees(np.abs(motion.rate_body_rad_s[-1])).max() < 1e-6
+    turned = np.degrees(motion.lab_from_body[-1].as_rotvec())
     np.testing.assert_allclose(turned, np.array([3, -2, 14]) * 0.2, rtol=1e-6, atol=0)
 
 

@@ -18,7 +18,7 @@ from skysim.dynamics.flight_computer import FlightComputer
 from skysim.dynamics.guidance import plan
 from skysim.dynamics.multibody.actuators.kind import ControlInput
 from skysim.scene import loader
-from skysim.simulation import run
+from skysim.simulation.flight import simulate_motion
 
 FREE = {
     "vehicle.mount": "free",
@@ -166,11 +166,10 @@ def test_constant_torque_leaves_no_error_on_cmgs_either() -> None:
         "motion.maneuver": "[]",
         "exposure": "{time: 10 ms, rate_hz: 1, frames: 1, first: 6 s}",
     }
-    flown = run.prepare(loader.load("simsat_cmg", changes)).telemetry
-    assert flown is not None
-    error_deg = np.degrees(flown.lab_from_body.magnitude())
-    late = flown.t_s > 3
-    decay = np.polyfit(flown.t_s[late], np.log(error_deg[late]), 1)[0]
+    telemetry = simulate_motion(loader.load("simsat_cmg", changes)).telemetry()
+    error_deg = np.degrees(telemetry.lab_from_body.magnitude())
+    late = telemetry.t_s > 3
+    decay = np.polyfit(telemetry.t_s[late], np.log(error_deg[late]), 1)[0]
     assert decay == pytest.approx(-0.6, rel=0.02)
     assert error_deg[-1] < 0.002
 
@@ -201,10 +200,9 @@ def test_momentum_is_mujocos_own(name: str) -> None:
 def test_momentum_is_in_the_telemetry_whether_somebody_flies_or_not(control: str) -> None:
     """Wheels without friction keep what they had, 0.010125 kg m2 at 300, -500 and 800 rpm."""
     changes = FREE | WHEELS | {"motion.control": control, "exposure.frames": "1", "exposure.first": "0.2 s"}
-    flown = run.prepare(loader.load("afit_simsat", changes)).telemetry
-    assert flown is not None
+    telemetry = simulate_motion(loader.load("afit_simsat", changes)).telemetry()
     expected = 0.010125 * np.array([300, -500, 800]) * math.pi / 30
-    np.testing.assert_allclose(flown.momentum_nms, np.tile(expected, (len(flown.t_s), 1)), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(telemetry.momentum_nms, np.tile(expected, (len(telemetry.t_s), 1)), rtol=0, atol=1e-6)
 
 
 # --- desaturation -------------------------------------------------------------------------------------------
@@ -221,9 +219,7 @@ def relieved() -> Telemetry:
         "exposure": "{time: 10 ms, rate_hz: 1, frames: 1, first: 8 s}",
         "vehicle.disturbances": "{}",
     }
-    flown = run.prepare(loader.load("simsat_slew", changes)).telemetry
-    assert flown is not None
-    return flown
+    return simulate_motion(loader.load("simsat_slew", changes)).telemetry()
 
 
 def test_desaturation_follows_the_fans_lag(relieved: Telemetry) -> None:

@@ -17,7 +17,7 @@ from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.occlusion import behind_wall
 from skysim.scene import loader
 from skysim.scene.sections import light
-from skysim.simulation import exposure
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
 from skysim.sources.dome.shell import surface
 from skysim.sources.dome.shell.surface import Surface
@@ -67,7 +67,7 @@ def crosses(begin_m: Floats, end_m: Floats, middle_m: Floats) -> np.ndarray:
 
 
 def picture(lab: Lab) -> tuple[bytes, set[int], Any]:
-    frame, truth = exposure.render_frame(lab, 0)
+    frame, truth = render_at_rest(lab.camera, lab.start)
     return frame.image_dn.tobytes(), set(truth.sources.id.tolist()), truth
 
 
@@ -124,8 +124,8 @@ def test_where_nothing_is_in_the_way_the_frame_is_the_same_bit_for_bit(tmp_path:
 
 
 def test_it_is_on_unless_the_scene_says_otherwise() -> None:
-    assert build_lab(loader.load("afit_simsat")).obstacles is not None
-    assert build_lab(loader.load("afit_simsat", {"light.occlusion": "false"})).obstacles is None
+    assert build_lab(loader.load("afit_simsat")).camera.obstacles is not None
+    assert build_lab(loader.load("afit_simsat", {"light.occlusion": "false"})).camera.obstacles is None
 
 
 LENS = '<geom type="cylinder" size="0.022 0.015" pos="0 0 0.065" mass="0.2" rgba="0.05 0.05 0.06 1"/>'

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skysim.scene import loader
-from skysim.simulation import exposure, run
+from skysim.simulation.flight import simulate_motion
 
 CLEAN = {
     "exposure.frames": "1",
@@ -27,7 +27,7 @@ CLEAN = {
 def stars() -> dict[str, Any]:
     """A still frame of bright stars, background off, and the truth of those that stand alone and inside."""
     loaded = loader.load("shefex2", CLEAN)
-    frame, truth = exposure.render_frame(run.prepare(loaded), 0)
+    frame, truth = simulate_motion(loaded).render(0)
     part, seen = loaded.camera.detector, truth.sources
     image_e = (frame.image_dn.astype(float) - part.offset_dn) * part.gain_e_dn
     image_e -= part.dark_e_s * frame.exposure_s

@@ -28,13 +28,13 @@ from skysim.results import scoring, stretch
 from skysim.results.files import ccsds_aem, export, frames, recording
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
-from skysim.simulation import run
 from skysim.simulation.checks import check
-from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.flight import Flight, open_flight
+from skysim.simulation.lab import build_lab
 from skysim.sources import stars as star_sources
 
 LENS = "[-0.2, 0.1, 0.001, -0.0005, 0.02]"
-Flown = tuple[Lab, recording.Recording]
+Flown = tuple[Flight, recording.Recording]
 SECOND = datetime.timedelta(seconds=1)
 START = datetime.datetime(2012, 6, 22, 21)
 
@@ -43,18 +43,19 @@ def quiet(items: Iterable[Any], total: int, what: str) -> Iterator[Any]:
     yield from items
 
 
-def sky_lab(folder: Path) -> Lab:
+def sky_flight(folder: Path) -> Flight:
     """A scene under the stars run into a folder: frames, truths, solutions."""
-    lab = run.prepare(loader.load("shefex2", {"exposure.frames": "3", "camera.distortion": LENS}))
+    flight = open_flight(loader.load("shefex2", {"exposure.frames": "3", "camera.distortion": LENS}))
+    scene = flight.lab.scene
     rows = []
-    for shot in run.run(lab, build_tracker(lab.camera)):
-        frames.write_frame(folder, shot.frame, shot.truth, lab.scene)
-        rows.append(scoring.row(shot, lab.scene, lab.camera.mount))
-    files.write_table(folder / "solutions.ecsv", scoring.table(rows, scoring.angle_names(lab.scene)))
-    return lab
+    for shot in flight.shots():
+        frames.write_frame(folder, shot.frame, shot.truth, scene)
+        rows.append(scoring.score(shot).row)
+    files.write_table(folder / "solutions.ecsv", scoring.table(rows, scoring.angle_names(scene)))
+    return flight
 
 
-def dome_lab(folder: Path) -> Lab:
+def dome_flight(folder: Path) -> Flight:
     """A dome photographed into a folder by a noise-free camera: frames and truths."""
     told = {
         "exposure.frames": "2",
@@ -62,22 +63,22 @@ def dome_lab(folder: Path) -> Lab:
         "camera.shutter": "{kind: global}",
     }
     small = {"camera.width_px": "800", "camera.height_px": "600", "camera.detector.noise": "false"}
-    lab = run.prepare(loader.load("afit_simsat", told | small))
-    for frame, truth, _ in run.render_frames(lab):
-        frames.write_frame(folder, frame, truth, lab.scene)
-    return lab
+    flight = open_flight(loader.load("afit_simsat", told | small))
+    for shot in flight.shots(solves=False):
+        frames.write_frame(folder, shot.frame, shot.truth, flight.lab.scene)
+    return flight
 
 
 @pytest.fixture(scope="module")
 def stars(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     folder = tmp_path_factory.mktemp("stars")
-    return sky_lab(folder), recording.open_recording(folder)
+    return sky_flight(folder), recording.open_recording(folder)
 
 
 @pytest.fixture(scope="module")
 def dome(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     folder = tmp_path_factory.mktemp("dome")
-    return dome_lab(folder), recording.open_recording(folder)
+    return dome_flight(folder), recording.open_recording(folder)
 
 
 # Attitude
@@ -117,17 +118,18 @@ def test_the_standard_s_own_examples() -> None:
 @pytest.mark.slow
 def test_under_the_stars_the_message_puts_every_star_on_its_pixel(stars: Flown, tmp_path: Path) -> None:
     """Star directions by the annex's matrix into the camera, by the lens onto the chip, where the truth has them."""
-    lab, run = stars
+    flight, run = stars
+    camera = flight.lab.camera
     export.export(run, ["aem"], tmp_path, quiet)
     told, epochs, quaternions = read_aem(tmp_path / "truth.aem")
     assert (told["REF_FRAME_A"], told["REF_FRAME_B"], told["TIME_SYSTEM"]) == ("ICRF", "STARTRACKER_1", "UTC")
-    place = dict(zip(lab.camera.sources.id.tolist(), lab.camera.sources.place[:, :3], strict=True))
+    place = dict(zip(camera.sources.id.tolist(), camera.sources.place[:, :3], strict=True))
     for stem, epoch, q in zip(run.stems, epochs, quaternions, strict=True):
         seen = Table.read(f"{stem}.ecsv")
         directions = np.array([place[hip] for hip in seen["id"].tolist()])
-        pixels = lab.camera.optics.project(directions @ matrix_b_from_a(q).T)
+        pixels = camera.optics.project(directions @ matrix_b_from_a(q).T)
         np.testing.assert_allclose(pixels, np.column_stack([seen["x_px"], seen["y_px"]]), rtol=0, atol=1e-5)
-        assert epoch == lab.scene.start_time + SECOND * seen.meta["t_mid_s"]
+        assert epoch == camera.scene.start_time + SECOND * seen.meta["t_mid_s"]
     _, when, answers = read_aem(tmp_path / "solutions.aem")
     assert when == epochs
     off = (Rotation.from_quat(answers).inv() * Rotation.from_quat(quaternions)).magnitude()
@@ -136,16 +138,17 @@ def test_under_the_stars_the_message_puts_every_star_on_its_pixel(stars: Flown, 
 
 def test_in_the_laboratory_the_message_puts_every_led_on_its_pixel(dome: Flown, tmp_path: Path) -> None:
     """LEDs in lab coordinates by the annex's matrix into the body, by the mount into the camera."""
-    lab, run = dome
+    flight, run = dome
+    camera = flight.lab.camera
     export.export(run, ["aem"], tmp_path, quiet)
     told, _, quaternions = read_aem(tmp_path / "truth.aem")
     assert (told["REF_FRAME_A"], told["REF_FRAME_B"]) == ("LAB", "SC_BODY_1")
-    place = dict(zip(lab.camera.sources.id.tolist(), lab.camera.sources.place[:, :3], strict=True))
+    place = dict(zip(camera.sources.id.tolist(), camera.sources.place[:, :3], strict=True))
     for stem, q in zip(run.stems, quaternions, strict=True):
         seen = Table.read(f"{stem}.ecsv")
         leds_m = np.array([place[led] for led in seen["id"].tolist()])
-        from_camera_m = leds_m @ matrix_b_from_a(q).T - lab.camera.mount.camera_body_m
-        pixels = lab.camera.optics.project(lab.camera.mount.cam_from_body.apply(from_camera_m))
+        from_camera_m = leds_m @ matrix_b_from_a(q).T - camera.mount.camera_body_m
+        pixels = camera.optics.project(camera.mount.cam_from_body.apply(from_camera_m))
         np.testing.assert_allclose(pixels, np.column_stack([seen["x_px"], seen["y_px"]]), rtol=0, atol=1e-5)
     assert not (tmp_path / "solutions.aem").exists()  # nobody solved
 
@@ -153,11 +156,12 @@ def test_in_the_laboratory_the_message_puts_every_led_on_its_pixel(dome: Flown, 
 @pytest.mark.parametrize("which", ["stars", "dome"])
 def test_angles_of_a_solution_are_its_attitude(which: str, request: pytest.FixtureRequest) -> None:
     """What `solutions.ecsv` has of a camera's attitude in the lab, turned back: the camera's, or the body's."""
-    lab, run = request.getfixturevalue(which)
+    flight, run = request.getfixturevalue(which)
+    camera = flight.lab.camera
     cam_from_lab = Rotation.random(50, rng=np.random.default_rng(3))
-    angles = np.array([scoring.angles_deg(one, lab.scene, lab.camera.mount) for one in cam_from_lab])
+    angles = np.array([scoring.angles_deg(one, camera.scene, camera.mount) for one in cam_from_lab])
     back = recording.attitudes(angles, run.is_celestial)
-    meant = cam_from_lab.inv() * (Rotation.identity() if which == "stars" else lab.camera.mount.cam_from_body)
+    meant = cam_from_lab.inv() * (Rotation.identity() if which == "stars" else camera.mount.cam_from_body)
     np.testing.assert_allclose((back * meant.inv()).magnitude(), 0, rtol=0, atol=1e-12)
 
 
@@ -226,7 +230,7 @@ def test_a_noise_free_frame_keeps_every_digit(dome: Flown, tmp_path: Path) -> No
 
 @pytest.mark.slow
 def test_a_sequence_is_chunked_by_frame_and_dated(stars: Flown, tmp_path: Path) -> None:
-    lab, run = stars
+    flight, run = stars
     export.export(run, ["zarr"], tmp_path, quiet)
     group = zarr.open_group(tmp_path / frames.ZARR, mode="r")
     assert group.metadata.zarr_format == 3
@@ -237,7 +241,8 @@ def test_a_sequence_is_chunked_by_frame_and_dated(stars: Flown, tmp_path: Path) 
     opened = xarray.open_zarr(tmp_path / frames.ZARR, consolidated=False)
     assert opened["frames"].dims == ("frame", "y", "x")
     assert opened["mid_utc"].values[0] == np.datetime64("2012-06-22T21:00:00.120000")
-    cam_from_lab = lab.camera.mount.cam_from_body * lab.trajectory.attitude_at(opened["t_mid_s"].values).inv()
+    lab_from_body = flight.trajectory().attitude_at(opened["t_mid_s"].values)
+    cam_from_lab = flight.lab.camera.mount.cam_from_body * lab_from_body.inv()
     off = (Rotation.from_quat(opened["cam_from_lab_xyzw"].values) * cam_from_lab.inv()).magnitude()
     assert off.max() < 1e-12
 
@@ -320,9 +325,10 @@ def test_a_lens_beyond_sip_is_told_of_in_header_and_doubt() -> None:
 
 @pytest.mark.filterwarnings("ignore:.*datfix")
 def test_a_distorted_frame_s_header_has_its_stars(stars: Flown) -> None:
-    lab, run = stars
+    flight, run = stars
+    sources = flight.lab.camera.sources
     seen = Table.read(f"{run.stems[2]}.ecsv")
-    place = dict(zip(lab.camera.sources.id.tolist(), lab.camera.sources.place[:, :3], strict=True))
+    place = dict(zip(sources.id.tolist(), sources.place[:, :3], strict=True))
     x, y, z = np.array([place[hip] for hip in seen["id"].tolist()]).T
     header = fits.getheader(f"{run.stems[2]}.fits")
     pixels = np.column_stack(WCS(header).all_world2pix(np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z)), 0))

@@ -18,7 +18,7 @@ from skysim.core.io import files
 from skysim.results.files import frames
 from skysim.scene import loader, opencv_calibration
 from skysim.scene.opencv_calibration import Calibration
-from skysim.simulation import exposure, run
+from skysim.simulation.flight import simulate_motion
 
 TOLD = Calibration(1600, 1200, 4545.123456789, (790.25, 611.5), (-0.1, 1e-7, 1e-05, -3.2e-9, 0.25))
 
@@ -195,7 +195,7 @@ def test_a_frame_is_solved_by_its_camera_s_calibration(lens: Path) -> None:
         "schema: 1\nbase: shefex2\ncamera: {calibration: lens.yml, focal_length: null}\nexposure: {frames: 1}\n"
     )
     loaded = loader.load(own)
-    frame, truth = exposure.render_frame(run.prepare(loaded), 0)
+    frame, truth = simulate_motion(loaded).render(0)
     frames.write_frame(lens.parent, frame, truth, loaded)
     told = opencv_calibration.read(lens)
     off = opencv_calibration.text(

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.scene import loader
-from skysim.scene.keys import provenance
+from skysim.scene import loader, provenance
 
 WITH_LENS = """camera:
   width_px: 2448

@@ -8,10 +8,9 @@ import pytest
 import yaml
 
 from skysim.core.paths import DATA, SCENES
-from skysim.scene import loader, opencv_calibration
-from skysim.scene.keys import provenance
-from skysim.scene.keys.provenance import Entry, Origin
+from skysim.scene import loader, opencv_calibration, provenance
 from skysim.scene.opencv_calibration import Calibration
+from skysim.scene.provenance import Entry, Origin
 
 
 def by_key(name: str | Path, **overrides: str) -> dict[str, Entry]:

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.scene import loader
-from skysim.scene.keys import unused
-from skysim.simulation import exposure, run
+from skysim.scene import loader, unused
+from skysim.simulation.flight import simulate_motion
 from skysim.simulation.lab import build_tracker
 from skysim.tracking.factory import solve_frame
 
@@ -237,11 +236,11 @@ def test_every_key_of_a_rule_is_a_key_of_the_schema() -> None:
 
 def outcome(scene: str, settings: dict[str, str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One frame after a short motion, its solution, and the attitude and bias at the end."""
-    lab = run.prepare(loader.load(scene, settings, refuses_unused=False))
-    frame, _ = exposure.render_frame(lab, 0)
-    attitude = solve_frame(build_tracker(lab.camera), frame).attitude.cam_from_ref
+    flight = simulate_motion(loader.load(scene, settings, refuses_unused=False))
+    frame, _ = flight.render(0)
+    attitude = solve_frame(build_tracker(flight.lab.camera), frame).attitude.cam_from_ref
     solved = np.full(4, np.nan) if attitude is None else attitude.as_quat()
-    return frame.image_dn.copy(), solved, lab.trajectory.lab_from_body[-1].as_quat()
+    return frame.image_dn, solved, flight.trajectory().lab_from_body[-1].as_quat()
 
 
 SAMPLE = ("tracker.limit_mag", "tracker.survey.surface_seed", "light.led.pwm_period", "camera.detector.dark_doubling_c")

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.types import Truth
+from skysim.core.types import Frame, Truth
 from skysim.scene.loader import load
-from skysim.simulation.exposure import render_frame
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab, build_tracker, sky_during
 from skysim.sources.air import scintillation
 from skysim.tracking.factory import solve_frame
@@ -29,13 +27,13 @@ AIR = {
 NO_AIR = ("start_time", "camera.detector.noise", "motion.jitter", "light.occlusion")
 
 
-def bed(**keys: str) -> Lab:
+def lab_of(**keys: str) -> Lab:
     return build_lab(load("shefex2", AIR | keys))
 
 
 def level(lab: Lab, altitude_deg: float) -> Rotation:
     """cam_from_icrs of a camera toward the south at an altitude, the zenith up in its image."""
-    sky = sky_during(lab, 0.0)
+    sky = sky_during(lab.camera, 0.0)
     assert sky is not None
     north, _, up = sky.axes
     h = np.radians(altitude_deg)
@@ -43,20 +41,21 @@ def level(lab: Lab, altitude_deg: float) -> Rotation:
     return Rotation.from_matrix(np.stack([np.cross(y, z), y, z]))
 
 
-def frame_at(lab: Lab, altitude_deg: float, index: int = 0) -> Truth:
+def render_toward(lab: Lab, cam_from_lab: Rotation, index: int = 0) -> tuple[Frame, Truth]:
+    """A frame of the camera at rest."""
+    return render_at_rest(lab.camera, cam_from_lab.inv() * lab.camera.mount.cam_from_body, index)
+
+
+def truth_at(lab: Lab, altitude_deg: float, index: int = 0) -> Truth:
     """The truth of a frame of the camera at rest."""
-    cam_from_lab = level(lab, altitude_deg)
-    return render_frame(lab.at_rest(cam_from_lab.inv() * lab.camera.mount.cam_from_body, index), index)[1]
+    return render_toward(lab, level(lab, altitude_deg), index)[1]
 
 
 def test_stars_are_raised_and_dimmed_in_the_frame() -> None:
     """Against the same frame without air: up in the image by A tan Z + B tan^3 Z, fainter by Kasten & Young's law."""
-    lab = bed()
-    empty = replace(lab, air=None)
-    cam_from_lab = level(lab, 30.0)
-    through = frame_at(lab, 30.0).sources
-    at_rest = empty.at_rest(cam_from_lab.inv() * empty.mount.cam_from_body)
-    without = render_frame(at_rest, 0)[1].sources
+    lab = lab_of()
+    through = truth_at(lab, 30.0).sources
+    without = render_toward(lab.with_camera(air=None), level(lab, 30.0))[1].sources
     both, ours, bare = np.intersect1d(through.id, without.id, return_indices=True)
     assert len(both) > 30
     focal_px = lab.scene.camera.focal_px
@@ -79,27 +78,27 @@ def test_stars_are_raised_and_dimmed_in_the_frame() -> None:
 @pytest.mark.slow
 def test_the_skyline_hides_stars_and_the_truth_says_which() -> None:
     low = {"light.air.horizon": "{azimuth_deg: [0, 180], altitude_deg: [20, 20]}"}
-    free, hilly = (frame_at(bed(**keys), 20.0) for keys in ({}, low))
+    free, hilly = (truth_at(lab_of(**keys), 20.0) for keys in ({}, low))
     gone = np.setdiff1d(free.sources.id, hilly.sources.id)
     assert 0.2 < len(gone) / len(free.sources.id) < 0.8
     assert np.isin(hilly.hidden, free.sources.id).all()
     lowest_px = hilly.sources.xy_px[:, 1].max()
-    center_y = bed().scene.camera.center_px[1]
+    center_y = lab_of().scene.camera.center_px[1]
     assert lowest_px < center_y + 3  # a circle of altitude 20 degrees rises by 4 px to the sides
     np.testing.assert_array_equal(np.sort(hilly.hidden), np.sort(gone[np.isin(gone, hilly.hidden)]))
-    assert len(frame_at(bed(), -20.0).sources.id) == 0
+    assert len(truth_at(lab_of(), -20.0).sources.id) == 0
 
 
 @pytest.mark.slow
 def test_stars_twinkle_by_frame_and_star() -> None:
-    lab = bed(**{"light.air.scintillation": "true"})
-    sources = [frame_at(lab, 60.0, index).sources for index in (0, 0, 1)]
+    lab = lab_of(**{"light.air.scintillation": "true"})
+    sources = [truth_at(lab, 60.0, index).sources for index in (0, 0, 1)]
     same = [one.electrons for one in sources]
     np.testing.assert_array_equal(same[0], same[1])
-    still = frame_at(bed(), 60.0).sources
+    still = truth_at(lab_of(), 60.0).sources
     ratios = []
     for index in range(12):
-        seen = frame_at(lab, 60.0, index).sources
+        seen = truth_at(lab, 60.0, index).sources
         _, a, b = np.intersect1d(seen.id, still.id, return_indices=True)
         ratios.append(seen.electrons[a] / still.electrons[b])
     ratio = np.concatenate(ratios)
@@ -115,7 +114,7 @@ def test_seeing_widens_images_by_its_variance() -> None:
     """20" at the zenith before a lens of 200 mm; at 30 degrees of altitude 2^0.6 times that."""
     keys, areas = {"camera.focal_length": "200 mm", "camera.f_number": "4"}, []
     for seeing in ({}, {"light.air.seeing_arcsec": "20"}):
-        truth = frame_at(bed(**keys, **seeing), 30.0).sources
+        truth = truth_at(lab_of(**keys, **seeing), 30.0).sources
         assert len(truth.id)
         areas.append(float(np.median(truth.area_px)) / (4 * np.pi))
     wanted_px = 20 / np.sqrt(8 * np.log(2)) * np.radians(1 / 3600) * 0.2 / 9.9e-6 * 2**0.6
@@ -135,9 +134,8 @@ def test_air_needs_a_site() -> None:
 
 def errors_arcsec(lab: Lab, altitude_deg: float, index: int = 0) -> tuple[float, float]:
     """Error across the boresight and rms residual in px of a frame."""
-    cam_from_lab = level(lab, altitude_deg) if lab.camera.air else level(bed(), altitude_deg)
-    at_rest = lab.at_rest(cam_from_lab.inv() * lab.camera.mount.cam_from_body, index)
-    frame, truth = render_frame(at_rest, index)
+    cam_from_lab = level(lab, altitude_deg) if lab.camera.air else level(lab_of(), altitude_deg)
+    frame, truth = render_toward(lab, cam_from_lab, index)
     attitude = solve_frame(build_tracker(lab.camera), frame).attitude
     assert attitude.cam_from_ref is not None
     error = (attitude.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec() * 206264.8
@@ -150,13 +148,13 @@ def test_a_tracker_that_knows_its_site_is_as_good_as_without_air(altitude_deg: f
     """Noise is off: what is left is the centroiding's own error, and 0.3" of the ground's aberration."""
     told, later = {"tracker.refraction": "true"}, {"exposure.first": "600 s"}
     without = errors_arcsec(build_lab(load("shefex2", {key: AIR[key] for key in NO_AIR})), altitude_deg)
-    undone = errors_arcsec(bed(**told), altitude_deg)
+    undone = errors_arcsec(lab_of(**told), altitude_deg)
     assert undone[0] < without[0] + 1.0
     assert undone[1] == pytest.approx(without[1], abs=0.02)
-    assert errors_arcsec(bed(**told, **later), altitude_deg)[0] < without[0] + 1.0
+    assert errors_arcsec(lab_of(**told, **later), altitude_deg)[0] < without[0] + 1.0
 
 
 @pytest.mark.slow
 def test_a_tracker_that_does_not_is_off_by_the_refraction() -> None:
     """57.6" tan(30 degrees) at an altitude of 60 degrees."""
-    assert errors_arcsec(bed(), 60.0)[0] == pytest.approx(33.2, abs=1.5)
+    assert errors_arcsec(lab_of(), 60.0)[0] == pytest.approx(33.2, abs=1.5)

@@ -5,8 +5,7 @@ The scene `simsat_bump` with its accident early and fewer frames. Steered by the
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -16,8 +15,9 @@ from skysim.core.types import Floats, Frame, Telemetry
 from skysim.experiments.study import loader as loader_of_studies
 from skysim.experiments.study.plan import resolve_point
 from skysim.scene import loader
-from skysim.simulation import compilation, run
-from skysim.simulation.lab import Lab, build_tracker
+from skysim.scene.scene import Scene
+from skysim.simulation.flight import Flight, Shot, open_flight, simulate_motion
+from skysim.simulation.lab import build_tracker
 from skysim.tracking import factory
 
 BUMP = 'kind: bump, rate_deg_s: [3, -2, 14], duration: "40 ms", caught_after: "0.2 s"'
@@ -34,19 +34,36 @@ IMU_ALONE = {
 }
 
 
-def prepared(name: str = "simsat_bump", **changes: str) -> Lab:
-    given = {key.replace("__", "."): value for key, value in changes.items()}
-    return run.prepare(loader.load(name, given))
+def changed(name: str = "simsat_bump", **changes: str) -> Scene:
+    return loader.load(name, {key.replace("__", "."): value for key, value in changes.items()})
+
+
+def shots_of(scene: Scene) -> list[Shot]:
+    return list(open_flight(scene).shots())
+
+
+def flown(name: str = "simsat_bump", **changes: str) -> Telemetry:
+    return simulate_motion(changed(name, **changes)).telemetry()
+
+
+class Bumped(NamedTuple):
+    """A flight at its end, with its exposures and its telemetry."""
+
+    flight: Flight
+    shots: list[Shot]
+    telemetry: Telemetry
 
 
 @pytest.fixture(scope="module")
-def bumped() -> Lab:
-    return prepared(**EARLY | EXACT_MAP)
+def bumped() -> Bumped:
+    flight = open_flight(changed(**EARLY | EXACT_MAP))
+    shots = list(flight.shots())
+    return Bumped(flight, shots, flight.telemetry())
 
 
 @pytest.mark.slow
-def test_the_tracker_is_compiled_before_the_first_frame_of_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One synthetic frame is solved first, whose report is none of the flight's."""
+def test_the_tracker_is_compiled_before_the_first_report_of_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first frame is solved once more before, and that report is none of the flight's."""
     solved: list[Frame] = []
     solve = factory.solve_frame
 
@@ -55,15 +72,10 @@ def test_the_tracker_is_compiled_before_the_first_frame_of_a_flight(monkeypatch:
         return solve(tracker, frame, **known)
 
     monkeypatch.setattr(factory, "solve_frame", watched)
-    lab = prepared(exposure='{time: 10 ms, rate_hz: 5, frames: 2, first: "0.1 s"}', motion__maneuver="[]")
+    shots = shots_of(changed(exposure='{time: 10 ms, rate_hz: 5, frames: 2, first: "0.1 s"}', motion__maneuver="[]"))
     assert [frame.index for frame in solved] == [0, 0, 1]
-    np.testing.assert_array_equal(solved[0].image_dn, compilation.synthetic_frame(lab).image_dn)
-    assert len(lab.reports) == 2
-
-
-def told(lab: Lab) -> Telemetry:
-    assert lab.telemetry is not None
-    return lab.telemetry
+    assert solved[0] is solved[1] is shots[0].frame
+    assert len(shots) == 2
 
 
 def off_deg(telemetry: Telemetry) -> Floats:
@@ -89,15 +101,16 @@ def in_sigma(telemetry: Telemetry) -> Floats:
 
 
 @pytest.mark.slow
-def test_every_frame_is_solved_and_used(bumped: Lab) -> None:
-    assert bumped.update_statuses == dict.fromkeys(range(8), "used")
-    assert {report.attitude.status for report in bumped.reports.values()} == {"solved"}
+def test_every_frame_is_solved_and_used(bumped: Bumped) -> None:
+    assert [shot.frame.index for shot in bumped.shots] == list(range(8))
+    assert {shot.update_status for shot in bumped.shots} == {"used"}
+    assert {shot.report.attitude.status for shot in bumped.shots} == {"solved"}
 
 
 @pytest.mark.slow
-def test_the_imu_is_wrong_for_good_by_the_turn_it_missed(bumped: Lab) -> None:
+def test_the_imu_is_wrong_for_good_by_the_turn_it_missed(bumped: Bumped) -> None:
     """What is beyond its limit of 10 deg/s about z, integrated along the true rate: 0.58 deg; it stays."""
-    telemetry, path = told(bumped), bumped.trajectory
+    telemetry, path = bumped.telemetry, bumped.flight.trajectory()
     excess = np.maximum(np.abs(np.degrees(path.rate_body_rad_s[:, 2])) - 10, 0)
     missed_deg = np.trapezoid(excess, path.t_s)
     lost = imu_error_deg(telemetry)
@@ -114,11 +127,11 @@ def test_the_imu_is_wrong_for_good_by_the_turn_it_missed(bumped: Lab) -> None:
 
 
 @pytest.mark.slow
-def test_the_filter_knows_what_it_does_not_know(bumped: Lab) -> None:
+def test_the_filter_knows_what_it_does_not_know(bumped: Bumped) -> None:
     """Within four of its own sigma always: no surer than it may be before the star tracker has seen anything, while
     turns are missed, and after.
     """
-    telemetry = told(bumped)
+    telemetry = bumped.telemetry
     assert in_sigma(telemetry)[1:].max() < 4
     sigma_deg = np.degrees(telemetry.sigma_attitude_rad)
     doubting = (telemetry.t_s > AFTER_S) & (telemetry.t_s < 2.4)
@@ -131,7 +144,7 @@ def test_the_filter_of_an_hour_s_flight_claims_what_its_laboratory_errs_by() -> 
     """At 2.4 deg/s a frame's time errs by 9 arcsec; unknown to the filter, it errs by 7 sigma, and its bias by 5."""
     spec = loader_of_studies.load("end_to_end").spec
     scene, _ = resolve_point(spec, {"exposure.frames": 150, "exposure.rate_hz": 5})
-    telemetry = told(run.prepare(scene))
+    telemetry = simulate_motion(scene).telemetry()
     assert telemetry.sigma_bias_rad_s is not None
     bias_error = np.abs(telemetry.assumed_bias_rad_s - telemetry.bias_rad_s) / telemetry.sigma_bias_rad_s
     turning = telemetry.t_s > 10
@@ -142,7 +155,7 @@ def test_the_filter_of_an_hour_s_flight_claims_what_its_laboratory_errs_by() -> 
 @pytest.mark.slow
 def test_the_filter_allows_for_the_survey_s_error() -> None:
     """An error of survey and lever that all solutions share does not average out, and the filter says so."""
-    telemetry = told(prepared(**EARLY))
+    telemetry = flown(**EARLY)
     late = telemetry.t_s > 7
     assert in_sigma(telemetry)[late].max() < 4
     assert telemetry.lab_from_filter is not None
@@ -150,8 +163,8 @@ def test_the_filter_allows_for_the_survey_s_error() -> None:
     assert np.degrees(error[late]).min() * 3600 > 60  # 0.5 mm of lever are 85 arcsec at 1.2 m
 
 
-def test_the_star_tracker_brings_attitude_and_bias_back(bumped: Lab) -> None:
-    telemetry = told(bumped)
+def test_the_star_tracker_brings_attitude_and_bias_back(bumped: Bumped) -> None:
+    telemetry = bumped.telemetry
     assert telemetry.lab_from_filter is not None
     assert telemetry.assumed_bias_rad_s is not None
     assert telemetry.bias_rad_s is not None
@@ -164,15 +177,15 @@ def test_the_star_tracker_brings_attitude_and_bias_back(bumped: Lab) -> None:
     assert deg_h.max() < 5  # of 15, the Earth's turning, that it had to find
 
 
-def test_the_vehicle_is_brought_back(bumped: Lab) -> None:
-    off = off_deg(told(bumped))
+def test_the_vehicle_is_brought_back(bumped: Bumped) -> None:
+    off = off_deg(bumped.telemetry)
     assert off.max() > 1
-    assert off[told(bumped).t_s > 7].max() < 0.05
+    assert off[bumped.telemetry.t_s > 7].max() < 0.05
 
 
 @pytest.mark.slow
 def test_steered_by_the_imu_it_stays_where_the_imu_is_wrong() -> None:
-    telemetry = told(prepared(**EARLY | {key.replace(".", "__"): value for key, value in IMU_ALONE.items()}))
+    telemetry = flown(**EARLY | IMU_ALONE)
     assert telemetry.lab_from_filter is None
     late = telemetry.t_s > 8
     assert off_deg(telemetry)[late].min() > 0.3
@@ -180,63 +193,72 @@ def test_steered_by_the_imu_it_stays_where_the_imu_is_wrong() -> None:
     np.testing.assert_allclose(off_deg(telemetry)[late], lost[late], rtol=0, atol=0.05)
 
 
-# --- frames in flight and after it --------------------------------------------------------------------------
+# --- frames in the loop and after it -------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_what_was_solved_in_flight_is_what_the_frames_say_afterwards(bumped: Lab) -> None:
-    """Rendered from a piece of the flight when its time came, and from the whole: the same photons, one answer."""
-    kept = [shot.report.attitude for shot in run.run(bumped, build_tracker(bumped))]
-    forgotten = replace(bumped, reports={})
-    again = [shot.report.attitude for shot in run.run(forgotten, build_tracker(forgotten))]
-    assert kept == [bumped.reports[index].attitude for index in range(8)]
-    assert [one.status for one in kept] == [one.status for one in again]
-    for one, other in zip(kept, again, strict=True):
-        assert np.linalg.norm((one.cam_from_ref * other.cam_from_ref.inv()).as_rotvec()) < 1e-9
+def test_what_the_filter_used_is_what_the_frames_give_afterwards(bumped: Bumped) -> None:
+    """Rendered from a piece of the motion when they were due, and from the whole: the same bits, the same solution."""
+    tracker = build_tracker(bumped.flight.lab.camera)
+    for shot in bumped.shots:
+        frame, truth = bumped.flight.render(shot.frame.index)
+        np.testing.assert_array_equal(frame.image_dn, shot.frame.image_dn)
+        assert (truth.lab_from_body * shot.truth.lab_from_body.inv()).magnitude() == 0
+        again = factory.solve_frame(tracker, frame).attitude
+        assert shot.report is not None
+        attitude = shot.report.attitude
+        assert again.status == attitude.status == "solved"
+        assert np.linalg.norm((attitude.cam_from_ref * again.cam_from_ref.inv()).as_rotvec()) < 1e-9
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("latency_s", [0.0, 0.2])
 def test_a_solution_comes_after_its_latency(latency_s: float) -> None:
     """The filter is sure of itself at the first tick after the exposure's end and the latency, and right."""
-    lab = prepared(
-        filter=f'{{start_deg: 0.5, latency: "{latency_s} s"}}',
-        motion__maneuver="[{kind: sine, amplitude_deg: [2, 1, 3], frequency_hz: 0.5, duration: 5 s}]",
-        exposure='{time: "10 ms", rate_hz: 2, frames: 4, first: "0.4 s"}',
+    flight = open_flight(
+        changed(
+            filter=f'{{start_deg: 0.5, latency: "{latency_s} s"}}',
+            motion__maneuver="[{kind: sine, amplitude_deg: [2, 1, 3], frequency_hz: 0.5, duration: 5 s}]",
+            exposure='{time: "10 ms", rate_hz: 2, frames: 4, first: "0.4 s"}',
+        )
     )
-    telemetry = told(lab)
+    shots = list(flight.shots())
+    telemetry = flight.telemetry()
     knows = telemetry.t_s[(telemetry.sigma_attitude_rad < np.radians(0.1)).all(axis=1)]
     assert knows[0] == pytest.approx(0.41 + latency_s, abs=0.0101)
     assert in_sigma(telemetry)[1:].max() < 4
-    # What comes too late for the flight is no longer told the filter, but solved after all.
-    assert sorted(lab.reports) == list(range(4 if latency_s == 0 else 3))
-    shots = list(run.run(lab, build_tracker(lab.camera)))
+    # What would come after the end of the motion does not update the filter, but is solved after all.
+    updates = 4 if latency_s == 0 else 3
+    assert [shot.update_status for shot in shots] == ["used"] * updates + [""] * (4 - updates)
     assert [shot.report.attitude.status for shot in shots] == ["solved"] * 4
 
 
 @pytest.mark.long
 def test_the_loop_with_latency_survives_the_accident() -> None:
-    lab = prepared(**EARLY, filter__latency="0.2 s")
-    assert set(lab.update_statuses.values()) == {"used"}
-    assert in_sigma(told(lab))[1:].max() < 4
-    assert off_deg(told(lab))[told(lab).t_s > 7].max() < 0.06
+    flight = open_flight(changed(**EARLY | EXACT_MAP, filter__latency="0.2 s"))
+    shots = list(flight.shots())
+    assert [shot.update_status for shot in shots] == ["used"] * 7 + [""]  # the last comes after the motion's end
+    telemetry = flight.telemetry()
+    assert in_sigma(telemetry)[1:].max() < 4
+    assert off_deg(telemetry)[telemetry.t_s > 7].max() < 0.05
 
 
 def test_a_frame_without_an_answer_leaves_the_filter_alone() -> None:
     """The lens is capped: no LEDs, no solution; the filter goes on with the gyros and is less and less sure."""
-    lab = prepared(light__led__intensity="1 ucd", exposure='{time: "10 ms", rate_hz: 2, frames: 2}')
-    assert "used" not in lab.update_statuses.values()
-    assert [lab.update_statuses[k] for k in range(2)] == [lab.reports[k].attitude.status for k in range(2)]
-    sigma = told(lab).sigma_attitude_rad
+    flight = open_flight(changed(light__led__intensity="1 ucd", exposure='{time: "10 ms", rate_hz: 2, frames: 2}'))
+    shots = list(flight.shots())
+    assert "used" not in [shot.update_status for shot in shots]
+    assert [shot.update_status for shot in shots] == [shot.report.attitude.status for shot in shots]
+    sigma = flight.telemetry().sigma_attitude_rad
     assert sigma is not None
     assert (np.diff(sigma, axis=0) > 0).all()
 
 
 def test_under_the_stars_the_filter_s_lab_is_the_sky() -> None:
     """The same loop with the other tracker: a free vehicle, its attitude among the stars."""
-    lab = prepared("shefex2", vehicle__imu="{}", filter="{start_deg: 0.5}", exposure__frames="4")
-    assert lab.update_statuses == dict.fromkeys(range(4), "used")
-    telemetry = told(lab)
+    flight = open_flight(changed("shefex2", vehicle__imu="{}", filter="{start_deg: 0.5}", exposure__frames="4"))
+    assert [shot.update_status for shot in flight.shots()] == ["used"] * 4
+    telemetry = flight.telemetry()
     assert in_sigma(telemetry)[1:].max() < 4
     assert telemetry.sigma_attitude_rad is not None
     assert np.degrees(telemetry.sigma_attitude_rad[-1]).max() < 0.02
@@ -249,10 +271,10 @@ def test_under_the_stars_the_filter_s_lab_is_the_sky() -> None:
 def test_the_same_seed_flies_the_same_flight_bit_for_bit() -> None:
     short = EARLY | {"exposure": '{time: "10 ms", rate_hz: 1, frames: 2, first: "1.4 s"}'}
     short["motion.maneuver"] = short["motion.maneuver"].replace("1.5 s", "1.6 s")
-    one, same, other = (prepared(**short, seed=seed) for seed in ("6", "6", "7"))
+    one, same, other = (flown(**short, seed=seed) for seed in ("6", "6", "7"))
     for name in ("torque_nm", "rate_body_rad_s", "assumed_bias_rad_s", "sigma_attitude_rad"):
-        assert getattr(told(one), name).tobytes() == getattr(told(same), name).tobytes()
-        assert getattr(told(one), name).tobytes() != getattr(told(other), name).tobytes()
-    for telemetry in ("lab_from_body", "lab_from_imu", "lab_from_filter"):
-        quaternions = [getattr(told(lab), telemetry).as_quat().tobytes() for lab in (one, same, other)]
+        assert getattr(one, name).tobytes() == getattr(same, name).tobytes()
+        assert getattr(one, name).tobytes() != getattr(other, name).tobytes()
+    for name in ("lab_from_body", "lab_from_imu", "lab_from_filter"):
+        quaternions = [getattr(telemetry, name).as_quat().tobytes() for telemetry in (one, same, other)]
         assert quaternions[0] == quaternions[1] != quaternions[2]

@@ -19,14 +19,13 @@ from skysim.core.types import Telemetry
 from skysim.dynamics.controllers.interface import ControllerInput, ControllerSetup, check_torque, torque_of_reply
 from skysim.dynamics.guidance import plan
 from skysim.experiments.study import loader as study_loader
-from skysim.experiments.study import store
-from skysim.experiments.study.execution import runner, setups
+from skysim.experiments.study.execution import runner, setups, store
 from skysim.experiments.study.execution.engines import Serial
 from skysim.scene import loader
-from skysim.simulation import run
 from skysim.simulation.checks import check
+from skysim.simulation.flight import open_flight
 from skysim.simulation.lab import build_lab
-from skysim.simulation.user_parts import build_lab_with
+from skysim.simulation.user_parts import UserParts
 from skysim.tracking.external import process
 
 PD = '''
@@ -96,7 +95,8 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def flown(changes: dict[str, Any] | None = None, **parts: Any) -> Telemetry:
     """The motion alone of `skysim.simulate`, without its frame."""
     scene = skysim.load_scene("simsat_slew", SHORT | (changes or {}))
-    return run.simulate_motion(build_lab_with(scene, **parts)).log
+    with open_flight(scene, **parts) as flight:
+        return flight.simulate_motion().telemetry()
 
 
 def command(folder: Path, text: str) -> dict[str, str]:
@@ -146,17 +146,17 @@ def test_it_gets_what_the_page_says() -> None:
     seen: list[ControllerInput] = []
     told: list[ControllerSetup] = []
     scene = skysim.load_scene("simsat_slew", SHORT)
-    log = flown(controller=recorder(seen, told, (0.0, 0.0, 5.0)))
+    telemetry = flown(controller=recorder(seen, told, (0.0, 0.0, 5.0)))
     (setup,) = told
     assert (setup.period_s, setup.actuators, setup.feedback, setup.seed) == (0.01, "wheels", "truth", scene.seed)
     assert (setup.bandwidth_rad_s, setup.damping, setup.rate_limit_rad_s) == (2.5, 0.7, None)
     np.testing.assert_allclose(setup.inertia_kg_m2, build_lab(scene).vehicle.inertia_kg_m2, rtol=0, atol=0)
-    assert [now.tick for now in seen] == list(range(len(log.t_s)))
-    np.testing.assert_allclose([now.t_s for now in seen], log.t_s, rtol=0, atol=1e-12)
+    assert [now.tick for now in seen] == list(range(len(telemetry.t_s)))
+    np.testing.assert_allclose([now.t_s for now in seen], telemetry.t_s, rtol=0, atol=1e-12)
     measured = Rotation.from_quat([now.lab_from_body_xyzw for now in seen])
-    assert (measured.inv() * log.lab_from_body).magnitude().max() < 1e-15
-    np.testing.assert_array_equal([now.rate_body_rad_s for now in seen], log.rate_body_rad_s)
-    np.testing.assert_array_equal([now.momentum_nms for now in seen], log.momentum_nms)
+    assert (measured.inv() * telemetry.lab_from_body).magnitude().max() < 1e-15
+    np.testing.assert_array_equal([now.rate_body_rad_s for now in seen], telemetry.rate_body_rad_s)
+    np.testing.assert_array_equal([now.momentum_nms for now in seen], telemetry.momentum_nms)
     reference = plan(scene.motion)
     for now in seen[::50]:
         attitude, rate, acceleration = reference.state_at(now.t_s)
@@ -178,9 +178,9 @@ def test_it_measures_what_the_scene_s_feedback_gives(feedback: str) -> None:
         "filter.latency": "0 s",
     }
     scene = skysim.load_scene("simsat_bump", changes)
-    log = skysim.simulate(scene, controller=recorder(seen, told)).telemetry
+    telemetry = skysim.simulate(scene, controller=recorder(seen, told)).telemetry
     measured = Rotation.from_quat([now.lab_from_body_xyzw for now in seen])
-    by = {"imu": log.lab_from_imu, "filter": log.lab_from_filter}
+    by = {"imu": telemetry.lab_from_imu, "filter": telemetry.lab_from_filter}
     np.testing.assert_allclose((measured.inv() * by[feedback]).magnitude(), 0, rtol=0, atol=1e-12)
     other = by["imu" if feedback == "filter" else "filter"]
     assert (measured.inv() * other).magnitude().max() > 1e-9
@@ -284,30 +284,32 @@ def test_a_program_that_fails_is_named_and_ended(text: str, told: str, tmp_path:
 
 @pytest.mark.slow
 def test_a_program_ends_with_its_motion(tmp_path: Path) -> None:
-    """Also where the motion does not begin: a tilt beyond the stop is found after the controller was started."""
+    """Where the motion cannot begin it is not started: a tilt beyond the stop is found before."""
     text = (
         f"import os\nopen({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()))\n" + READY.rpartition("sys.stdin")[0]
     )
     text += "for line in sys.stdin:\n    n = json.loads(line)['tick']\n"
     programs = command(tmp_path, text + "    print(json.dumps({'tick': n, 'torque_nm': [0, 0, 0]}), flush=True)\n")
-    far = [{"kind": "step", "roll_deg": 50, "duration": "1 s"}]
-    for maneuver, told in ((far, "tilt of 50 deg"), ([], None)):
+
+    def scene(maneuver: list[dict[str, Any]]) -> skysim.Scene:
         changes = {"motion.control": {"law": "mine"}, "motion.maneuver": maneuver}
-        lab = build_lab(skysim.load_scene("simsat_slew", SHORT | changes), programs)
-        if told:
-            with pytest.raises(InputError, match=told):
-                run.simulate_motion(lab)
-        else:
-            run.simulate_motion(lab)
-        with pytest.raises(ProcessLookupError):
-            os.kill(int((tmp_path / "pid").read_text()), 0)
+        return skysim.load_scene("simsat_slew", SHORT | changes)
+
+    pid = tmp_path / "pid"
+    with pytest.raises(InputError, match="tilt of 50 deg"):
+        open_flight(scene([{"kind": "step", "roll_deg": 50, "duration": "1 s"}]), programs=programs)
+    assert not pid.exists()
+    with open_flight(scene([]), programs=programs) as flight:
+        flight.simulate_motion()
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid.read_text()), 0)
 
 
 def test_a_check_does_not_start_a_program(tmp_path: Path) -> None:
     """Or `skysim run`, which checks its plan, would start it twice."""
     started = tmp_path / "started"
     programs = command(tmp_path, f"open({str(started)!r}, 'w')\n{READY}")
-    lab = build_lab(skysim.load_scene("simsat_slew", SHORT | {"motion.control": {"law": "mine"}}), programs)
+    lab = build_lab(skysim.load_scene("simsat_slew", SHORT | {"motion.control": {"law": "mine"}}), UserParts(programs))
     check(lab)
     assert not started.exists()
 

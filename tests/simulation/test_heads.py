@@ -10,13 +10,12 @@ import pytest
 from benchmarks.heads import gain, measured_pairs
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.results import run as results
+from skysim.results.simulate import simulate
 from skysim.scene.loader import load_scene
-from skysim.simulation import run
 from skysim.simulation.checks import check
-from skysim.simulation.exposure import render_frame
-from skysim.simulation.lab import Lab, build_lab, build_tracker
-from skysim.tracking.factory import solve_frame
+from skysim.simulation.exposure import render_at_rest
+from skysim.simulation.flight import open_flight, simulate_motion
+from skysim.simulation.lab import Lab, build_lab
 
 SIDE = {"name": "side", "position": ["0.2 m", "0 m", "0 m"], "rotation_deg": [0, 90, 0]}
 SHORT = {"exposure.frames": 2, "motion.maneuver": [{"kind": "hold", "duration": "1 s"}]}
@@ -29,25 +28,27 @@ def two_heads(**overrides: object) -> Lab:
 def test_a_head_is_turned_and_placed_as_the_scene_says() -> None:
     """[0, 90, 0] looks to the right of the main image: the side's boresight is the main camera's x axis."""
     lab = two_heads(heads=[SIDE | {"mount_error_arcsec": [0, 0, 3600]}], thermal=None)
-    _, main = render_frame(lab, 0)
-    _, side = render_frame(lab.cameras[1:][0], 0)
+    head = lab.cameras[1]
+    _, main = render_at_rest(lab.camera, lab.start)
+    _, side = render_at_rest(head, lab.start)
     boresight = side.cam_from_lab.inv().apply([0.0, 0.0, 1.0])
     np.testing.assert_allclose(boresight, main.cam_from_lab.inv().apply([1.0, 0.0, 0.0]), atol=1e-12)
     # The real camera is turned about its boresight by one degree from the assumed mount.
-    assumed = lab.cameras[1:][0].mount.cam_from_body * side.lab_from_body.inv()
+    assumed = head.mount.cam_from_body * side.lab_from_body.inv()
     error = (side.cam_from_lab * assumed.inv()).as_rotvec(degrees=True)
     np.testing.assert_allclose(error, [0.0, 0.0, 1.0], atol=1e-9)
-    np.testing.assert_array_equal(lab.cameras[1:][0].mount.camera_body_m, [0.2, 0.0, 0.0])
+    np.testing.assert_array_equal(head.mount.camera_body_m, [0.2, 0.0, 0.0])
 
 
 def test_a_head_is_another_chip_with_other_noise() -> None:
     """The same camera at the same place: only chip and noise differ."""
     same = SIDE | {"position": ["0 m", "0 m", "0 m"], "rotation_deg": [0, 0, 0]}
     lab = two_heads(heads=[same])
-    head = lab.cameras[1:][0]
+    head = lab.cameras[1]
     assert head.scene.camera.detector.hardware_seed != lab.scene.camera.detector.hardware_seed
     assert head.scene.seed != lab.scene.seed
-    (frame, truth), (other, _) = render_frame(lab, 0), render_frame(head, 0)
+    frame, truth = render_at_rest(lab.camera, lab.start)
+    other, _ = render_at_rest(head, lab.start)
     bright = truth.sources.peak_e > 2000
     x, y = np.rint(truth.sources.xy_px[bright]).astype(int).T
     inside = (x >= 0) & (y >= 0) & (x < frame.image_dn.shape[1]) & (y < frame.image_dn.shape[0])
@@ -59,7 +60,7 @@ def test_a_head_is_another_chip_with_other_noise() -> None:
 def test_keys_of_a_head_are_put_over_those_of_the_main_camera() -> None:
     lens = {"camera": {"f_number": 2.8}, "exposure": {"time": "80 ms"}, "tracker": {"limit_mag": 5.0}}
     lab = two_heads(heads=[SIDE | lens])
-    main, side = lab.scene, lab.cameras[1:][0].scene
+    main, side = (camera.scene for camera in lab.cameras)
     assert (side.camera.f_number, side.exposure.time_s, side.tracker.limit_mag) == (2.8, 0.08, 5.0)
     assert side.camera.focal_length_m == main.camera.focal_length_m
     assert side.exposure.frames == main.exposure.frames
@@ -67,8 +68,9 @@ def test_keys_of_a_head_are_put_over_those_of_the_main_camera() -> None:
 
 
 def test_frames_of_the_main_camera_do_not_change_with_a_head() -> None:
-    alone, both = two_heads(heads=[]), two_heads()
-    np.testing.assert_array_equal(render_frame(alone, 1)[0].image_dn, render_frame(both, 1)[0].image_dn)
+    labs = two_heads(heads=[]), two_heads()
+    alone, both = (render_at_rest(lab.camera, lab.start, 1)[0].image_dn for lab in labs)
+    np.testing.assert_array_equal(alone, both)
 
 
 @pytest.mark.parametrize(
@@ -119,24 +121,33 @@ def test_the_check_expects_the_roll_of_two_heads_from_the_other_s_boresight() ->
 def test_under_a_dome_a_head_that_looks_below_the_rim_sees_nothing() -> None:
     top = SIDE | {"position": ["0.1 m", "0 m", "0.45 m"]}
     heads = [top | {"name": "up", "rotation_deg": [0, 8, 0]}, top | {"name": "down", "rotation_deg": [0, 150, 0]}]
-    lab = run.prepare(load_scene("afit_simsat", {"exposure.frames": 1, "heads": heads, "tracker.survey": {}}))
-    reports = [solve_frame(build_tracker(bed), render_frame(bed, 0)[0]) for bed in lab.cameras]
+    scene = load_scene("afit_simsat", {"exposure.frames": 1, "heads": heads, "tracker.survey": {}})
+    reports = [shot.report for shot in open_flight(scene).shots()]
     assert [report.attitude.solved for report in reports] == [True, True, False]
     assert len(reports[2].centroids) < 3
 
 
 @pytest.mark.slow
-def test_live_frames_are_filtered_with_all_heads_as_in_a_run() -> None:
-    lab = two_heads(**{"exposure.frames": 6, "exposure.rate_hz": 10})
-    moved = run.simulate_motion(lab)
-    assert len(moved.heads[0].reports) == 6
-    live = {captured.frame.index: captured.update_status for captured in run.live(lab, None)}
-    assert live == moved.update_statuses == dict.fromkeys(range(6), "used")
+def test_the_filter_uses_the_frames_of_all_heads() -> None:
+    """Also where only those of the main camera are asked for; its frames and updates are the same."""
+    changes = SHORT | {"exposure.frames": 6, "exposure.rate_hz": 10}
+    scene = load_scene("two_heads", changes)
+    every = list(open_flight(scene).shots())
+    for name in ("main", "side"):
+        own = [shot for shot in every if shot.camera.name == name]
+        assert {shot.frame.index: shot.update_status for shot in own} == dict.fromkeys(range(6), "used")
+    flight = open_flight(scene, keeps_history=False)
+    alone = list(flight.shots(cameras=[0]))
+    assert [schedule.index for schedule in flight.schedules] == [6, 6]
+    main = [shot for shot in every if shot.camera.name == "main"]
+    for shot, other in zip(alone, main, strict=True):
+        assert shot.update_status == other.update_status
+        np.testing.assert_array_equal(shot.frame.image_dn, other.frame.image_dn)
 
 
 @pytest.mark.slow
 def test_a_saved_run_has_a_folder_for_each_head(tmp_path: Path) -> None:
-    simulated = results.simulate(load_scene("two_heads", SHORT))
+    simulated = simulate(load_scene("two_heads", SHORT))
     folder = simulated.save(tmp_path / "run")
     assert [len(simulated), len(simulated.heads["side"])] == [2, 2]
     assert (folder / "side" / "report.html").is_file()
@@ -157,11 +168,12 @@ def test_two_heads_lower_the_roll_by_the_factor_of_their_covariances() -> None:
 @pytest.mark.slow
 def test_the_filter_finds_how_far_the_mounts_have_turned() -> None:
     """The shipped scene to its half: the second camera's boresight relative to the first, and the claimed errors."""
-    lab = run.simulate_motion(build_lab(load_scene("two_heads", {"exposure.frames": 200})))
-    for name, mounting in lab.log.mountings.items():
+    flight = simulate_motion(load_scene("two_heads", {"exposure.frames": 200}))
+    mountings = flight.telemetry().mountings
+    for name, mounting in mountings.items():
         error, sigma = mounting.estimate_rad[-1] - mounting.true_rad[-1], mounting.sigma_rad[-1]
         assert np.abs(error / sigma).max() < 4, name
-    side = lab.log.mountings["side"]
-    boresight = lab.cameras[1:][0].mount.cam_from_body.apply(side.estimate_rad[-1] - side.true_rad[-1])[:2]
+    side = mountings["side"]
+    boresight = flight.lab.cameras[1].mount.cam_from_body.apply(side.estimate_rad[-1] - side.true_rad[-1])[:2]
     assert np.linalg.norm(side.true_rad[-1]) > 20 * ARCSEC_RAD
     assert np.linalg.norm(boresight) < 3 * ARCSEC_RAD

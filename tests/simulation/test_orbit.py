@@ -10,7 +10,7 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.scene import loader
-from skysim.simulation.exposure import render_frame
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.sources import catalog, stars
 from skysim.sources.orbit.camera_orbit import state_at
@@ -28,26 +28,26 @@ def in_orbit(**keys: str) -> Lab:
         **{"motion.start": "{ra_deg: 90, dec_deg: 0, roll_deg: 0}", "camera.detector.noise": "false"},
         **{key.replace("__", "."): value for key, value in keys.items()},
     }
-    lab = build_lab(loader.load("shefex2", overrides))
-    return lab.at_rest(lab.start, 1)
+    return build_lab(loader.load("shefex2", overrides))
 
 
 def test_stars_have_the_aberration_of_each_frame_s_velocity() -> None:
     """Against `stars.apparent` with the velocity of mid-exposure, projected by the lens: half a revolution is 10"."""
     lab = in_orbit(light__limit_mag="4")
-    scene, known = lab.scene, catalog.read_for("light.catalog", lab.scene.light.catalog)
+    scene, star_camera = lab.scene, lab.camera
+    known = catalog.read_for("light.catalog", scene.light.catalog)
     for index in range(2):
-        _, truth = render_frame(lab, index)
+        _, truth = render_at_rest(star_camera, lab.start, index)
         time = scene.start_time + datetime.timedelta(seconds=truth.t_s)
-        velocity_m_s = state_at(lab.camera.orbit, truth.t_s).velocity_m_s
+        velocity_m_s = state_at(star_camera.orbit, truth.t_s).velocity_m_s
         rows = np.searchsorted(known.hip[np.argsort(known.hip)], truth.sources.id)
         chosen = np.argsort(known.hip)[rows]
         exact = stars.apparent(known, time, velocity_m_s)[chosen]
-        xy_px = lab.camera.optics.project(truth.cam_from_lab.apply(exact))
+        xy_px = star_camera.optics.project(truth.cam_from_lab.apply(exact))
         off_arcsec = np.linalg.norm(xy_px - truth.sources.xy_px, axis=1) / scene.camera.focal_px * 206265
         # Parallax, proper motion and deflection of half a revolution are below 0.001".
         assert off_arcsec.max() < 0.005
-        still = lab.camera.optics.project(truth.cam_from_lab.apply(stars.apparent(known, time)[chosen]))
+        still = star_camera.optics.project(truth.cam_from_lab.apply(stars.apparent(known, time)[chosen]))
         moved = np.linalg.norm(still - truth.sources.xy_px, axis=1) / scene.camera.focal_px * 206265
         assert moved.mean() == pytest.approx(7617 / 299_792_458 * 206265, rel=0.05)
 
@@ -59,7 +59,7 @@ def test_a_tracker_with_the_orbit_s_velocity_is_free_of_its_aberration(knows: st
     lab = in_orbit(tracker__orbit_velocity=knows)
     tracker = build_tracker(lab.camera)
     for index in range(2):
-        frame, truth = render_frame(lab, index)
+        frame, truth = render_at_rest(lab.camera, lab.start, index)
         attitude = solve_frame(tracker, frame).attitude
         assert attitude.status == "solved"
         error = (attitude.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec()
@@ -69,8 +69,8 @@ def test_a_tracker_with_the_orbit_s_velocity_is_free_of_its_aberration(knows: st
 def test_the_earth_hides_the_stars_behind_it() -> None:
     """Above the equator at RA 0, looking at RA 180 (nadir), and half a revolution later at the zenith."""
     lab = in_orbit(motion__start="{ra_deg: 180, dec_deg: 0, roll_deg: 0}")
-    _, hidden = render_frame(lab, 0)
-    _, seen = render_frame(lab, 1)
+    _, hidden = render_at_rest(lab.camera, lab.start, 0)
+    _, seen = render_at_rest(lab.camera, lab.start, 1)
     assert len(hidden.sources.id) == 0
     assert len(seen.sources.id) > 50
 
@@ -91,7 +91,7 @@ def test_a_satellite_ahead_on_the_same_orbit_is_seen(tmp_path: Path) -> None:
     velocity = state_at(lab.camera.orbit, 0.0).velocity_m_s
     ra, dec = np.degrees(np.arctan2(velocity[1], velocity[0])) % 360, np.degrees(np.arcsin(velocity[2] / 7.6e3))
     lab = in_orbit(**keys, motion__start=f"{{ra_deg: {ra}, dec_deg: {dec}, roll_deg: 0}}")
-    _, truth = render_frame(lab, 0)
+    _, truth = render_at_rest(lab.camera, lab.start, 0)
     assert [satellite.id for satellite in truth.satellites] == [ID_BASE + 2]
     assert truth.satellites[0].range_km == pytest.approx(60, abs=1.5)
     assert truth.satellites[0].rate_deg_s == pytest.approx(0.063, rel=0.1)  # it turns with the orbit

@@ -16,10 +16,11 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.dynamics import multibody
 from skysim.scene import loader
-from skysim.simulation import exposure, run
 from skysim.simulation.checks import attitudes, check, detection, facts, plan
 from skysim.simulation.checks.facts import Fact, Samples
 from skysim.simulation.checks.sky import claims, depth
+from skysim.simulation.exposure import render_at_rest
+from skysim.simulation.flight import Flight, simulate_motion
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking.factory import solve_frame
 
@@ -35,7 +36,7 @@ STATION = (
 )
 
 
-def bed(name: str, **changes: str) -> Lab:
+def lab_of(name: str, **changes: str) -> Lab:
     return build_lab(loader.load(name, {key.replace("__", "."): value for key, value in changes.items()}))
 
 
@@ -46,7 +47,7 @@ def fact(result: plan.Check, name: str) -> Fact:
 
 @pytest.fixture(scope="module")
 def afit() -> plan.Check:
-    return check(bed("afit_simsat"))
+    return check(lab_of("afit_simsat"))
 
 
 def samples_of(lab: Lab) -> tuple[detection.Context, Samples]:
@@ -62,35 +63,35 @@ def samples_of(lab: Lab) -> tuple[detection.Context, Samples]:
 @pytest.mark.slow
 def test_frames_are_checked_where_the_vehicle_will_be() -> None:
     """The reference at mid-exposure; the controller follows it to a hundredth of a degree."""
-    lab = bed("afit_simsat", exposure__frames="40")
-    flown = run.simulate_motion(lab)
+    lab = lab_of("afit_simsat", exposure__frames="40")
+    motion = Flight(lab).simulate_motion().trajectory()
     frames = attitudes.of_frames(lab)
-    apart = (flown.trajectory.attitude_at(frames.t_s) * frames.lab_from_body.inv()).magnitude()
+    apart = (motion.attitude_at(frames.t_s) * frames.lab_from_body.inv()).magnitude()
     assert np.degrees(apart).max() < 0.1
-    rates = np.array([flown.trajectory.rate_at(t_s) for t_s in frames.t_s])
+    rates = np.array([motion.rate_at(t_s) for t_s in frames.t_s])
     assert np.degrees(np.abs(rates - frames.rate_body_rad_s)).max() < 0.1
     every = [0.005 + 1 + n / 2 for n in range(40)]
-    fastest = max(np.linalg.norm(flown.trajectory.rate_at(t_s)) for t_s in every)
+    fastest = max(np.linalg.norm(motion.rate_at(t_s)) for t_s in every)
     assert np.linalg.norm(frames.rate_body_rad_s, axis=1).max() == pytest.approx(fastest, rel=0.01)
 
 
 def test_the_reach_is_even_up_to_the_greatest_tilt_and_over_the_whole_sky() -> None:
-    dome, sky = bed("afit_simsat"), bed("shefex2")
+    dome, sky = lab_of("afit_simsat"), lab_of("shefex2")
     frames = attitudes.of_frames(dome)
-    reach = attitudes.within_reach(dome.scene, dome.mount, frames)
+    reach = attitudes.within_reach(dome.scene, dome.camera.mount, frames)
     tilt_deg = multibody.tilt_deg(reach.lab_from_body)
     assert tilt_deg.max() == pytest.approx(multibody.tilt_deg(frames.lab_from_body).max(), abs=1e-4)
     height = 1 - np.cos(np.radians(tilt_deg))
     assert np.median(height) == pytest.approx(height.max() / 2, rel=0.1)
-    everywhere = attitudes.within_reach(sky.scene, sky.mount, frames).lab_from_body
-    boresight = (everywhere * sky.mount.cam_from_body.inv()).apply([0, 0, 1])
+    everywhere = attitudes.within_reach(sky.scene, sky.camera.mount, frames).lab_from_body
+    boresight = (everywhere * sky.camera.mount.cam_from_body.inv()).apply([0, 0, 1])
     assert np.linalg.norm(boresight.mean(axis=0)) < 0.05
     nearest_deg = np.degrees(cKDTree(boresight).query(boresight, k=2)[0][:, 1])
     assert nearest_deg.min() > 15  # 48 even directions are some 30 deg apart
 
 
 def test_without_a_controller_the_bearing_may_tilt_to_its_stop() -> None:
-    lab = bed("afit_simsat", motion__control="none", motion__maneuver="[]")
+    lab = lab_of("afit_simsat", motion__control="none", motion__maneuver="[]")
     frames = attitudes.of_frames(lab)
     assert math.degrees(attitudes.greatest_tilt_rad(lab.scene, frames)) == pytest.approx(30)
 
@@ -104,7 +105,7 @@ def test_without_a_controller_the_bearing_may_tilt_to_its_stop() -> None:
 )
 def test_a_tilt_beyond_the_stop_is_refused_as_by_a_run(changes: dict[str, str], told: str) -> None:
     with pytest.raises(InputError, match=f"{told}.*allowed: up to vehicle.tilt_stop_deg 30"):
-        check(bed("afit_simsat", **changes))
+        check(lab_of("afit_simsat", **changes))
 
 
 # Facts
@@ -121,10 +122,9 @@ def test_the_field_and_the_pixel_are_the_pinhole_s(afit: plan.Check) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["afit_simsat", "shefex2", "apl_dome"])
 def test_as_many_lights_are_counted_as_the_tracker_uses(name: str) -> None:
-    lab = bed(name, exposure__frames="1")
-    flown = run.simulate_motion(lab)
-    frame, _ = exposure.render_frame(flown, 0)
-    report = solve_frame(build_tracker(flown), frame)
+    lab = lab_of(name, exposure__frames="1")
+    frame, _ = Flight(lab).simulate_motion().render(0)
+    report = solve_frame(build_tracker(lab.camera), frame)
     assert report.attitude.match is not None
     found = fact(check(lab), "lights in the field").values["frames"]
     assert found["mean"] == pytest.approx(len(report.attitude.match.observed), rel=0.1, abs=1.5)
@@ -132,7 +132,7 @@ def test_as_many_lights_are_counted_as_the_tracker_uses(name: str) -> None:
 
 
 def test_the_least_lights_are_where_it_says() -> None:
-    lab = bed("afit_simsat")
+    lab = lab_of("afit_simsat")
     context, samples = samples_of(lab)
     text = facts.lights_in_field(context, samples).values["reach"]["least_at"]
     roll, pitch, yaw = (float(re.search(rf"{name} (\S+)°", text)[1]) for name in ("roll", "pitch", "yaw"))  # type: ignore[index]
@@ -151,25 +151,25 @@ def test_the_depth_of_focus_ends_where_defocus_is_a_pixel(afit: plan.Check) -> N
         chip_m = 1 / (1 / 0.035 - 1 / (33 * 0.0254))
         assert 0.035 / 8 * abs(image_m - chip_m) / image_m == pytest.approx(4e-6, rel=1e-6)
     assert values["near_m"] < 33 * 0.0254 < values["far_m"]
-    assert fact(check(bed("shefex2")), "depth of focus").values["far_m"] == math.inf
+    assert fact(check(lab_of("shefex2")), "depth of focus").values["far_m"] == math.inf
 
 
 @pytest.mark.slow
 def test_smear_is_the_rate_times_the_exposure() -> None:
     """Stars cross f w T pixels; under a dome the pupil on its lever moves too: by R / (R - M) more."""
-    moving = fact(check(bed("shefex2", motion__rate_deg_s="[3, 4, 0]")), "smear").values
-    focal_px = bed("shefex2").scene.camera.focal_px
+    moving = fact(check(lab_of("shefex2", motion__rate_deg_s="[3, 4, 0]")), "smear").values
+    focal_px = lab_of("shefex2").scene.camera.focal_px
     assert moving["largest_px"] == pytest.approx(focal_px * math.radians(5) * 0.04, rel=0.02)
     assert moving["rate_deg_s"] == pytest.approx(5)
-    dome = bed("afit_simsat")
+    dome = lab_of("afit_simsat")
     values = fact(check(dome), "smear").values
-    far = np.linalg.norm(dome.sources.place[:, :3], axis=1).mean() / 0.838
+    far = np.linalg.norm(dome.camera.sources.place[:, :3], axis=1).mean() / 0.838
     assert values["largest_px"] < far * dome.scene.camera.focal_px * math.radians(values["rate_deg_s"]) * 0.01
 
 
 def test_the_cap_s_margin_is_the_angle_beyond_the_field() -> None:
     """On a sphere of R about the bearing: half field h at the pupil M above is h - asin(M sin h / R) at the bearing."""
-    lab = bed(
+    lab = lab_of(
         "afit_simsat",
         light__surface="{kind: sphere, apex: 48 in, radius: 48 in}",
         light__layout="{kind: fibonacci, count: 900, cap_deg: 27}",
@@ -189,7 +189,7 @@ def test_the_cap_s_margin_is_the_angle_beyond_the_field() -> None:
 
 def test_the_cap_of_listed_leds_ends_at_the_farthest_of_them() -> None:
     """Three LEDs to 20 deg from the zenith in a cap of 50: the row says both; a warning has nothing to change."""
-    lab = bed(
+    lab = lab_of(
         "afit_simsat",
         light__surface="{kind: sphere, apex: 48 in, radius: 48 in}",
         light__layout="{kind: listed, directions_deg: [[0, 20], [90, 10], [200, 5]], cap_deg: 50}",
@@ -207,7 +207,7 @@ def test_the_cap_of_listed_leds_ends_at_the_farthest_of_them() -> None:
 @pytest.mark.slow
 def test_the_cap_s_margin_at_the_tilt_stop_is_stated_and_a_study_is_warned_of_it() -> None:
     """The maneuver tilts by 9.6 deg, the stop is at 30: 5 deg of tilt more need 5 deg of LEDs more on a sphere."""
-    lab = bed(
+    lab = lab_of(
         "afit_simsat",
         light__surface="{kind: sphere, apex: 48 in, radius: 48 in}",
         light__layout="{kind: fibonacci, count: 900, cap_deg: 30}",
@@ -222,7 +222,7 @@ def test_the_cap_s_margin_at_the_tilt_stop_is_stated_and_a_study_is_warned_of_it
     assert not [line for line in planned.findings if "cap_deg" in line]
     (warned,) = [line for line in check(lab, 30.0).findings if "cap_deg" in line]
     assert "at a tilt of 30.0 deg" in warned
-    free = check(bed("afit_simsat", motion__control="none", motion__maneuver="[]"))
+    free = check(lab_of("afit_simsat", motion__control="none", motion__maneuver="[]"))
     assert all("tilt stop" not in line for one in free.facts if one.name == "LED cap" for line in one.lines)
 
 
@@ -234,16 +234,16 @@ def test_what_the_tracker_believes_is_said() -> None:
         "tracker__assumed_distortion": "[0.1, 0, 0, 0, 0]",
         "tracker__assumed_camera_body": "[0 mm, 0 mm, 385 mm]",
     }
-    lines = " ".join(fact(check(bed("afit_simsat_ideal", **changes)), "tracker knows").lines)
+    lines = " ".join(fact(check(lab_of("afit_simsat_ideal", **changes)), "tracker knows").lines)
     for words in ("LEDs to 0.3 mm", "rotated by 36″", "length wrong by +0.2 %", "another distortion", "lever wrong by"):
         assert words in lines
-    told = " ".join(fact(check(bed("shefex2")), "tracker knows").lines)
+    told = " ".join(fact(check(lab_of("shefex2")), "tracker knows").lines)
     assert "of hipparcos_hp6.5, epoch J1991.25 moved to 2012-06-22" in told
 
 
 def test_causes_are_in_order_and_each_is_found_where_it_is_put() -> None:
     """Beside half a millimeter of lever, 0.1 deg of the survey's axes is the first."""
-    result = check(bed("afit_simsat", tracker__survey__rotation_deg="[0, 0, 0.1]"))
+    result = check(lab_of("afit_simsat", tracker__survey__rotation_deg="[0, 0, 0.1]"))
     values = fact(result, "expected error").values["frames"]
     roll = values["roll_causes_arcsec"]
     assert next(iter(roll)) == "survey rotation"
@@ -257,7 +257,7 @@ def test_causes_are_in_order_and_each_is_found_where_it_is_put() -> None:
 def test_what_cross_and_sigma_are_of_is_said() -> None:
     """Cross is of two axes; a survey's error is constant in one dome, unlike the noise of centroids."""
     over_surveys = "of the survey: 1σ over surveys; one dome has one survey, whose error stays the same"
-    surveyed, exact = check(bed("afit_simsat")), check(bed("afit_simsat_ideal"))
+    surveyed, exact = check(lab_of("afit_simsat")), check(lab_of("afit_simsat_ideal"))
     assert over_surveys in fact(surveyed, "expected error").lines
     assert over_surveys not in fact(exact, "expected error").lines
     assert [one for one in fact(exact, "expected error").lines if one.startswith("cross: sqrt(x² + y²)")]
@@ -266,7 +266,7 @@ def test_what_cross_and_sigma_are_of_is_said() -> None:
 @pytest.mark.slow
 def test_a_solver_s_own_error_is_a_cause() -> None:
     """`infinity` ignores the lever: half a degree on this dome at every tilt (nearfield.py)."""
-    values = fact(check(bed("afit_simsat_ideal", tracker__solver="infinity")), "expected error").values["frames"]
+    values = fact(check(lab_of("afit_simsat_ideal", tracker__solver="infinity")), "expected error").values["frames"]
     assert next(iter(values["cross_causes_arcsec"])) == "solver"
     assert 0.02 < values["cross_arcsec"] / 3600 < 1
 
@@ -357,9 +357,9 @@ def test_a_solver_s_own_error_is_a_cause() -> None:
 def test_a_mistake_is_warned_of_with_its_key(scene: str, changes: dict[str, str], key: str, words: str) -> None:
     """And with what to change it to; the plan as it ships gives no such warning."""
     tilted = {"motion__maneuver": TILTED} if key.endswith("cap_deg") else {}
-    lines = [line for line in check(bed(scene, **tilted, **changes)).findings if line.startswith(f"{key}: ")]
+    lines = [line for line in check(lab_of(scene, **tilted, **changes)).findings if line.startswith(f"{key}: ")]
     assert [line for line in lines if words in line and re.search("; (change it to|leave it out|turn)", line)]
-    assert not [line for line in check(bed(scene)).findings if words in line]
+    assert not [line for line in check(lab_of(scene)).findings if words in line]
 
 
 @pytest.mark.slow
@@ -404,12 +404,12 @@ def test_saturation_can_be_cured_by_light_exposure_or_lens(intensity: str, keys:
 
 def test_a_bright_background_is_the_only_warning_that_it_causes() -> None:
     """The lights in it are saturated too, and their pixels above no threshold."""
-    (line,) = check(bed("shefex2", background="[{kind: uniform, e_s: 5.0e6}]")).findings
+    (line,) = check(lab_of("shefex2", background="[{kind: uniform, e_s: 5.0e6}]")).findings
     assert line.startswith("background: 200001 electrons in a pixel without a light, of 39956 at saturation; lower it")
 
 
 def test_smear_is_not_also_reported_as_faint_lights() -> None:
-    (line,) = check(bed("shefex2", motion__rate_deg_s="[0, 60, 0]")).findings
+    (line,) = check(lab_of("shefex2", motion__rate_deg_s="[0, 60, 0]")).findings
     assert line.startswith("exposure.time: images move by up to 1")
 
 
@@ -417,7 +417,7 @@ def test_smear_is_not_also_reported_as_faint_lights() -> None:
 def test_the_brightest_hundred_of_many_lights_are_no_fault() -> None:
     """The tracker takes as many from a frame; the fact says so, and no warning blames the area or the exposure."""
     tape = "{kind: string, pitch: 4 mm, spacing: 14 mm, cap_deg: 32}"
-    dense = bed("afit_simsat_ideal", light__surface=SPHERE, light__layout=tape, light__led__disk_diameter="1 mm")
+    dense = lab_of("afit_simsat_ideal", light__surface=SPHERE, light__layout=tape, light__led__disk_diameter="1 mm")
     result = check(dense)
     assert "; the tracker uses the 100 brightest)" in fact(result, "lights in the field").lines[0]
     assert not [line for line in result.findings if "detects" in line]
@@ -426,12 +426,12 @@ def test_the_brightest_hundred_of_many_lights_are_no_fault() -> None:
 @pytest.mark.slow
 def test_only_an_led_s_image_has_the_part_of_an_led(afit: plan.Check) -> None:
     assert ", LED 2" in fact(afit, "image size").lines[0]
-    assert "LED" not in fact(check(bed("shefex2")), "image size").lines[0]
+    assert "LED" not in fact(check(lab_of("shefex2")), "image size").lines[0]
 
 
 @pytest.mark.slow
 def test_the_rate_at_which_an_image_is_as_long_as_wide_is_told() -> None:
-    result = check(bed("shefex2"))
+    result = check(lab_of("shefex2"))
     rate_deg_s, width_px = (
         fact(result, "smear").values["width_rate_deg_s"],
         fact(result, "image size").values["width_px"],
@@ -444,9 +444,8 @@ def test_the_rate_at_which_an_image_is_as_long_as_wide_is_told() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("focal_length", "solved"), [("25.01 mm", 3), ("25.5 mm", 3), ("27 mm", 0)])
 def test_a_wrong_focal_length_is_warned_of_where_the_tracker_refuses(focal_length: str, solved: int) -> None:
-    lab = bed("shefex2", tracker__assumed_focal_length=focal_length, exposure__frames="3")
-    flown, tracker = run.simulate_motion(lab), build_tracker(lab.camera)
-    found = [solve_frame(tracker, frame).attitude.solved for frame, _, _ in run.render_frames(flown)]
+    lab = lab_of("shefex2", tracker__assumed_focal_length=focal_length, exposure__frames="3")
+    found = [shot.report.attitude.solved for shot in Flight(lab).shots()]
     assert found.count(True) == solved
     assert bool(check(lab).findings) == (solved == 0)
 
@@ -462,12 +461,12 @@ def test_a_wrong_focal_length_is_warned_of_where_the_tracker_refuses(focal_lengt
 def test_fields_alike_are_those_that_the_tracker_refuses_as_ambiguous(layout: str) -> None:
     """On rendered frames at the attitudes in reach: none, some three of four, all."""
     changes = {"light__surface": SPHERE, "light__layout": layout, "camera__focus": "0.82 m", "camera__f_number": "11"}
-    lab = bed("afit_simsat", **changes, motion__maneuver=TILTED)
+    lab = lab_of("afit_simsat", **changes, motion__maneuver=TILTED)
     frames = attitudes.of_frames(lab)
     reach = attitudes.within_reach(lab.scene, lab.camera.mount, frames).lab_from_body
     tracker, told = build_tracker(lab.camera), []
     for n, lab_from_body in enumerate(reach):
-        frame, _ = exposure.render_frame(lab.in_run(n).at_rest(lab_from_body), 0)
+        frame, _ = render_at_rest(lab.in_run(n).camera, lab_from_body)
         told.append(solve_frame(tracker, frame).attitude.status)
     ambiguous = np.mean([status.startswith("ambiguous") for status in told])
     assert fact(check(lab), "fields alike").values["share"] == pytest.approx(ambiguous, abs=0.2)
@@ -477,19 +476,18 @@ def test_fields_whose_leds_have_names_are_not_alike() -> None:
     """The same spiral with its codes and without."""
     any_attitude = {"motion__control": "null", "motion__maneuver": "[]"}
     told = any_attitude | {"light__layout__count": "700", "tracker__survey__led_sigma": "1 mm"}
-    without = check(bed("coded_spiral", **told, light__led__code="null", tracker__decoder="null"))
+    without = check(lab_of("coded_spiral", **told, light__led__code="null", tracker__decoder="null"))
     assert any("look like another one" in line for line in without.findings)
-    assert not any("look like another one" in line for line in check(bed("coded_spiral", **told)).findings)
+    assert not any("look like another one" in line for line in check(lab_of("coded_spiral", **told)).findings)
 
 
 def test_half_of_the_stars_at_the_limit_are_detected() -> None:
     """The limit that `light.catalog` is compared with, on rendered frames: most brighter by half a magnitude are."""
-    lab = bed("shefex2", exposure__frames="1", motion__rate_deg_s="[0, 0, 0]")
+    lab = lab_of("shefex2", exposure__frames="1", motion__rate_deg_s="[0, 0, 0]")
     limit = depth.detection_limit_mag(*samples_of(lab))
     tracker, rng, found, faint = build_tracker(lab.camera), np.random.default_rng(3), [], []
     for n in range(6):
-        still = lab.in_run(n).at_rest(Rotation.random(rng=rng))
-        frame, truth = exposure.render_frame(still, 0)
+        frame, truth = render_at_rest(lab.in_run(n).camera, Rotation.random(rng=rng))
         magnitude = dict(zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True))
         near = cKDTree(solve_frame(tracker, frame).centroids.xy_px).query(truth.sources.xy_px)[0] < 1.5
         v_mag = np.array([magnitude[hip] for hip in truth.sources.id.tolist()])
@@ -501,10 +499,10 @@ def test_half_of_the_stars_at_the_limit_are_detected() -> None:
 
 def test_the_star_of_a_signal_to_noise_of_five_is_that_of_the_truth_table() -> None:
     """V at which the rendered frames' stars pass 5, by their own color, against a star like the Sun: to 0.3 mag."""
-    lab = bed("shefex2", exposure__frames="1")
+    lab = lab_of("shefex2", exposure__frames="1")
     limit = fact(check(lab), "faintest star").values["snr_5_v_mag"]
     magnitude = dict(zip(lab.camera.sources.id.tolist(), lab.camera.sources.magnitude.tolist(), strict=True))
-    _, truth = exposure.render_frame(run.simulate_motion(lab), 0)
+    _, truth = Flight(lab).simulate_motion().render(0)
     v_mag = np.array([magnitude[hip] for hip in truth.sources.id.tolist()])
     near = np.abs(truth.sources.snr - 5) < 0.7
     assert near.sum() > 10
@@ -516,7 +514,7 @@ def test_a_floor_that_the_check_proposes_makes_the_claims_true() -> None:
     """Of a chip whose pixels differ by 10 %, NEES is 5.4 as expected and 5.7 (median of 40 frames) as measured."""
     floor_px = 0.02
     nees = [
-        claims.claimed(*samples_of(bed("shefex2", camera__detector__prnu="0.1", tracker__centroid_sigma_px=str(px))))
+        claims.claimed(*samples_of(lab_of("shefex2", camera__detector__prnu="0.1", tracker__centroid_sigma_px=str(px))))
         for px in (0.007, floor_px)
     ]
     assert nees == [pytest.approx(5.4, abs=0.3), pytest.approx(3, abs=0.15)]
@@ -526,7 +524,7 @@ MOON = {"start_time": "2012-06-24T21:00:00", "motion__rate_deg_s": "[0, 0, 0]", 
 
 
 def warned_of_bodies(ra_deg: float, dec_deg: float, **changes: str) -> list[str]:
-    scene = bed("shefex2", motion__start=f"{{ra_deg: {ra_deg}, dec_deg: {dec_deg}}}", **MOON | changes)
+    scene = lab_of("shefex2", motion__start=f"{{ra_deg: {ra_deg}, dec_deg: {dec_deg}}}", **MOON | changes)
     return [line for line in check(scene).findings if line.startswith("light.bodies")]
 
 
@@ -548,10 +546,10 @@ def test_bodies_in_the_field_and_near_it_are_warned_of() -> None:
 def test_a_body_fills_a_pixel_as_in_its_frame(ra_deg: float, dec_deg: float, name: str) -> None:
     """Within a factor of 1.5 of the brightest pixel's electrons: its place in the pixel, and the phase's shape."""
     start = f"{{ra_deg: {ra_deg}, dec_deg: {dec_deg}}}"
-    lab = bed("shefex2", motion__start=start, exposure__frames="1", **MOON)
+    lab = lab_of("shefex2", motion__start=start, exposure__frames="1", **MOON)
     line = next(line for line in check(lab).findings if name in line)
     fill = float(re.search(r"([\d.]+) times saturation", line)[1])
-    _, truth = exposure.render_frame(run.prepare(lab.scene), 0)
+    _, truth = simulate_motion(lab.scene).render(0)
     row = list(truth.sources.id).index(next(body.id for body in truth.bodies if body.name == name.lower()))
     full_e = detection.full_scale_e(lab.scene.camera.detector)
     assert fill == pytest.approx(truth.sources.peak_e[row] / full_e, rel=0.5)
@@ -560,7 +558,7 @@ def test_a_body_fills_a_pixel_as_in_its_frame(ra_deg: float, dec_deg: float, nam
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["afit_simsat", "nps_tas2", "shefex2", "scoreboard", "collimated_display"])
 def test_a_plan_that_ships_gives_no_warning(name: str) -> None:
-    assert check(bed(name)).findings == []
+    assert check(lab_of(name)).findings == []
 
 
 @pytest.mark.long
@@ -573,13 +571,13 @@ def test_only_the_plans_with_saturated_and_too_few_leds_are_warned_of() -> None:
 @pytest.mark.slow
 def test_a_check_costs_a_fraction_of_a_second() -> None:
     """Of CPU, after its functions were loaded once: against the time to set up the same scene, twice."""
-    lab = bed("shefex2")
+    lab = lab_of("shefex2")
     check(lab)
     began = time.process_time()
     check(lab)
     checked = time.process_time()
     for _ in range(2):
-        build_tracker(bed("shefex2"))
+        build_tracker(lab_of("shefex2").camera)
     assert checked - began < 2 * (time.process_time() - checked)
 
 
@@ -593,5 +591,5 @@ def test_a_profile_that_is_too_fast_is_refused_before_the_run(tmp_path: Path) ->
     file.write_text("\n".join(["t_s,roll_deg,pitch_deg,yaw_deg", *rows]))
     changes = {"motion__start": "profile", "motion__maneuver": f"[{{kind: profile, file: {file}}}]"}
     with pytest.raises(InputError, match=r"motion\.maneuver\.0: profile: needs a torque of .* times what the"):
-        check(bed("simsat_slew", **changes))
-    check(bed("simsat_slew", motion__control="prescribed", filter="null", **changes))
+        check(lab_of("simsat_slew", **changes))
+    check(lab_of("simsat_slew", motion__control="prescribed", filter="null", **changes))

@@ -10,13 +10,13 @@ import pytest
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene import loader
-from skysim.simulation import exposure, run
 from skysim.simulation.checks import attitudes, findings
 from skysim.simulation.checks.detection import Context, context_of
 from skysim.simulation.checks.dome import reflections
 from skysim.simulation.checks.facts import Samples
 from skysim.simulation.checks.plan import check, sampled
 from skysim.simulation.checks.sky import air, depth, stray
+from skysim.simulation.flight import Flight
 from skysim.simulation.lab import build_lab, build_tracker
 from skysim.sources.false_lights import MIRRORED
 from skysim.tracking.factory import solve_frame
@@ -139,7 +139,7 @@ def test_images_in_the_wall_that_are_detected_are_warned_of() -> None:
         r"light.reflection.specular: the tracker detects up to (\d+) images .* change it to ([\d.]+)$", line
     )
     assert found
-    frame, truth = exposure.render_frame(run.simulate_motion(context.lab), 0)
+    frame, truth = Flight(context.lab).simulate_motion().render(0)
     seen = solve_frame(build_tracker(context.lab.camera), frame).centroids.xy_px
     mirrored = truth.sources.xy_px[truth.sources.id >= MIRRORED]
     near = (np.linalg.norm(mirrored[:, None] - seen, axis=2).min(axis=1) < 2).sum()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -15,11 +13,13 @@ from skysim.core.random_streams import DETECTOR, random_stream
 from skysim.core.types import Truth
 from skysim.results import metrics
 from skysim.scene import loader
-from skysim.simulation import exposure, run
-from skysim.simulation.lab import Lab, build_lab, build_tracker
-from skysim.simulation.motion import ClosedLoop
+from skysim.scene.scene import Scene
+from skysim.simulation.exposure import render_at_rest
+from skysim.simulation.flight import Flight, Shot, open_flight, simulate_motion
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.simulation.timing import exposure_window
 from skysim.tracking import onboard_model
+from skysim.tracking.factory import solve_frame
 
 # Without noise a frame is the expectation in float64; without fixed pattern and with one exposure for all rows, a
 # perfect chip's.
@@ -56,13 +56,17 @@ ATTITUDES = [
 POINTINGS = ["{ra_deg: 83, dec_deg: 2}", "{ra_deg: 300, dec_deg: 20, roll_deg: 77}"]
 
 
-def prepared(name: str, **overrides: str) -> Lab:
-    return run.prepare(loader.load(name, {k.replace("__", "."): v for k, v in overrides.items()}))
+def changed(name: str, **overrides: str) -> Scene:
+    return loader.load(name, {k.replace("__", "."): v for k, v in overrides.items()})
 
 
-def quiet(name: str, start: str) -> Lab:
+def flown(name: str, **overrides: str) -> Flight:
+    return simulate_motion(changed(name, **overrides))
+
+
+def quiet(name: str, start: str) -> Flight:
     changes = {"afit_simsat_ideal": QUIET_DOME, "shefex2": QUIET_SKY}[name]
-    return run.prepare(loader.load(name, changes | {"motion.start": start}))
+    return simulate_motion(loader.load(name, changes | {"motion.start": start}))
 
 
 def error_deg(answer: Attitude, truth: Truth) -> float:
@@ -71,8 +75,8 @@ def error_deg(answer: Attitude, truth: Truth) -> float:
     return float(np.degrees((answer.cam_from_ref * truth.cam_from_lab.inv()).magnitude()))
 
 
-def shots_of(lab: Lab) -> list[run.FrameResult]:
-    return list(run.run(lab, build_tracker(lab.camera)))
+def shots_of(scene: Scene) -> list[Shot]:
+    return list(open_flight(scene).shots())
 
 
 def true_centroids(truth: Truth) -> Centroids:
@@ -93,12 +97,12 @@ def true_centroids(truth: Truth) -> Centroids:
     ("name", "start"), [("afit_simsat_ideal", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS]
 )
 def test_a_noise_free_image_gives_the_true_attitude(name: str, start: str) -> None:
-    lab = quiet(name, start)
-    frame, truth = exposure.render_frame(lab, 0)
+    flight = quiet(name, start)
+    frame, truth = flight.render(0)
     assert frame.image_dn.dtype == np.float64  # neither rounded nor clipped
     # The tracker takes the center of an LED's light for the image of its center: 1e-3 px of 22.6" at most, five LEDs.
     limit_deg = 1e-6 if name == "shefex2" else 1e-3 * 22.6 / 3600 / np.sqrt(5)
-    assert error_deg(build_tracker(lab.camera).solve(frame.image_dn).attitude, truth) < limit_deg
+    assert error_deg(build_tracker(flight.lab.camera).solve(frame.image_dn).attitude, truth) < limit_deg
 
 
 @pytest.mark.slow
@@ -107,7 +111,7 @@ def test_a_shipped_scene_without_noise_and_fixed_pattern_is_solved(name: str) ->
     """Nothing but light: the wings of the images and the readout smear must not join the lights to one blob."""
     off = {key: "0" for key in ("prnu", "dsnu", "hot_pixels")} | {"noise": "false"}
     lab = build_lab(loader.load(name, {f"camera.detector.{key}": value for key, value in off.items()}))
-    frame, truth = exposure.render_frame(lab.at_rest(lab.start), 0)
+    frame, truth = render_at_rest(lab.camera, lab.start)
     # 18": the tracker takes apl_dome's stretched shell for a sphere.
     assert error_deg(build_tracker(lab.camera).solve(frame.image_dn).attitude, truth) < 5e-3
 
@@ -117,16 +121,16 @@ def test_a_shipped_scene_without_noise_and_fixed_pattern_is_solved(name: str) ->
     ("name", "start"), [("afit_simsat_ideal", s) for s in ATTITUDES] + [("shefex2", s) for s in POINTINGS]
 )
 def test_true_centroids_give_the_true_attitude(name: str, start: str) -> None:
-    lab = quiet(name, start)
-    _, truth = exposure.render_frame(lab, 0)
-    assert error_deg(build_tracker(lab.camera).solve_centroids(true_centroids(truth)), truth) < 1e-6
+    flight = quiet(name, start)
+    _, truth = flight.render(0)
+    assert error_deg(build_tracker(flight.lab.camera).solve_centroids(true_centroids(truth)), truth) < 1e-6
 
 
 def test_true_centroids_under_the_dome_give_the_attitude_to_machine_precision() -> None:
     # Reference §5: exact PnP noise-free, 1e-14 deg; here both sides know the very same LEDs.
-    lab = quiet("afit_simsat_ideal", ATTITUDES[1])
-    _, truth = exposure.render_frame(lab, 0)
-    assert error_deg(build_tracker(lab.camera).solve_centroids(true_centroids(truth)), truth) < 1e-12
+    flight = quiet("afit_simsat_ideal", ATTITUDES[1])
+    _, truth = flight.render(0)
+    assert error_deg(build_tracker(flight.lab.camera).solve_centroids(true_centroids(truth)), truth) < 1e-12
 
 
 @pytest.mark.parametrize("start", POINTINGS)
@@ -134,11 +138,11 @@ def test_uneven_pixels_cost_what_they_move_the_stars(start: str) -> None:
     """PRNU moves a Gaussian star's center by prnu / sqrt(8 pi) px, whatever its width, and N stars turn by that
     over sqrt(sum r^2): from the integral of g^2 x^2, with g the star's profile. Four sigma."""
     uneven = {"camera.detector.prnu": "0.01", "motion.start": start}
-    lab = run.prepare(loader.load("shefex2", QUIET_SKY | uneven))
-    frame, truth = exposure.render_frame(lab, 0)
-    from_center_px = truth.sources.xy_px - lab.scene.camera.center_px
+    flight = simulate_motion(loader.load("shefex2", QUIET_SKY | uneven))
+    frame, truth = flight.render(0)
+    from_center_px = truth.sources.xy_px - flight.lab.scene.camera.center_px
     sigma_rad = 0.01 / np.sqrt(8 * np.pi) / np.sqrt(np.sum(from_center_px**2))
-    error = error_deg(build_tracker(lab.camera).solve(frame.image_dn).attitude, truth)
+    error = error_deg(build_tracker(flight.lab.camera).solve(frame.image_dn).attitude, truth)
     assert 1e-6 < error < 4 * np.degrees(sigma_rad)
 
 
@@ -147,17 +151,17 @@ def test_a_distorted_lens_that_the_tracker_knows_costs_nothing() -> None:
         "camera.distortion": "[-0.2, 0.1, 0.001, -0.002, 0.05]",
         "camera.principal_point_px": "[340, 230]",
     }
-    lab = run.prepare(loader.load("shefex2", QUIET_SKY | lens))
-    frame, truth = exposure.render_frame(lab, 0)
-    assert error_deg(build_tracker(lab.camera).solve(frame.image_dn).attitude, truth) < 1e-6
+    flight = simulate_motion(loader.load("shefex2", QUIET_SKY | lens))
+    frame, truth = flight.render(0)
+    assert error_deg(build_tracker(flight.lab.camera).solve(frame.image_dn).attitude, truth) < 1e-6
 
 
 def test_a_wrongly_believed_lever_costs_what_the_reference_says() -> None:
     """Reference §5: 1 mm of lateral lever is .047 deg across (5 LEDs); by geometry 1 mm / 1.22 m = .047 deg."""
     moved = {"tracker.assumed_camera_body": "['1 mm', '0 m', '381 mm']", "motion.start": "{roll_deg: 7}"}
-    lab = run.prepare(loader.load("afit_simsat_ideal", QUIET_DOME | moved))
-    _, truth = exposure.render_frame(lab, 0)
-    error = error_deg(build_tracker(lab.camera).solve_centroids(true_centroids(truth)), truth)
+    flight = simulate_motion(loader.load("afit_simsat_ideal", QUIET_DOME | moved))
+    _, truth = flight.render(0)
+    error = error_deg(build_tracker(flight.lab.camera).solve_centroids(true_centroids(truth)), truth)
     assert error == pytest.approx(np.degrees(1e-3 / 1.22), rel=0.15)
 
 
@@ -165,8 +169,8 @@ def test_a_wrongly_believed_lever_costs_what_the_reference_says() -> None:
 
 
 def test_the_camera_points_where_the_scene_says() -> None:
-    lab = quiet("shefex2", "{ra_deg: 83, dec_deg: 2, roll_deg: 20}")
-    _, truth = exposure.render_frame(lab, 0)
+    flight = quiet("shefex2", "{ra_deg: 83, dec_deg: 2, roll_deg: 20}")
+    _, truth = flight.render(0)
     right, down, sight = truth.cam_from_lab.as_matrix()
     ra, dec = np.radians([83.0, 2.0])
     wanted = [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
@@ -180,11 +184,11 @@ def test_the_camera_points_where_the_scene_says() -> None:
 
 def test_the_truth_is_that_of_mid_exposure() -> None:
     """The attitude in the truth puts the stars on the pixels in the truth, while the camera slews."""
-    lab = prepared("shefex2", exposure__frames="4")
-    frame, truth = exposure.render_frame(lab, 3)
+    flight = flown("shefex2", exposure__frames="4")
+    frame, truth = flight.render(3)
     assert frame.t_mid_s == truth.t_s == pytest.approx(0.1 + 3 * 0.1 + 0.020, abs=1e-12)
-    rows = {hip: n for n, hip in enumerate(lab.camera.sources.id)}
-    direction = lab.camera.sources.place[[rows[hip] for hip in truth.sources.id], :3]
+    rows = {hip: n for n, hip in enumerate(flight.lab.camera.sources.id)}
+    direction = flight.lab.camera.sources.place[[rows[hip] for hip in truth.sources.id], :3]
     x, y, z = truth.cam_from_lab.apply(direction).T
     pinhole = np.column_stack([329 + x / z * 25e-3 / 9.9e-6, 246 + y / z * 25e-3 / 9.9e-6])
     np.testing.assert_allclose(truth.sources.xy_px, pinhole, rtol=0, atol=1e-9)
@@ -192,8 +196,8 @@ def test_the_truth_is_that_of_mid_exposure() -> None:
 
 def test_the_truth_moves_at_the_rate_of_the_scene() -> None:
     """A sphere of 120 kg m2 in free flight turns evenly: .5 deg/s for the 2 s between frames 0 and 20."""
-    lab = prepared("shefex2", exposure__frames="21")
-    first, last = (exposure.render_frame(lab, k)[1] for k in (0, 20))
+    flight = flown("shefex2", exposure__frames="21")
+    first, last = (flight.render(k)[1] for k in (0, 20))
     assert last.t_s - first.t_s == pytest.approx(2.0, abs=1e-12)
     turned = (last.cam_from_lab * first.cam_from_lab.inv()).magnitude()
     assert np.degrees(turned) == pytest.approx(1.0, abs=1e-9)
@@ -202,8 +206,8 @@ def test_the_truth_moves_at_the_rate_of_the_scene() -> None:
 
 def test_streaks_are_rate_times_exposure_times_focal_length() -> None:
     """Near the axis; .5 deg/s, 40 ms, 2,525 px: .88 px."""
-    lab = prepared("shefex2", exposure__frames="1")
-    seen = exposure.render_frame(lab, 0)[1].sources
+    flight = flown("shefex2", exposure__frames="1")
+    seen = flight.render(0)[1].sources
     middle = np.hypot(*(seen.xy_px - [329, 246]).T) < 120
     assert middle.sum() >= 3
     wanted = np.radians(0.5) * 0.040 * 25e-3 / 9.9e-6
@@ -211,9 +215,9 @@ def test_streaks_are_rate_times_exposure_times_focal_length() -> None:
 
 
 def test_the_camera_rides_fifteen_inches_above_the_bearing() -> None:
-    lab = prepared("afit_simsat", exposure__frames="1")
-    np.testing.assert_allclose(lab.camera.mount.camera_body_m, [0, 0, 15 * 0.0254], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(lab.camera.mount.cam_from_body.as_matrix(), np.eye(3), rtol=0, atol=1e-12)
+    mount = build_lab(loader.load("afit_simsat")).camera.mount
+    np.testing.assert_allclose(mount.camera_body_m, [0, 0, 15 * 0.0254], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(mount.cam_from_body.as_matrix(), np.eye(3), rtol=0, atol=1e-12)
 
 
 def test_shutters_open_on_time() -> None:
@@ -227,15 +231,15 @@ def test_a_rolling_shutter_s_truth_is_that_of_its_middle_row() -> None:
     """493 rows, each 80 us after the one above: the last closes 39.36 ms late, the middle one 19.68 ms."""
     # The first and last rows are .35 px off the middle's: a tracker that trusts to .03 px would leave them out.
     loose = {"tracker__centroid_sigma_px": "0.2", "exposure__frames": "1"}
-    lab = prepared("shefex2", camera__shutter="{kind: rolling, row_time: '80 us'}", seed="3", **loose)
-    assert exposure_window(lab.scene, 0).close_s(493) == pytest.approx(0.1 + 0.040 + 0.03936, abs=1e-12)
-    frame, truth = exposure.render_frame(lab, 0)
+    flight = flown("shefex2", camera__shutter="{kind: rolling, row_time: '80 us'}", seed="3", **loose)
+    assert exposure_window(flight.lab.scene, 0).close_s(493) == pytest.approx(0.1 + 0.040 + 0.03936, abs=1e-12)
+    frame, truth = flight.render(0)
     assert frame.t_mid_s == truth.t_s == pytest.approx(0.1 + 0.020 + 0.01968, abs=1e-12)
+    lab = flight.lab
     blind = lab.scene.tracker.model_copy(update={"assumed_row_time_s": 0.0})
-    scene = lab.scene.model_copy(update={"tracker": blind})
     errors = []
-    for one in lab, replace(lab, scene=scene):
-        report = build_tracker(one).solve(frame.image_dn, exposure_s=frame.exposure_s)
+    for one in lab, lab.with_scene(lab.scene.model_copy(update={"tracker": blind})):
+        report = build_tracker(one.camera).solve(frame.image_dn, exposure_s=frame.exposure_s)
         answer = report.attitude
         assert answer.cam_from_ref is not None
         errors.append(np.degrees(metrics.cross_and_roll_rad(answer.cam_from_ref, truth.cam_from_lab)) * 3600)
@@ -252,7 +256,7 @@ def test_a_rolling_shutter_s_truth_is_that_of_its_middle_row() -> None:
 def test_a_background_is_under_everything_else() -> None:
     """1000 e-/s of glow for 40 ms at 10 e-/DN: 4 DN more in every pixel, and the same stars on top."""
     dark, lit = (
-        exposure.render_frame(run.prepare(loader.load("shefex2", QUIET_SKY | {"background": glow})), 0)
+        simulate_motion(loader.load("shefex2", QUIET_SKY | {"background": glow})).render(0)
         for glow in ("[]", "[{kind: uniform, e_s: 1000}]")
     )
     np.testing.assert_allclose(lit[0].image_dn - dark[0].image_dn, 4.0, rtol=0, atol=1e-6)
@@ -263,7 +267,7 @@ def test_a_background_is_under_everything_else() -> None:
 def test_jitter_shakes_the_camera_by_what_the_scene_says() -> None:
     """100 arcsec rms about the body's x, at 20 Hz: the path's turns away from the unshaken one have that rms."""
     line = "[{kind: line, frequency_hz: 20, rms_arcsec: [100, 0, 0]}]"
-    still, shaken = (prepared("shefex2", exposure__frames="11", motion__jitter=j).trajectory for j in ("[]", line))
+    still, shaken = (flown("shefex2", exposure__frames="11", motion__jitter=j).trajectory() for j in ("[]", line))
     t_s = np.linspace(0, 1, 2000, endpoint=False)  # twenty whole periods
     turned = np.degrees((still.attitude_at(t_s).inv() * shaken.attitude_at(t_s)).as_rotvec()) * 3600
     np.testing.assert_allclose(np.sqrt(np.mean(turned**2, axis=0)), [100, 0, 0], rtol=1e-3, atol=1e-3)
@@ -271,7 +275,7 @@ def test_jitter_shakes_the_camera_by_what_the_scene_says() -> None:
 
 def test_a_chip_s_fixed_pattern_is_its_own_and_not_the_seed_s() -> None:
     one, same, other = (
-        prepared("shefex2", exposure__frames="1", seed=seed, camera__detector__hardware_seed=detector).detector
+        build_lab(changed("shefex2", seed=seed, camera__detector__hardware_seed=detector)).camera.detector
         for seed, detector in (("1", "5"), ("2", "5"), ("1", "6"))
     )
     for name in ("sensitivity", "dark_e_s"):
@@ -283,9 +287,9 @@ def test_a_chip_s_fixed_pattern_is_its_own_and_not_the_seed_s() -> None:
 
 
 def test_frames_do_not_depend_on_those_before() -> None:
-    lab = prepared("shefex2", exposure__frames="4")
-    in_order = [exposure.render_frame(lab, k)[0].image_dn for k in range(4)]
-    backwards = [exposure.render_frame(lab, k)[0].image_dn for k in (3, 2, 1, 0)][::-1]
+    flight = flown("shefex2", exposure__frames="4")
+    in_order = [flight.render(k)[0].image_dn for k in range(4)]
+    backwards = [flight.render(k)[0].image_dn for k in (3, 2, 1, 0)][::-1]
     for one, other in zip(in_order, backwards, strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -297,7 +301,7 @@ def test_noise_differs_from_frame_to_frame_and_seed_to_seed() -> None:
 
 
 def test_the_hardware_s_seed_is_not_the_noise_s() -> None:
-    domes = [prepared("afit_simsat", seed=seed, exposure__frames="1").sources for seed in ("1", "2")]
+    domes = [build_lab(changed("afit_simsat", seed=seed)).camera.sources for seed in ("1", "2")]
     np.testing.assert_array_equal(domes[0].place, domes[1].place)
     np.testing.assert_array_equal(domes[0].strength, domes[1].strength)
 
@@ -306,11 +310,11 @@ def test_the_hardware_s_seed_is_not_the_noise_s() -> None:
 
 
 @pytest.fixture(scope="module")
-def shots() -> list[run.FrameResult]:
-    return shots_of(prepared("shefex2", exposure__frames="3"))
+def shots() -> list[Shot]:
+    return shots_of(changed("shefex2", exposure__frames="3"))
 
 
-def test_a_run_answers_every_frame(shots: list[run.FrameResult]) -> None:
+def test_a_run_answers_every_frame(shots: list[Shot]) -> None:
     assert [shot.frame.index for shot in shots] == [0, 1, 2]
     for shot in shots:
         assert error_deg(shot.report.attitude, shot.truth) < 10 / 60
@@ -318,16 +322,15 @@ def test_a_run_answers_every_frame(shots: list[run.FrameResult]) -> None:
 
 
 def test_a_blinded_frame_is_a_status_and_no_attitude() -> None:
-    lab = prepared("shefex2", exposure__frames="1", background="[{kind: uniform, e_s: 1e8}]")
-    (shot,) = shots_of(lab)
+    (shot,) = shots_of(changed("shefex2", exposure__frames="1", background="[{kind: uniform, e_s: 1e8}]"))
     assert "saturated" in shot.report.attitude.status
     assert shot.report.attitude.cam_from_ref is None
 
 
 @pytest.mark.slow
 def test_a_starless_frame_is_a_status_and_no_attitude() -> None:
-    lab = prepared("shefex2", exposure__frames="1", light__limit_mag="0", motion__start="{ra_deg: 10, dec_deg: 60}")
-    (shot,) = shots_of(lab)
+    starless = {"light__limit_mag": "0", "motion__start": "{ra_deg: 10, dec_deg: 60}"}
+    (shot,) = shots_of(changed("shefex2", exposure__frames="1", **starless))
     assert shot.report.attitude.status != "solved"
     assert shot.report.attitude.cam_from_ref is None
     assert len(shot.truth.sources.id) == 0
@@ -338,14 +341,14 @@ def test_a_starless_frame_is_a_status_and_no_attitude() -> None:
 def test_an_unknown_algorithm_is_refused_before_the_flight(name: str, stage: str) -> None:
     loaded = loader.load(name, {f"tracker.{stage}": "magic"})
     with pytest.raises(InputError, match=rf"^tracker\.{stage}: unknown {stage} 'magic'; allowed: \w+"):
-        run.prepare(loaded)
+        open_flight(loaded)
 
 
 @pytest.mark.parametrize(("name", "solver"), [("shefex2", "rotation_only"), ("afit_simsat", "quest")])
 def test_a_solver_for_the_other_sky_is_refused(name: str, solver: str) -> None:
     loaded = loader.load(name, {"tracker.solver": solver})
     with pytest.raises(InputError, match=rf"^tracker\.solver: unknown solver '{solver}'; allowed: "):
-        run.prepare(loaded)
+        open_flight(loaded)
 
 
 def test_the_believed_camera_is_the_true_one_unless_told_otherwise() -> None:
@@ -374,7 +377,7 @@ def test_the_shutter_s_smear_counts_for_saturation_and_noise() -> None:
         "camera.detector.noise": "true",
     }
     plain, shifted = (
-        exposure.render_frame(run.prepare(loader.load("shefex2", bright | {"camera.shutter": shutter})), 0)[1].sources
+        simulate_motion(loader.load("shefex2", bright | {"camera.shutter": shutter})).render(0)[1].sources
         for shutter in ("{kind: global}", '{kind: frame_transfer, row_time: "40 us"}')
     )
     assert not plain.saturated.all()
@@ -389,12 +392,12 @@ def test_the_shutter_s_smear_counts_for_saturation_and_noise() -> None:
 COMA = {"motion.start": "{ra_deg: 190, dec_deg: 25}", "motion.rate_deg_s": "[0, 0, 0]"}  # no bright stars
 
 
-def controlled(frames: int, start: str, control: str, **more: str) -> Lab:
+def controlled(frames: int, start: str, control: str, **more: str) -> Scene:
     given = {"exposure.frames": str(frames), "exposure.time": start, "tracker.exposure_control": control}
-    return prepared("shefex2", **(COMA | given | more))
+    return changed("shefex2", **(COMA | given | more))
 
 
-def exposures_ms(shots: list[run.FrameResult]) -> list[float]:
+def exposures_ms(shots: list[Shot]) -> list[float]:
     return [1e3 * shot.frame.exposure_s for shot in shots]
 
 
@@ -411,14 +414,14 @@ def test_an_exposure_too_short_for_stars_grows_until_there_are_four() -> None:
 def test_a_frame_is_exposed_for_as_long_as_it_was_told() -> None:
     """It opens on time, its truth is that of its own middle, and its glare is its own: 1e5 e-/s."""
     glare = "[{kind: uniform, e_s: 1e5}]"
-    lab = controlled(3, "4 ms", "{mean_dn: 1000, min_stars: 1000}", background=glare)
-    shots = shots_of(lab)
+    scene = controlled(3, "4 ms", "{mean_dn: 1000, min_stars: 1000}", background=glare)
+    shots = shots_of(scene)
+    detector = scene.camera.detector
     assert exposures_ms(shots) == pytest.approx([4, 6, 8], abs=1e-9)
     for n, shot in enumerate(shots):
         assert shot.frame.t_mid_s == shot.truth.t_s == pytest.approx(0.1 + n * 0.1 + (2 + n) * 1e-3, abs=1e-12)
-        gathered_dn = 1e5 * shot.frame.exposure_s / lab.scene.camera.detector.gain_e_dn
-        offset_dn = lab.scene.camera.detector.offset_dn
-        assert np.median(shot.frame.image_dn) == pytest.approx(offset_dn + gathered_dn, abs=1.0)
+        gathered_dn = 1e5 * shot.frame.exposure_s / detector.gain_e_dn
+        assert np.median(shot.frame.image_dn) == pytest.approx(detector.offset_dn + gathered_dn, abs=1.0)
 
 
 @pytest.mark.long
@@ -442,56 +445,23 @@ def test_a_bright_body_shortens_the_exposure_and_turning_away_restores_the_stars
 
 
 @pytest.mark.slow
-def test_frames_taken_in_flight_are_taken_again_with_the_same_exposures() -> None:
-    """For the filter frames are taken in flight; the run shows the very same, and one that flies anew agrees."""
-    flight = {"vehicle__imu": "{}", "filter": "{start_deg: 0.1}", "motion__control": "none"}
+def test_frames_that_the_filter_used_are_rendered_again_with_the_same_exposures() -> None:
+    given = {"vehicle__imu": "{}", "filter": "{start_deg: 0.1}", "motion__control": "none"}
     growing = "{mean_dn: 4000, min_stars: 100000, step: 1 ms, longest: 7 ms, overexposed_objects: 100000}"
     exposure = '{time: "4 ms", rate_hz: 5, frames: 5}'
-    flight |= {"motion__maneuver": "[]", "exposure": exposure, "tracker__exposure_control": growing}
-    lab = prepared("afit_simsat", **flight)
-    assert list(lab.exposures_s.values()) == pytest.approx([4e-3, 5e-3, 6e-3, 7e-3, 7e-3], abs=1e-12)
-    assert sorted(lab.reports) == list(range(5))  # the flight lasts until the longest exposure of the last frame
-    shots = shots_of(lab)
-    assert [shot.frame.exposure_s for shot in shots] == list(lab.exposures_s.values())
-    anew = shots_of(replace(lab, reports={}, exposures_s={}))
-    assert exposures_ms(anew) == exposures_ms(shots)
-    for shot, other in zip(shots, anew, strict=True):
-        np.testing.assert_array_equal(shot.frame.image_dn, other.frame.image_dn)
-        gap_px = shot.report.centroids.xy_px - other.report.centroids.xy_px
-        assert np.abs(gap_px).max() < 1e-6
-
-
-# As it happens.
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["simsat_bump", "shefex2"])
-def test_frames_as_they_happen_are_those_of_the_whole_flight(name: str) -> None:
-    """To the last bit, though the flight before them is forgotten: with the filter in the loop, and flown alone."""
-    loaded = loader.load(name, {"exposure.frames": "6"})
-    whole = run.run(run.prepare(loaded), build_tracker(build_lab(loaded)).camera)
-    lab = build_lab(loaded)
-    as_it_happens = run.live(lab, build_tracker(lab.camera))
-    for shot, look in zip(whole, as_it_happens, strict=True):
-        np.testing.assert_array_equal(look.frame.image_dn, shot.frame.image_dn)
-        assert look.frame.t_mid_s == shot.frame.t_mid_s
-        assert (look.truth.cam_from_lab * shot.truth.cam_from_lab.inv()).magnitude() == 0
-        assert look.report is not None
-        assert look.report.attitude.status == shot.report.attitude.status
-
-
-def test_a_flight_that_forgets_is_the_same_flight() -> None:
-    """Nothing of it depends on how much is kept; what is older is gone."""
-    loaded = loader.load("simsat_slew", {"exposure.frames": "3"})
-    lab = build_lab(loaded)
-    long, short = ClosedLoop(lab), ClosedLoop(lab, discards_history=True)
-    while long.simulation.steps_left:
-        long.tick(10)
-        short.tick(10)
-    assert len(short.simulation.states) < len(long.simulation.states) / 4
-    kept = short.simulation.knots(short.simulation.first_step)
-    for one, other in zip(kept, long.simulation.knots(short.simulation.first_step), strict=True):
-        np.testing.assert_array_equal(one, other)
+    given |= {"motion__maneuver": "[]", "exposure": exposure, "tracker__exposure_control": growing}
+    flight = open_flight(changed("afit_simsat", **given))
+    shots = list(flight.shots())
+    assert exposures_ms(shots) == pytest.approx([4, 5, 6, 7, 7], abs=1e-9)
+    # The flight lasts until the longest exposure of the last frame, so the filter gets that one too.
+    assert [shot.update_status for shot in shots] == ["used"] * 5
+    for shot in shots:
+        assert shot.report is not None
+        frame, _ = flight.render(shot.frame.index)
+        assert frame.exposure_s == shot.frame.exposure_s
+        np.testing.assert_array_equal(frame.image_dn, shot.frame.image_dn)
+        again = solve_frame(build_tracker(flight.lab.camera), frame)
+        assert np.abs(again.centroids.xy_px - shot.report.centroids.xy_px).max() < 1e-6
 
 
 MOON = {
@@ -504,7 +474,7 @@ MOON = {
 
 
 def test_the_moon_is_in_the_frame_and_in_its_truth() -> None:
-    frame, truth = exposure.render_frame(run.prepare(loader.load("shefex2", MOON)), 0)
+    frame, truth = simulate_motion(loader.load("shefex2", MOON)).render(0)
     (moon,) = (body for body in truth.bodies if body.name == "moon")
     row = list(truth.sources.id).index(moon.id)
     x, y = truth.sources.xy_px[row].round().astype(int)
@@ -516,7 +486,7 @@ def test_the_moon_is_in_the_frame_and_in_its_truth() -> None:
     assert moon.v_mag == pytest.approx(-8.84, abs=0.01)
     assert 1800 < moon.diameter_arcsec < 2000
     occulted = loader.load("shefex2", MOON | {"light.bodies": "{moon: false}"})
-    _, without = exposure.render_frame(run.prepare(occulted), 0)
+    _, without = simulate_motion(occulted).render(0)
     assert not any(body.name == "moon" for body in without.bodies)
 
 
@@ -524,8 +494,8 @@ def test_the_moon_is_in_the_frame_and_in_its_truth() -> None:
 def test_the_moon_moves_among_the_stars_during_a_run() -> None:
     """By half a second of arc a second, so a frame a minute later has it elsewhere."""
     settings = MOON | {"exposure.frames": "2", "exposure.rate_hz": "0.0167"}
-    lab = run.prepare(loader.load("shefex2", settings))
-    place = [exposure.render_frame(lab, index)[1].bodies[0] for index in (0, 1)]
+    flight = simulate_motion(loader.load("shefex2", settings))
+    place = [flight.render(index)[1].bodies[0] for index in (0, 1)]
     moved_arcsec = np.hypot(place[1].ra_deg - place[0].ra_deg, place[1].dec_deg - place[0].dec_deg) * 3600
     assert 25 < moved_arcsec < 40
 

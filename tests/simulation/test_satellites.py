@@ -13,7 +13,7 @@ from skysim.core.errors import InputError
 from skysim.core.types import SourceTruth
 from skysim.results.files.frames import write_frame
 from skysim.scene import loader
-from skysim.simulation.exposure import render_frame
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.sources.orbit.satellites import ID_BASE
 from skysim.tracking.factory import solve_frame
@@ -21,10 +21,9 @@ from skysim.tracking.factory import solve_frame
 FRAMES = 6
 
 
-def at_rest(**keys: str) -> Lab:
+def lab_of(**keys: str) -> Lab:
     overrides = {key.replace("__", "."): value for key, value in keys.items()}
-    lab = build_lab(loader.load("shefex2", {"exposure.frames": str(FRAMES), **overrides}))
-    return lab.at_rest(lab.start, FRAMES - 1)
+    return build_lab(loader.load("shefex2", {"exposure.frames": str(FRAMES), **overrides}))
 
 
 def streaks(sources: SourceTruth) -> np.ndarray:
@@ -35,8 +34,8 @@ def streaks(sources: SourceTruth) -> np.ndarray:
 def test_streaks_are_as_long_and_as_bright_as_their_satellites() -> None:
     """Length: rate times exposure, by the scale at the streak. Light: that of a star of the magnitude and color."""
     random = "{per_field: 60, seed: 3, rate_deg_s: [0.5, 3], v_mag: [2, 2]}"
-    lab = at_rest(light__satellites__random=random, camera__detector__noise="false", light__limit_mag="0")
-    _, truth = render_frame(lab, 0)
+    lab = lab_of(light__satellites__random=random, camera__detector__noise="false", light__limit_mag="0")
+    _, truth = render_at_rest(lab.camera, lab.start, 0)
     rows = truth.sources
     light = {satellite.id: satellite for satellite in truth.satellites}
     camera = lab.scene.camera
@@ -49,8 +48,8 @@ def test_streaks_are_as_long_and_as_bright_as_their_satellites() -> None:
 
 
 def test_a_satellite_has_its_row_and_its_details_in_the_header(tmp_path: Path) -> None:
-    lab = at_rest(light__satellites__random="{per_field: 6, seed: 3, v_mag: [1, 3]}")
-    frame, truth = render_frame(lab, 0)
+    lab = lab_of(light__satellites__random="{per_field: 6, seed: 3, v_mag: [1, 3]}")
+    frame, truth = render_at_rest(lab.camera, lab.start, 0)
     write_frame(tmp_path, frame, truth, lab.scene)
     table = Table.read(tmp_path / "frame_0000.ecsv")
     assert truth.satellites
@@ -73,11 +72,11 @@ def test_a_long_streak_is_rejected_as_one_thing(v_mag: float) -> None:
     keys = {"exposure__time": "999 ms", "exposure__rate_hz": "1", "tracker__brightest": "1000"}
     false, streaked = [], 0
     for settings in ({}, {"light__satellites__random": random}):
-        lab = at_rest(**keys, **settings)
+        lab = lab_of(**keys, **settings)
         tracker = build_tracker(lab.camera)
         counts = []
         for index in range(FRAMES):
-            frame, truth = render_frame(lab, index)
+            frame, truth = render_at_rest(lab.camera, lab.start, index)
             report = solve_frame(tracker, frame)
             assert report.attitude.status == "solved"
             stars = truth.sources.flux_xy_px[~streaks(truth.sources)]

@@ -17,11 +17,11 @@ from skysim.core.errors import InputError
 from skysim.core.types import Telemetry
 from skysim.dynamics.guidance import plan
 from skysim.results.files import export, recording
+from skysim.results.run import Run
 from skysim.scene import loader
-from skysim.simulation import run
 from skysim.simulation.checks.plan import broken_assumptions
-from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.user_parts import build_lab_with
+from skysim.simulation.flight import Flight, open_flight, simulate_motion
+from skysim.simulation.lab import build_lab
 from skysim.tracking.external.interface import Answer
 
 ONE = {"exposure": {"time": "10 ms", "rate_hz": 1, "frames": 1, "first": "2 s"}}
@@ -44,8 +44,8 @@ def attitudes(columns: dict[str, np.ndarray]) -> Rotation:
     return Rotation.from_euler("ZYX", np.column_stack([columns[f"{n}_deg"] for n in ("yaw", "pitch", "roll")]), True)
 
 
-def moved(scene: str = "afit_simsat", changes: dict[str, Any] | None = None, **parts: Any) -> Lab:
-    return run.simulate_motion(build_lab_with(skysim.load_scene(scene, ONE | (changes or {})), **parts))
+def moved(scene: str = "afit_simsat", changes: dict[str, Any] | None = None, **parts: Any) -> Flight:
+    return open_flight(skysim.load_scene(scene, ONE | (changes or {})), **parts).simulate_motion()
 
 
 def profile_scene(folder: Path, columns: dict[str, np.ndarray], **changes: Any) -> Path:
@@ -68,15 +68,15 @@ def angle(a: Rotation, b: Rotation) -> np.ndarray:
 
 def test_a_prescribed_motion_is_the_reference_itself() -> None:
     """A slew of a vehicle out of balance, at every step of a millisecond; and the rate is the reference's."""
-    lab = moved(changes=PRESCRIBED)
-    reference = plan(lab.scene.motion)
-    path = lab.trajectory
+    flight = moved(changes=PRESCRIBED)
+    reference = plan(flight.lab.scene.motion)
+    path = flight.trajectory()
     assert angle(path.lab_from_body, reference.attitudes(path.t_s)).max() < 1e-15
     np.testing.assert_array_equal(path.rate_body_rad_s[::100], [reference.state_at(t)[1] for t in path.t_s[::100]])
     assert np.degrees(path.lab_from_body.magnitude()).max() > 0.3
-    np.testing.assert_array_equal(lab.log.torque_nm, 0)
+    np.testing.assert_array_equal(flight.telemetry().torque_nm, 0)
     pushed = moved(changes={"motion.control": "pid"})
-    assert angle(pushed.trajectory.lab_from_body, reference.attitudes(path.t_s)).max() > 1e-6
+    assert angle(pushed.trajectory().lab_from_body, reference.attitudes(path.t_s)).max() > 1e-6
 
 
 def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
@@ -88,9 +88,9 @@ def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
         "filter": None,
         "exposure": {"time": "10 ms", "rate_hz": 1, "frames": 1, "first": "4 s"},
     }
-    lab = moved("simsat_bump", changes)
-    assert lab.imu_samples is not None
-    np.testing.assert_allclose(np.degrees(lab.imu_samples.angle_rad.sum(axis=0)), [0, 0, 8], rtol=0, atol=0.02)
+    samples = moved("simsat_bump", changes).imu_samples()
+    assert samples is not None
+    np.testing.assert_allclose(np.degrees(samples.angle_rad.sum(axis=0)), [0, 0, 8], rtol=0, atol=0.02)
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
 )
 def test_what_a_prescribed_motion_cannot_do_is_refused(changes: dict[str, Any], told: str) -> None:
     with pytest.raises(InputError, match=told):
-        run.simulate_motion(build_lab(skysim.load_scene("afit_simsat", PRESCRIBED | changes)))
+        simulate_motion(skysim.load_scene("afit_simsat", PRESCRIBED | changes))
 
 
 # --- profiles -----------------------------------------------------------------------------------------------
@@ -122,10 +122,10 @@ def test_what_a_prescribed_motion_cannot_do_is_refused(changes: dict[str, Any], 
 def test_a_table_is_followed_exactly_without_a_controller_and_closely_with_one() -> None:
     columns = swing(TIMES)
     exact = moved("afit_simsat", {"motion.control": None, "motion.maneuver": []}, profile=columns)
-    assert exact.scene.motion.is_prescribed
-    assert angle(exact.trajectory.attitude_at(TIMES[:20]), attitudes(columns)[:20]).max() < 1e-12
+    assert exact.lab.scene.motion.is_prescribed
+    assert angle(exact.trajectory().attitude_at(TIMES[:20]), attitudes(columns)[:20]).max() < 1e-12
     flown = moved("afit_simsat", {"motion.control": "pid"}, profile=columns)
-    off_deg = np.degrees(angle(flown.trajectory.attitude_at(TIMES[:20]), attitudes(columns)[:20]))
+    off_deg = np.degrees(angle(flown.trajectory().attitude_at(TIMES[:20]), attitudes(columns)[:20]))
     assert 1e-6 < off_deg.max() < 0.02
 
 
@@ -135,12 +135,12 @@ def test_a_profile_beside_its_scene_starts_the_vehicle_and_ends_in_a_hold(tmp_pa
     columns = swing(np.arange(1.0, 4.05, 0.1))
     columns["t_s"] = columns["t_s"] - 1.0
     path = profile_scene(tmp_path, columns)
-    lab = run.simulate_motion(build_lab(loader.load(path, {"exposure.frames": "1", "exposure.first": "3.5 s"})))
-    begin = lab.trajectory
-    assert angle(begin.lab_from_body[0], attitudes(columns)[0]) < 1e-9
-    assert np.degrees(np.linalg.norm(begin.rate_body_rad_s[0])) > 3
-    assert angle(begin.lab_from_body[-1], attitudes(columns)[-1]) < 1e-3
-    assert broken_assumptions(lab) == broken_assumptions(build_lab(loader.load("afit_simsat")))
+    flight = simulate_motion(loader.load(path, {"exposure.frames": "1", "exposure.first": "3.5 s"}))
+    motion = flight.trajectory()
+    assert angle(motion.lab_from_body[0], attitudes(columns)[0]) < 1e-9
+    assert np.degrees(np.linalg.norm(motion.rate_body_rad_s[0])) > 3
+    assert angle(motion.lab_from_body[-1], attitudes(columns)[-1]) < 1e-3
+    assert broken_assumptions(flight.lab) == broken_assumptions(build_lab(loader.load("afit_simsat")))
 
 
 def test_a_slip_is_told_with_the_file_s_line_and_the_scene_s(tmp_path: Path) -> None:
@@ -192,7 +192,7 @@ def test_what_the_vehicle_cannot_follow_is_refused(
 def test_the_torque_of_a_profile_is_eulers() -> None:
     """Just refused by a limit below it and just allowed above: J alpha + w x J w, largest over the samples."""
     columns = swing(TIMES)
-    lab = build_lab_with(skysim.load_scene("afit_simsat", ONE), profile=columns)
+    lab = open_flight(skysim.load_scene("afit_simsat", ONE), profile=columns).lab
     _, rate, acceleration = lab.profiles[0].states_at(TIMES)
     inertia = lab.vehicle.inertia_kg_m2
     torque = acceleration @ inertia + np.cross(rate, rate @ inertia)
@@ -288,12 +288,12 @@ STILL = {"exposure.frames": 2, "motion.rate_deg_s": [0, 0, 0]}
 
 
 @pytest.fixture(scope="module")
-def sky() -> skysim.results.run.Run:  # type: ignore[name-defined]
+def sky() -> Run:
     return skysim.simulate(skysim.load_scene("shefex2", STILL))
 
 
 @pytest.mark.slow
-def test_a_function_of_an_image_is_a_tracker(sky: Any) -> None:
+def test_a_function_of_an_image_is_a_tracker(sky: Run) -> None:
     """What it returns, in every form; and it gets each image once, in order, unchanged."""
     truth, images = sky[0].truth.cam_from_lab, []
     error = Rotation.from_rotvec([1e-4, 0, 0])
@@ -333,7 +333,7 @@ def test_what_a_function_cannot_answer_is_the_frame_s_status(answer: Any, status
 
 
 @pytest.mark.slow
-def test_an_estimator_or_a_name_is_a_tracker(sky: Any) -> None:
+def test_an_estimator_or_a_name_is_a_tracker(sky: Run) -> None:
     height_px, width_px = sky[0].image.shape
     camera = estimator.Camera.from_fov(width_px, height_px, fov_deg=14.87)
     theirs = estimator.StarTracker.for_sky(camera, limit_mag=6, date="2012-06-22", focal_uncertainty=0.05)
@@ -372,10 +372,10 @@ def test_a_function_s_attitudes_reach_the_filter_and_the_controller() -> None:
     def mine(image: np.ndarray) -> Answer:
         return Answer("solved", believed.as_quat(), np.eye(3) * 1e-10)
 
-    log: Telemetry = skysim.simulate(scene, tracker=mine).telemetry
-    assert log.lab_from_filter is not None
-    assert np.degrees(log.lab_from_filter.as_rotvec()[:, 2].min()) == pytest.approx(-0.5, abs=0.05)
-    assert np.degrees(log.lab_from_body[-1].as_rotvec()[2]) > 0.1
+    telemetry: Telemetry = skysim.simulate(scene, tracker=mine).telemetry
+    assert telemetry.lab_from_filter is not None
+    assert np.degrees(telemetry.lab_from_filter.as_rotvec()[:, 2].min()) == pytest.approx(-0.5, abs=0.05)
+    assert np.degrees(telemetry.lab_from_body[-1].as_rotvec()[2]) > 0.1
 
 
 def test_a_profile_that_is_not_there_is_refused() -> None:

@@ -12,9 +12,9 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Sources
 from skysim.scene import loader
 from skysim.scene.sections.leds import ClockConfig
-from skysim.simulation import exposure
+from skysim.simulation.exposure import render_at_rest
+from skysim.simulation.flight import open_flight
 from skysim.simulation.lab import build_lab
-from skysim.simulation.motion import ClosedLoop
 from skysim.simulation.timing import exposure_window, time_tag_error_s
 from skysim.sources.dome.led import lit_moments_s
 from skysim.sources.dome.timing.clocks import Clocks, filtered_share
@@ -102,8 +102,8 @@ def test_filtered_leds_do_not_flicker() -> None:
         layout = "{kind: poisson_disk, spacing: 60 mm, cap_deg: 20, levels: [0.1], hardware_seed: 5}"
         drive = {"light.led.drive": f"{{kind: pwm{low_pass}}}", "light.layout": layout, "exposure.time": "1.5 ms"}
         lab = build_lab(loader.load("afit_simsat_ideal", AT_REST | drive | {"camera.detector.noise": "false"}))
-        resting = lab.at_rest(Rotation.identity(), 5)
-        electrons = np.array([exposure.render_frame(resting, k)[1].sources.electrons for k in range(6)])
+        truths = [render_at_rest(lab.camera, Rotation.identity(), k)[1] for k in range(6)]
+        electrons = np.array([truth.sources.electrons for truth in truths])
         scatter.append((electrons.std(axis=0) / electrons.mean(axis=0)).mean())
     assert 0.2 < scatter[0] < 0.5
     assert 0 < scatter[1] < 0.02
@@ -126,8 +126,7 @@ def test_flicker_differs_from_frame_to_frame_and_from_run_to_run() -> None:
     for seed in ("1", "2"):
         lab = build_lab(loader.load("afit_simsat", AT_REST | {"seed": seed}))
         for index in (0, 40, 80):
-            at_rest = lab.at_rest(lab.start, index)
-            sources = exposure.render_frame(at_rest, index)[1].sources
+            sources = render_at_rest(lab.camera, lab.start, index)[1].sources
             frames.append(dict(zip(sources.id.tolist(), sources.electrons.tolist(), strict=True)))
     ids = sorted(set.intersection(*map(set, frames)))
     electrons = np.array([[frame[n] for n in ids] for frame in frames])
@@ -152,7 +151,7 @@ def test_exposures_begin_late_by_their_jitter_and_tags_err_as_the_scene_says() -
     assert error_s.std() == pytest.approx(200e-6, rel=0.07)
     assert abs(np.corrcoef(late_s, error_s)[0, 1]) < 0.1
     lab = build_lab(scene)
-    frame, truth = exposure.render_frame(lab.at_rest(lab.start), 0)
+    frame, truth = render_at_rest(lab.camera, lab.start)
     assert frame.t_mid_s - truth.t_s == pytest.approx(time_tag_error_s(scene, 0), abs=1e-12)
     assert truth.t_s == pytest.approx(exposure_window(scene, 0).middle_s(scene.camera.height_px), abs=1e-12)
 
@@ -162,8 +161,8 @@ def test_the_filter_allows_for_the_tag_s_error_along_the_motion() -> None:
     overrides = {"filter.time_tag_sigma": "1 ms"}
     covariance = []
     for changes in (overrides, {}):
-        loop = ClosedLoop(build_lab(loader.load("simsat_bump", {"filter.time_tag_sigma": "0 s"} | changes)))
-        navigation = loop.navigation
+        flight = open_flight(loader.load("simsat_bump", {"filter.time_tag_sigma": "0 s"} | changes))
+        navigation = flight.motion.navigation
         assert navigation is not None
         assert navigation.filter is not None
         given: list[np.ndarray] = []

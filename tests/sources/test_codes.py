@@ -8,7 +8,7 @@ import pytest
 from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.scene.sections.leds import CyclicCodeConfig, PlainCodeConfig
-from skysim.simulation.exposure import render_frame
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import build_lab
 from skysim.sources.dome.timing.clocks import Clocks
 from skysim.sources.dome.timing.codebooks import codebook, light_levels
@@ -70,18 +70,17 @@ def test_a_bit_of_several_levels_fails_to_any_other_level() -> None:
 def test_a_run_s_code_begins_anywhere_and_its_clock_is_the_hardware_s() -> None:
     settings = {"light.led.code": "{kind: cyclic, bit_time: 20 ms}", "light.led.clock": "{offset_ppm: 50}"}
     lab = build_lab(loader.load(SCENE, settings))
-    runs = [lab.in_run(seed).codes for seed in (5, 6)]
+    runs = [lab.in_run(seed).camera.codes for seed in (5, 6)]
     assert runs[0].clock.offset == runs[1].clock.offset
     assert abs(runs[0].clock.on_s - runs[1].clock.on_s) > 1
-    assert build_lab(loader.load("afit_simsat")).codes is None
+    assert build_lab(loader.load("afit_simsat")).camera.codes is None
 
 
 def test_a_rendered_led_has_the_light_of_its_bits() -> None:
     """The same attitude in frames of different bits; the electrons of the truth, per LED, over those of another."""
     settings = {"light.led.code.depth": "0.25", "motion.control": "null", "motion.maneuver": "[]"}
     lab = build_lab(loader.load(SCENE, settings))
-    at_rest = lab.at_rest(lab.start, 9)
-    truths = [render_frame(at_rest, frame)[1].sources for frame in (2, 9)]
+    truths = [render_at_rest(lab.camera, lab.start, index)[1].sources for index in (2, 9)]
     assert len(truths[0].id) >= 3
     row = np.searchsorted(lab.camera.sources.id, truths[0].id)
     expected = [np.where(lab.camera.codes.words[row, bit], 1.0, 0.75) for bit in (2, 9)]

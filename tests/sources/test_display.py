@@ -11,11 +11,11 @@ import pytest
 
 from skysim.camera.glow import display_glow
 from skysim.core.errors import InputError
-from skysim.core.types import Sources
+from skysim.core.types import Frame, Sources, Truth
 from skysim.scene import loader
 from skysim.scene.sections import layouts
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
-from skysim.simulation import exposure
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab, light_sources
 from skysim.simulation.timing import exposure_window
 from skysim.sources import catalog, dome
@@ -234,6 +234,11 @@ def test_a_panel_does_not_flicker_in_whole_frames_nor_when_always_lit() -> None:
     np.testing.assert_allclose(light_s(refreshed(1.0), 2.4 / 60), 2.4 / 60, rtol=1e-12, atol=0)
 
 
+def still_frame(lab: Lab) -> tuple[Frame, Truth]:
+    """The first frame of a vehicle that stays at its start."""
+    return render_at_rest(lab.camera, lab.start)
+
+
 def light_s(drawn: Sources, exposure_s: float) -> np.ndarray:
     """A pixel's light in exposures begun evenly over a frame."""
     begins = (np.arange(4000) + 0.5) / 4000 / 60
@@ -244,13 +249,14 @@ def light_s(drawn: Sources, exposure_s: float) -> np.ndarray:
 def test_on_the_frame_rows_are_dark_whose_turn_is_not_in_the_exposure() -> None:
     """NPS's stars lit for a quarter of a frame, in an exposure of a quarter: by each row's own turn, or not at all."""
     changes = {"light.led.drive.duty": "0.25", "exposure.time": f"{1000 / 240} ms", "light.led.scatter": "0"}
-    dark = build_lab(loader.load("nps_tas2", changes))
+    dark_lab = build_lab(loader.load("nps_tas2", changes))
+    dark = dark_lab.camera
     steady = build_lab(loader.load("nps_tas2", changes | {"light.led.drive": "{kind: direct}"}))
     window = exposure_window(dark.scene, 0)
     assert dark.clocks is not None
     trains = dark.clocks.pulses_at(dark.sources, window.middle_s(dark.scene.camera.height_px))
     looks = window.open_s + (np.arange(20_000) + 0.5) / 20_000 * window.exposure_s
-    (_, flickering), (_, full) = exposure.render_frame(dark, 0), exposure.render_frame(steady, 0)
+    (_, flickering), (_, full) = still_frame(dark_lab), still_frame(steady)
     all_e = dict(zip(full.sources.id.tolist(), full.sources.electrons, strict=True))
     got = dict.fromkeys(all_e, 0.0) | dict(
         zip(flickering.sources.id.tolist(), flickering.sources.electrons, strict=True)
@@ -319,11 +325,12 @@ def test_a_camera_on_a_lever_sees_no_parallax_but_that_of_the_collimation(conjug
         )
     )
     central = build_lab(loader.load("collimated_display", {"motion.start.roll_deg": "6"}))
-    _, moved = exposure.render_frame(lab, 0)
-    _, still = exposure.render_frame(central, 0)
+    _, moved = still_frame(lab)
+    _, still = still_frame(central)
     both, ours, theirs = np.intersect1d(moved.sources.id, still.sources.id, return_indices=True)
     camera_m = moved.lab_from_body.apply(lab.camera.mount.camera_body_m)
-    direction = central.sources.place[[np.flatnonzero(central.sources.id == n)[0] for n in both], :3]
+    sources = central.camera.sources
+    direction = sources.place[[np.flatnonzero(sources.id == n)[0] for n in both], :3]
     ray = direction if conjugate_m is None else conjugate_m * direction - camera_m
     xyz = moved.cam_from_lab.apply(ray)
     camera = lab.scene.camera
@@ -346,10 +353,10 @@ def test_a_camera_on_a_lever_sees_no_parallax_but_that_of_the_collimation(conjug
 
 
 def glow_e_s(lab: Lab) -> np.ndarray:
-    lab_from_body = lab.trajectory.attitude_at(0.5)
-    camera_m = lab_from_body.apply(lab.camera.mount.camera_body_m)
-    cam_from_lab = lab.camera.mount.cam_from_body * lab_from_body.inv()
-    glow = display_glow.black_glow(lab.scene.light, lab.camera.optics, cam_from_lab, camera_m, lab.camera.band)
+    camera = lab.camera
+    camera_m = lab.start.apply(camera.mount.camera_body_m)
+    cam_from_lab = camera.mount.cam_from_body * lab.start.inv()
+    glow = display_glow.black_glow(lab.scene.light, camera.optics, cam_from_lab, camera_m, camera.band)
     assert glow is not None
     return glow
 
@@ -373,14 +380,16 @@ def test_a_black_panel_s_glow_is_that_of_all_its_pixels_by_the_contrast() -> Non
         "motion.start": "{roll_deg: 4, pitch_deg: -3, yaw_deg: 10}",
     }
     white = build_lab(loader.load("nps_tas2", changes))
-    seen = exposure.render_frame(white, 0)[1].sources
+    seen = still_frame(white)[1].sources
     assert len(seen.id) == 300
     gray = build_lab(loader.load("nps_tas2", changes | {"light.layout.contrast": "500"}))
     glow = glow_e_s(gray)
     assert glow.sum() == pytest.approx(seen.electrons.sum() / 0.1 / 500, rel=0.01)
     assert 0.05 < np.mean(glow > 0) < 0.2
     # And white is as bright as without: black and what is above it.
-    np.testing.assert_allclose(gray.sources.strength, white.sources.strength * (1 - 1 / 500), rtol=1e-12, atol=0)
+    np.testing.assert_allclose(
+        gray.camera.sources.strength, white.camera.sources.strength * (1 - 1 / 500), rtol=1e-12, atol=0
+    )
 
 
 def test_a_black_bench_s_glow_is_that_of_its_pixels_in_the_chip_s() -> None:
@@ -406,13 +415,13 @@ def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None
     silent = {"camera.detector.noise": "false"}
     plain = build_lab(loader.load("collimated_display", silent))
     glowing = build_lab(loader.load("collimated_display", silent | {"light.contrast": "200"}))
-    more = exposure.render_frame(glowing, 0)[0].image_dn - exposure.render_frame(plain, 0)[0].image_dn
+    more = still_frame(glowing)[0].image_dn - still_frame(plain)[0].image_dn
     gain, time_s = plain.scene.camera.detector.gain_e_dn, plain.scene.exposure.time_s
     wanted = np.median(glow_e_s(glowing)) * time_s / gain
     assert np.median(more) == pytest.approx(wanted, rel=0.01)
     assert (
         display_glow.black_glow(
-            plain.scene.light, plain.optics, star_sources.cam_from_icrs(0, 90, 0), np.zeros(3), BAND
+            plain.scene.light, plain.camera.optics, star_sources.cam_from_icrs(0, 90, 0), np.zeros(3), BAND
         )
         is None
     )

@@ -220,11 +220,12 @@ def test_a_sky_without_variable_stars_refuses_a_seed_of_them() -> None:
 
 def test_the_tracker_does_not_know_how_bright_a_variable_is() -> None:
     """The scene's stars shine as drawn; the tracker's catalog and the stars' places are as before."""
-    steady, varying = (build_lab(loader.load("shefex2", keys)) for keys in ({}, {"light.variability_seed": "1"}))
-    common = np.isin(varying.sources.id, steady.sources.id)
-    places = dict(zip(steady.sources.id.tolist(), steady.sources.place[:, :3].tolist(), strict=True))
-    assert [places[n] for n in varying.sources.id[common].tolist()] == varying.sources.place[common, :3].tolist()
-    assert np.sum(np.isin(steady.sources.strength, varying.sources.strength)) < len(steady.sources) - 3_000
+    labs = (build_lab(loader.load("shefex2", keys)) for keys in ({}, {"light.variability_seed": "1"}))
+    steady, varying = (lab.camera.sources for lab in labs)
+    common = np.isin(varying.id, steady.id)
+    places = dict(zip(steady.id.tolist(), steady.place[:, :3].tolist(), strict=True))
+    assert [places[n] for n in varying.id[common].tolist()] == varying.place[common, :3].tolist()
+    assert np.sum(np.isin(steady.strength, varying.strength)) < len(steady) - 3_000
 
 
 def test_colors_of_gaia_are_johnson_s() -> None:

@@ -14,7 +14,7 @@ from skysim.camera.glow.display_glow import black_glow
 from skysim.core.types import Floats, Sources
 from skysim.scene import loader
 from skysim.scene.sections.leds import AgingConfig, CosineLobeConfig, LedConfig, LobeTableConfig, WarmUpConfig
-from skysim.simulation.exposure import render_frame
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import build_lab
 from skysim.simulation.timing import exposure_window
 from skysim.sources.dome import sources
@@ -191,13 +191,13 @@ UNEVEN = "{hours: 9000, life_hours: 18000, scatter: 0.2}"
 def test_panels_age_as_one() -> None:
     """Their pixels, and the glow of the black ones."""
     keys = {"light.layout.contrast": "500"}
-    testbeds = [
-        build_lab(loader.load("nps_tas2", keys | more))
+    cameras = [
+        build_lab(loader.load("nps_tas2", keys | more)).camera
         for more in ({}, {"light.led.aging": "{hours: 9000, life_hours: 18000}"})
     ]
-    new, old = (lab.camera.sources.strength for lab in testbeds)
+    new, old = (camera.sources.strength for camera in cameras)
     np.testing.assert_allclose(old / new, math.sqrt(0.7), rtol=1e-12)
-    glows = [black_glow(one.scene.light, one.optics, Rotation.identity(), np.zeros(3), one.band) for one in testbeds]
+    glows = [black_glow(one.scene.light, one.optics, Rotation.identity(), np.zeros(3), one.band) for one in cameras]
     assert glows[0] is not None
     assert glows[0].max() > 0
     np.testing.assert_allclose(glows[1], math.sqrt(0.7) * glows[0], rtol=1e-12)
@@ -233,4 +233,4 @@ def test_all_light_of_the_leds_falls_while_they_warm_up(scene: str, keys: dict[s
 
 def still(scene: str, keys: dict[str, str], index: int) -> Floats:
     lab = build_lab(loader.load(scene, keys))
-    return render_frame(lab.at_rest(lab.start, index), index)[0].image_dn
+    return render_at_rest(lab.camera, lab.start, index)[0].image_dn

@@ -20,7 +20,7 @@ from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig, curve_file
 from skysim.scene.sections.leds import LedConfig
-from skysim.simulation.exposure import render_frame
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import build_lab
 from skysim.sources import catalog
 from skysim.sources.dome.led import color_factors, full_strength_e_s_sr
@@ -450,7 +450,7 @@ def test_a_gray_curve_gives_the_frame_of_its_number(scene: str, keys: dict[str, 
 
 def still_frame(scene: Scene) -> Floats:
     lab = build_lab(scene)
-    return render_frame(lab.at_rest(lab.start), 0)[0].image_dn
+    return render_at_rest(lab.camera, lab.start)[0].image_dn
 
 
 def test_a_lens_that_lets_nothing_to_the_chip_is_refused(tmp_path: Path) -> None:

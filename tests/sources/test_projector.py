@@ -140,19 +140,19 @@ def test_black_glows_as_all_pixels_by_the_contrast() -> None:
     """
     changes = {"light.layout.contrast": "500", "light.led.drive": "{kind: direct}", "light.led.lobe.exponent": "1"}
     lab = build_lab(loader.load("projected_dome", changes))
-    scene, lab_from_body = lab.scene, lab.trajectory.attitude_at(0.5)
+    scene, camera = lab.scene, lab.camera
     assert isinstance(scene.light, DomeConfig)
     assert isinstance(scene.light.layout, ProjectorConfig)
-    camera_m = lab_from_body.apply(lab.camera.mount.camera_body_m)
-    cam_from_lab = lab.camera.mount.cam_from_body * lab_from_body.inv()
-    glow = display_glow.black_glow(scene.light, lab.camera.optics, cam_from_lab, camera_m, lab.camera.band)
+    camera_m = lab.start.apply(camera.mount.camera_body_m)
+    cam_from_lab = camera.mount.cam_from_body * lab.start.inv()
+    glow = display_glow.black_glow(scene.light, camera.optics, cam_from_lab, camera_m, camera.band)
     assert glow is not None
     shell = surface.build_surface(scene.light.surface)
     axis = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
     place_m = shell.meet(camera_m, axis[None])
     per_m2 = projector.white_wall_per_m2(scene.light.layout, place_m, shell.inward(place_m))[0]
-    radiance = full_strength_e_s_sr(scene.light.led, lab.camera.band) * per_m2 / 500
-    etendue = lab.camera.optics.collecting_m2 * lab.camera.optics.throughput(np.ones(1))[0] / scene.camera.focal_px**2
+    radiance = full_strength_e_s_sr(scene.light.led, camera.band) * per_m2 / 500
+    etendue = camera.optics.collecting_m2 * camera.optics.throughput(np.ones(1))[0] / scene.camera.focal_px**2
     x, y = np.rint(scene.camera.center_px).astype(int)
     assert glow[y, x] == pytest.approx(radiance * etendue, rel=2e-3)
     spot = {
@@ -162,7 +162,7 @@ def test_black_glows_as_all_pixels_by_the_contrast() -> None:
     }
     narrow = build_lab(loader.load("projected_dome", changes | spot | {"light.layout.aim": "[0 m, 0 m, 1.2 m]"}))
     assert isinstance(narrow.scene.light, DomeConfig)
-    dark = display_glow.black_glow(narrow.scene.light, narrow.optics, cam_from_lab, camera_m, narrow.band)
+    dark = display_glow.black_glow(narrow.scene.light, narrow.camera.optics, cam_from_lab, camera_m, narrow.camera.band)
     assert dark is not None
     assert (dark == 0).any()
 

@@ -10,9 +10,8 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import loader as study_loader
-from skysim.experiments.study import store
 from skysim.experiments.study.analysis import search
-from skysim.experiments.study.execution import engines, runner
+from skysim.experiments.study.execution import engines, runner, store
 from skysim.scene import loader
 from skysim.scene.sections import light
 from skysim.scene.sections.light import DomeConfig, RoomConfig

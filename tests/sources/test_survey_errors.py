@@ -15,7 +15,7 @@ from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.scene.sections import light
 from skysim.scene.sections.tracker import SurveyErrorsConfig
-from skysim.simulation import exposure
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.sources.dome.shell import surface
 from skysim.sources.dome.shell.surface import Surface
@@ -164,7 +164,7 @@ def test_the_hardware_does_not_know_how_it_is_surveyed() -> None:
     frames = []
     for told in ("{}", ALL.format(lever="5 mm", seed=1)):
         lab = build_lab(loaded(tracker__survey=told, exposure=BARE_CAMERA["exposure"]))
-        frames.append(exposure.render_frame(lab, 0)[0].image_dn.tobytes())
+        frames.append(render_at_rest(lab.camera, lab.start)[0].image_dn.tobytes())
     assert frames[0] == frames[1]
 
 
@@ -179,7 +179,7 @@ def test_a_pupil_believed_aside_turns_the_attitude_by_its_shift_over_the_led_s_d
     """
     told = f"{{lever_sigma: 2 mm, seed: {seed}}}"
     eyes, lab = believing(tracker__survey=told, motion__start="{roll_deg: 7}", **BARE_CAMERA)
-    frame, truth = exposure.render_frame(lab, 0)
+    frame, truth = render_at_rest(lab.camera, lab.start)
     answer = factory.solve_frame(eyes, frame).attitude
     assert answer.status == "solved"
     assert answer.cam_from_ref is not None

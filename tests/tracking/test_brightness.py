@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.scene import loader
-from skysim.simulation.exposure import render_frame
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import build_lab, build_tracker
 from skysim.tracking.factory import solve_frame
 
@@ -28,13 +28,13 @@ def test_measured_fluxes_scatter_about_the_expected_ones_as_leds_do(drive: dict[
     """By 8 % from LED to LED, as the scene has it, and little more; and every attitude of the spiral is found."""
     lab = build_lab(loader.load("coded_spiral", LEVELS | drive))
     tracker, ratios = build_tracker(lab.camera), []
-    for frame in range(6):
-        tilt = Rotation.from_euler("zyx", [60 * frame, 4 * frame, -3 * frame], degrees=True)
-        rendered, truth = render_frame(lab.at_rest(tilt, frame), frame)
-        report = solve_frame(tracker, rendered)
+    for index in range(6):
+        tilt = Rotation.from_euler("zyx", [60 * index, 4 * index, -3 * index], degrees=True)
+        frame, truth = render_at_rest(lab.camera, tilt, index)
+        report = solve_frame(tracker, frame)
         assert report.attitude.solved
         match = report.attitude.match
-        flux_s = report.centroids.flux[match.observed] / rendered.exposure_s
+        flux_s = report.centroids.flux[match.observed] / frame.exposure_s
         ratios += np.log(flux_s / tracker.leds.flux_s[match.star]).tolist()
         assert set(tracker.leds.id[match.star]) <= set(truth.sources.id)
     assert len(ratios) > 60

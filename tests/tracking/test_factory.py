@@ -17,10 +17,10 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats, Frame, Telemetry
 from skysim.dynamics import imu, multibody
 from skysim.scene import loader
-from skysim.simulation import run
 from skysim.simulation.checks import check
 from skysim.simulation.checks.dome import assumptions
-from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.flight import Flight, simulate_motion
+from skysim.simulation.lab import build_lab, build_tracker
 from skysim.tracking import exposure_control
 from skysim.tracking.exposure_control import ExposureController
 from skysim.tracking.navigation import Navigation, build_filter
@@ -35,17 +35,18 @@ SINGLE = {"tracker.detector": "default", "tracker.min_area_px": "1"}
 NO_CONTROL = {"motion.control": "none", "motion.maneuver": "[]", "vehicle.center_of_mass": "[0 m, 0 m, 0 m]"}
 
 
-def flown(until_s: float, **changes: str) -> Lab:
+def flown(until_s: float, **changes: str) -> Flight:
     """SimSat, balanced and left alone unless the changes say otherwise."""
     until = {"exposure": f"{{time: 10 ms, rate_hz: 1, frames: 1, first: {until_s} s}}"}
     given = NO_CONTROL | until | {key.replace("__", "."): value for key, value in changes.items()}
-    return run.prepare(loader.load("afit_simsat", given))
+    return simulate_motion(loader.load("afit_simsat", given))
 
 
-def told(lab: Lab) -> Telemetry:
-    assert lab.telemetry is not None
-    assert lab.telemetry.lab_from_imu is not None
-    return lab.telemetry
+def telemetry_of(flight: Flight) -> Telemetry:
+    """Of a flight with an IMU."""
+    telemetry = flight.telemetry()
+    assert telemetry.lab_from_imu is not None
+    return telemetry
 
 
 def error(telemetry: Telemetry) -> Floats:
@@ -59,7 +60,7 @@ def error(telemetry: Telemetry) -> Floats:
 
 def test_a_perfect_navigator_follows_a_turning_vehicle() -> None:
     """At 30 deg/s about an axis that stands still, to 1e-5 arcsec after five seconds."""
-    telemetry = told(flown(5.0, vehicle__imu=f"{{{PERFECT}}}", motion__rate_deg_s="[0, 0, 30]"))
+    telemetry = telemetry_of(flown(5.0, vehicle__imu=f"{{{PERFECT}}}", motion__rate_deg_s="[0, 0, 30]"))
     assert np.abs(error(telemetry)).max() < 1e-5 * ARCSEC
     assert telemetry.saturated is not None
     assert not telemetry.saturated.any()
@@ -67,8 +68,8 @@ def test_a_perfect_navigator_follows_a_turning_vehicle() -> None:
 
 def test_a_moving_axis_costs_the_navigator_the_coning_within_its_samples() -> None:
     """An increment is no rotation vector, but short of one by w x dw/dt T^3 / 12 in every T: 0.02 arcsec here."""
-    lab = flown(5.0, vehicle__imu=f"{{{PERFECT}, rate_hz: 100}}", motion__rate_deg_s=TUMBLE)
-    telemetry, step_s = told(lab), 1 / 100
+    flight = flown(5.0, vehicle__imu=f"{{{PERFECT}, rate_hz: 100}}", motion__rate_deg_s=TUMBLE)
+    telemetry, step_s = telemetry_of(flight), 1 / 100
     rate = telemetry.rate_body_rad_s
     cone = np.cross(rate, np.gradient(rate, telemetry.t_s, axis=0)) * step_s**2 / 12
     lost = telemetry.lab_from_body.apply(cone)[:-1].sum(axis=0) * 0.01
@@ -79,23 +80,23 @@ def test_a_moving_axis_costs_the_navigator_the_coning_within_its_samples() -> No
 
 def test_uncompensated_earth_rate_makes_the_navigator_drift_by_15_deg_an_hour() -> None:
     """About the Earth's axis in the lab, however the vehicle turns: lab_from_imu = exp(W t) lab_from_body."""
-    lab = flown(5.0, vehicle__imu=f"{{{PERFECT}, earth_rate: uncompensated}}", motion__rate_deg_s="[0, 0, 30]")
-    telemetry = told(lab)
+    flight = flown(5.0, vehicle__imu=f"{{{PERFECT}, earth_rate: uncompensated}}", motion__rate_deg_s="[0, 0, 30]")
+    telemetry = telemetry_of(flight)
     drift = error(telemetry)[-1] / telemetry.t_s[-1]
     assert np.degrees(np.linalg.norm(drift)) * 3600 == pytest.approx(15.041, abs=1e-3)
-    np.testing.assert_allclose(drift, imu.earth_rate_lab_rad_s(lab.scene.site), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(drift, imu.earth_rate_lab_rad_s(flight.lab.scene.site), rtol=0, atol=1e-9)
 
 
 def test_compensated_earth_rate_is_taken_away_again() -> None:
-    lab = flown(5.0, vehicle__imu=f"{{{PERFECT}, earth_rate: compensated}}", motion__rate_deg_s="[0, 0, 30]")
-    assert np.abs(error(told(lab))).max() < 1e-4 * ARCSEC
+    flight = flown(5.0, vehicle__imu=f"{{{PERFECT}, earth_rate: compensated}}", motion__rate_deg_s="[0, 0, 30]")
+    assert np.abs(error(telemetry_of(flight))).max() < 1e-4 * ARCSEC
 
 
 def test_the_bias_that_is_told_is_what_the_gyros_show_too_much() -> None:
     """Turn-on bias and an Earth nobody takes away: minus the mean rate of the navigator's drift in body axes."""
     unit = "{gyro: {arw_deg_sqrt_h: 0, bias_deg_h: 0, turn_on_bias_deg_h: 30, scale_ppm: 0, quantum_arcsec: 0,"
     unit += " misalignment_arcsec: 0}, earth_rate: uncompensated}"
-    telemetry = told(flown(5.0, vehicle__imu=unit, motion__start="{roll_deg: 20, yaw_deg: 70}"))
+    telemetry = telemetry_of(flown(5.0, vehicle__imu=unit, motion__start="{roll_deg: 20, yaw_deg: 70}"))
     assert telemetry.lab_from_imu is not None
     assert telemetry.bias_rad_s is not None
     drift = (telemetry.lab_from_body.inv() * telemetry.lab_from_imu).as_rotvec()[-1] / telemetry.t_s[-1]
@@ -107,7 +108,7 @@ def test_a_wrong_home_stays_in_the_navigator() -> None:
     """Zeroed while the vehicle stood wrong by (roll, pitch, yaw): its Euler angles are short of it by that."""
     home = "home_error_deg: [0.5, -1.0, 2.0]"
     start = "{roll_deg: 5, pitch_deg: 10, yaw_deg: -40}"
-    telemetry = told(flown(1.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__start=start))
+    telemetry = telemetry_of(flown(1.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__start=start))
     assert telemetry.lab_from_imu is not None
     believed = telemetry.lab_from_imu.as_euler("ZYX", degrees=True)[:, ::-1]
     np.testing.assert_allclose(believed, np.tile([4.5, 11.0, -42.0], (len(believed), 1)), rtol=0, atol=1e-8)
@@ -117,15 +118,15 @@ def test_a_wrong_home_stays_in_the_navigator() -> None:
 def test_steered_by_the_imu_the_vehicle_goes_where_the_navigator_is_wrong() -> None:
     """The navigator is brought to the reference, (0, 0, 0), so the vehicle stands off by the home's error."""
     home = "home_error_deg: [0.5, -1.0, 2.0]"
-    lab = flown(12.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__control="{feedback: imu}")
-    telemetry = told(lab)
+    flight = flown(12.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__control="{feedback: imu}")
+    telemetry = telemetry_of(flight)
     assert telemetry.lab_from_imu is not None
     start = np.degrees(telemetry.lab_from_body[0].magnitude())
     assert start < 1e-12
     assert np.degrees(telemetry.lab_from_imu[-1].magnitude()) < 1e-3
     wrong = Rotation.from_euler("ZYX", [-2.0, 1.0, -0.5], degrees=True)
     assert np.degrees((telemetry.lab_from_body[-1] * wrong).magnitude()) < 1e-3
-    ideal = told(flown(12.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__control="pid"))
+    ideal = telemetry_of(flown(12.0, vehicle__imu=f"{{{PERFECT}, {home}}}", motion__control="pid"))
     assert np.degrees(ideal.lab_from_body[-1].magnitude()) < 1e-12  # truth is not led astray
 
 
@@ -135,10 +136,10 @@ def test_steered_by_the_imu_the_vehicle_goes_where_the_navigator_is_wrong() -> N
 def test_the_imu_feels_the_vibration() -> None:
     """The navigator adds up the shaken vehicle's rates: it is where that is, seen from where it was zeroed."""
     shake = "[{kind: line, frequency_hz: 20, rms_arcsec: [200, 0, 0]}]"
-    lab = flown(2.0, vehicle__imu=f"{{{PERFECT}}}", motion__jitter=shake)
-    telemetry = told(lab)
+    flight = flown(2.0, vehicle__imu=f"{{{PERFECT}}}", motion__jitter=shake)
+    telemetry = telemetry_of(flight)
     assert telemetry.lab_from_imu is not None
-    shaken = lab.trajectory.attitude_at(telemetry.t_s)
+    shaken = flight.trajectory().attitude_at(telemetry.t_s)
     expected = telemetry.lab_from_body[0] * shaken[0].inv() * shaken
     found = (expected.inv() * telemetry.lab_from_imu).as_rotvec()
     assert np.abs(found).max() < 0.01 * ARCSEC
@@ -151,8 +152,8 @@ def test_the_imu_feels_the_vibration() -> None:
 def test_tick_by_tick_it_feels_the_whole_flight(rate_hz: int) -> None:
     """The samples of all ticks together are those of the whole flight at once: as many, and their sum to 1e-9 rad."""
     place = np.array([0.1, 0.1, 0.14])
-    lab = flown(1.2345, vehicle__imu=f"{{{PERFECT}, rate_hz: {rate_hz}}}", motion__rate_deg_s=TUMBLE, seed="3")
-    telemetry, knots = told(lab), lab.trajectory
+    flight = flown(1.2345, vehicle__imu=f"{{{PERFECT}, rate_hz: {rate_hz}}}", motion__rate_deg_s=TUMBLE, seed="3")
+    telemetry, knots = telemetry_of(flight), flight.trajectory()
     last_s = telemetry.t_s[-1]
     ends_s = np.arange(1, round(last_s * rate_hz) + 1) / rate_hz
     whole = imu.ideal_increments(
@@ -162,7 +163,7 @@ def test_tick_by_tick_it_feels_the_whole_flight(rate_hz: int) -> None:
         ends_s,
         1 / rate_hz,
         place,
-        lab.vehicle.gravity_m_s2,
+        flight.lab.vehicle.gravity_m_s2,
     )
     at_once = imu.Navigator(knots.lab_from_body[0].as_quat(scalar_first=True))
     at_once.add(whole)
@@ -173,10 +174,11 @@ def test_tick_by_tick_it_feels_the_whole_flight(rate_hz: int) -> None:
 
 def test_samples_that_do_not_end_with_a_tick_are_not_lost() -> None:
     """Knots of 1 ms felt 7 ms at a time by a unit of 400 Hz: now two, now three samples, none twice."""
-    lab = flown(0.1, vehicle__imu=f"{{{PERFECT}}}", motion__rate_deg_s="[0, 0, 30]")
+    flight = flown(0.1, vehicle__imu=f"{{{PERFECT}}}", motion__rate_deg_s="[0, 0, 30]")
+    lab = flight.lab
     there = [lab.camera.mount], lab.start, np.zeros(3), 9.8, np.random.default_rng(1)
     navigation = Navigation(lab.scene, *there)
-    knots, counts = lab.trajectory, []
+    knots, counts = flight.trajectory(), []
     for end in range(7, 100, 7):
         begin = max(end - 10, 0)
         piece = slice(begin, end + 1)
@@ -194,7 +196,7 @@ def test_samples_that_do_not_end_with_a_tick_are_not_lost() -> None:
 def test_a_turn_beyond_the_gyros_limit_is_missing_for_good() -> None:
     """25 deg/s on gyros that stop at 10: two seconds lose 30 deg."""
     limited = PERFECT.replace("{arw", "{rate_limit_deg_s: 10, arw")
-    telemetry = told(flown(2.0, vehicle__imu=f"{{{limited}}}", motion__rate_deg_s="[0, 0, 25]"))
+    telemetry = telemetry_of(flown(2.0, vehicle__imu=f"{{{limited}}}", motion__rate_deg_s="[0, 0, 25]"))
     assert telemetry.saturated is not None
     assert telemetry.saturated[1:].all()
     lost = np.degrees(error(telemetry)[-1])

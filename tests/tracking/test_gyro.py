@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from skysim.simulation.run import live, prepare, render_frames, run
 
 from skysim.core.errors import InputError
 from skysim.scene.loader import load
-from skysim.simulation.lab import build_lab, build_tracker
+from skysim.simulation.flight import open_flight, simulate_motion
 from skysim.simulation.timing import exposure_window
 from skysim.tracking.gyro import latest, rate_of_frame, sigma_rad_s
 
@@ -26,29 +25,35 @@ FLIGHT = {
 @pytest.mark.parametrize("gyro", [False, True])
 def test_the_tracker_of_a_flight_gets_the_gyro_s_rate(gyro: bool) -> None:
     """An LN-200 tells the rate to a few seconds of arc a second; the frame alone to some hundred."""
-    lab = prepare(load("shefex2", FLIGHT | {"tracker.gyro": str(gyro).lower()}))
+    flight = open_flight(load("shefex2", FLIGHT | {"tracker.gyro": str(gyro).lower()}))
     sigma, error = [], []
-    for result in run(lab, build_tracker(lab.camera)):
-        rate = result.report.attitude.rate
+    for shot in flight.shots():
+        rate = shot.report.attitude.rate
         assert rate is not None
         sigma.append(np.degrees(np.sqrt(np.trace(rate.covariance_rad2_s2))))
-        error.append(np.degrees(np.linalg.norm(rate.rate_rad_s - result.truth.rate_cam_rad_s)))
+        error.append(np.degrees(np.linalg.norm(rate.rate_rad_s - shot.truth.rate_cam_rad_s)))
     assert (max(sigma) < 0.01) == gyro
     assert np.max(error) < 4 * np.max(sigma)
 
 
 @pytest.mark.slow
-def test_frames_during_the_motion_get_the_same_rate() -> None:
+def test_the_rate_of_a_frame_is_that_of_the_samples_of_the_whole_flight() -> None:
+    """What the frame gets when it is due needs none that come later; nor those that a flight forgets."""
     scene = load("shefex2", FLIGHT | {"tracker.gyro": "true"})
-    lab = build_lab(scene)
-    during = [one.report for one in live(lab, build_tracker(lab.camera)) if one.report]
-    flown = prepare(scene)
-    after = [one.report for one in run(flown, build_tracker(flown))]
-    assert len(during) == len(after) == 4
-    for one, other in zip(during, after, strict=True):
-        assert one.attitude.rate is not None
-        assert other.attitude.rate is not None
-        np.testing.assert_allclose(one.attitude.rate.rate_rad_s, other.attitude.rate.rate_rad_s, rtol=0, atol=1e-9)
+    flight = open_flight(scene)
+    shots = list(flight.shots())
+    forgetful = list(open_flight(scene, keeps_history=False).shots())
+    samples, mount = flight.imu_samples(), flight.lab.camera.mount
+    assert samples is not None
+    assert scene.vehicle.imu is not None
+    assert len(shots) == len(forgetful) == 4
+    for shot, other in zip(shots, forgetful, strict=True):
+        window = exposure_window(scene, shot.frame.index)
+        after = rate_of_frame(samples, window, scene.camera.height_px, scene.vehicle.imu, mount)
+        rates = [shot.rate, other.rate, after]
+        np.testing.assert_allclose(np.ptp([rate.rate_rad_s for rate in rates], axis=0), 0, rtol=0, atol=1e-9)
+        solved = [one.report.attitude.rate.rate_rad_s for one in (shot, other)]
+        np.testing.assert_allclose(solved[0], solved[1], rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -56,27 +61,27 @@ def test_the_rate_is_honest_and_none_if_saturated() -> None:
     """Its error over the units of production: squared, over the claim, 3 in the mean (biases and noise are normal)."""
     nees = []
     for unit in range(40):
-        lab = prepare(load("shefex2", FLIGHT | {"vehicle.imu": f"{{hardware_seed: {unit}}}", "seed": str(unit)}))
-        config, samples = lab.scene.vehicle.imu, lab.imu_samples
+        scene = load("shefex2", FLIGHT | {"vehicle.imu": f"{{hardware_seed: {unit}}}", "seed": str(unit)})
+        flight = simulate_motion(scene)
+        config, samples, mount = scene.vehicle.imu, flight.imu_samples(), flight.lab.camera.mount
         assert config is not None
         assert samples is not None
-        _, truth, _ = next(iter(render_frames(lab)))
-        window = exposure_window(lab.scene, 0)
-        rate = rate_of_frame(samples, window, 493, config, lab.camera.mount)
+        _, truth = flight.render(0)
+        window = exposure_window(scene, 0)
+        rate = rate_of_frame(samples, window, 493, config, mount)
         assert rate is not None
         error = rate.rate_rad_s - truth.rate_cam_rad_s
         nees.append(error @ np.linalg.solve(rate.covariance_rad2_s2, error))
     assert 1.5 < np.mean(nees) < 4.5
     full = replace(samples, saturated=samples.saturated | (abs(samples.t_s - 0.12) < 0.01))
-    assert rate_of_frame(full, window, 493, config, lab.camera.mount) is None
-    assert rate_of_frame(full, exposure_window(lab.scene, 2), 493, config, lab.camera.mount) is not None
-    assert rate_of_frame(samples, window._replace(open_s=99.0), 493, config, lab.camera.mount) is None
+    assert rate_of_frame(full, window, 493, config, mount) is None
+    assert rate_of_frame(full, exposure_window(scene, 2), 493, config, mount) is not None
+    assert rate_of_frame(samples, window._replace(open_s=99.0), 493, config, mount) is None
     assert sigma_rad_s(config, 1.0, 0.05) > sigma_rad_s(config, 0.0, 0.05) > sigma_rad_s(config, 0.0, 5.0)
 
 
 def test_old_samples_are_dropped() -> None:
-    lab = prepare(load("shefex2", FLIGHT))
-    samples = lab.imu_samples
+    samples = simulate_motion(load("shefex2", FLIGHT)).imu_samples()
     assert samples is not None
     pieces = [replace(samples, t_s=np.array([t_s])) for t_s in (0.0, 0.5, 1.0)]
     assert latest(pieces, 0.6) == pieces[1:]

@@ -27,12 +27,11 @@ from skysim.core.paths import ROOT
 from skysim.core.plugins.program import ProgramError
 from skysim.experiments import tracker_comparison
 from skysim.experiments.study import loader as study_loader
-from skysim.experiments.study import store
-from skysim.experiments.study.execution import runner, setups
+from skysim.experiments.study.execution import runner, setups, store
 from skysim.experiments.study.execution.engines import Serial
 from skysim.results import metrics
 from skysim.scene import loader
-from skysim.simulation import run
+from skysim.simulation.flight import Flight, open_flight
 from skysim.simulation.lab import build_lab
 from skysim.sources import stars
 from skysim.tracking.external import interface, process
@@ -290,12 +289,12 @@ def test_a_trial_of_another_release_of_a_tracker_is_another(installed: None, tmp
 def test_a_package_s_tracker_is_scored_by_the_error_that_it_makes(installed: None) -> None:
     """36 arcsec across in frame 0; raised in 1; in 2 a roll of 0.2 deg as well, which is wrong."""
     told = loader.load("shefex2", {"exposure.frames": "3"})
-    lab = run.prepare(told)
-    truths = [truth.cam_from_lab for _, truth, _ in run.render_frames(lab)]
+    truths = [shot.truth.cam_from_lab for shot in open_flight(told).shots(solves=False)]
     options = {f"q{n}_{i}": float(x) for n, t in enumerate(truths) for i, x in enumerate(t.as_quat())}
     config = told.tracker.model_copy(update={"name": "offset", "options": options | {"roll_deg": 0.2}})
-    lab = replace(lab, scene=told.model_copy(update={"tracker": config}))
-    shots = tracker_comparison.compare_frames(lab, tracker_comparison.build_trackers(lab, ["offset", "own"]))
+    lab = build_lab(told.model_copy(update={"tracker": config}))
+    trackers = tracker_comparison.build_trackers(lab, ["offset", "own"], {})
+    shots = tracker_comparison.compare_frames(Flight(lab), trackers)
     both = [answers for _, _, answers in shots]
     rows, own = [answers["offset"] for answers in both], [answers["own"] for answers in both]
     assert [(row.status, row.wrong, row.matched > 5) for row in own] == [("solved", False, True)] * 3

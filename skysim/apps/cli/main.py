@@ -10,7 +10,6 @@ from typing import Annotated
 import typer
 
 from estimator.core.errors import ImageError
-from skysim import __version__
 from skysim.apps.cli.commands.availability import availability
 from skysim.apps.cli.commands.camera import app as cameras
 from skysim.apps.cli.commands.files import catalog_app, export, scenes_app
@@ -29,7 +28,7 @@ from skysim.apps.cli.commands.validate import check, validate
 from skysim.apps.cli.examples import add_examples
 from skysim.apps.cli.option_names import as_typed
 from skysim.apps.cli.terminal import print_error
-from skysim.core import errors
+from skysim.core import __version__, errors
 from skysim.core.errors import InputError
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)

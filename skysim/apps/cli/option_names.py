@@ -75,3 +75,9 @@ def option_of(key: str) -> str:
         return OPTIONS[key]
     parameter, _, item = key.partition(".")
     return f"{OPTIONS[parameter]} {item}" if item and parameter in OPTIONS else key
+
+
+def with_location(finding: str, loaded: Loaded | None = None) -> str:
+    """A finding, `key: text`, with file and line of the key in a loaded scene, by default the last one."""
+    key, _, text = finding.partition(": ")
+    return str(as_typed(InputError(key, text), loaded)) if text else finding

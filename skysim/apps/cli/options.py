@@ -78,7 +78,7 @@ def load(
         for one of them
     """
     from skysim.core.io.yaml_reader import parse_overrides
-    from skysim.scene.keys import unused
+    from skysim.scene import unused
     from skysim.scene.loader import load as load_scene
 
     TYPED.clear()
@@ -150,11 +150,3 @@ def datetime_from_iso(text: str | None) -> datetime.datetime | None:
         return datetime.datetime.fromisoformat(text)
     except ValueError:
         raise InputError(f"--time {text}", "", "ISO 8601, e.g. 2012-06-22T21:00:00") from None
-
-
-def with_location(finding: str, loaded: Loaded | None = None) -> str:
-    """A finding, `key: text`, with file and line of the key in a loaded scene, by default the last one."""
-    from skysim.apps.cli.option_names import as_typed
-
-    key, _, text = finding.partition(": ")
-    return str(as_typed(InputError(key, text), loaded)) if text else finding

@@ -22,10 +22,9 @@ from starlette.responses import FileResponse, PlainTextResponse, RedirectRespons
 from starlette.routing import Route, Router
 
 from skysim.apps.gui import memory
-from skysim.apps.gui.page.frame.sensor import FRAMES
-from skysim.apps.gui.page.frame.served import display_of
-from skysim.apps.gui.page.page import Tab
-from skysim.apps.gui.page.panels.photo import LIMIT_BYTES
+from skysim.apps.gui.page.tab import Tab
+from skysim.apps.gui.panels.photo import LIMIT_BYTES
+from skysim.apps.gui.views.served import FRAMES, display_of
 from skysim.apps.gui.worker.session import Workers
 from skysim.apps.gui.worker.study_process import StudyProcess, is_shown
 from skysim.core.constants import DAY_S
@@ -45,11 +44,14 @@ SECURITY_HEADERS = {"x-frame-options": "DENY", "x-content-type-options": "nosnif
 # Noise is not compressible: gzip at its default level takes half a second for a frame.
 FRAME_HEADERS = {"cache-control": "no-store", "content-encoding": "identity"}
 FILES = f"/_nicegui/{nicegui.__version__}"
-USER, USER_BYTES, YEAR_S = "skysim_user", 8, 365 * int(DAY_S)  # cookie with the number of a browser
+USER = "skysim_user"  # cookie with the number of a browser
+USER_BYTES = 8
+YEAR_S = 365 * int(DAY_S)
 QUEUED = "This page opens when another one has been closed."
 CONNECT_TIMEOUT_S = 50.0  # for a browser to load the page
 RECONNECT_S = 6.0  # for a lost browser to reconnect, before its work ends
-PING_INTERVAL_S, PING_TIMEOUT_S = 5.0, 30.0  # of the connection; a busy machine answers late
+PING_INTERVAL_S = 5.0  # of the connection
+PING_TIMEOUT_S = 30.0  # a busy machine answers late
 
 
 async def frame(request: Request) -> Response:
@@ -57,9 +59,10 @@ async def frame(request: Request) -> Response:
 
     Query: see `display_of`, and `whole`: whether all pixels are needed
     """
-    frames, query = FRAMES.get(request.path_params["tab"]), request.query_params
-    served, display = frames and frames.newest.get(request.path_params["number"]), display_of(query)
-    data = await served.response(display, "whole" in query) if served and display else None
+    frames = FRAMES.get(request.path_params["tab"])
+    served = frames and frames.newest.get(request.path_params["number"])
+    display = display_of(request.query_params)
+    data = await served.response(display, "whole" in request.query_params) if served and display else None
     if data is None:
         return Response(status_code=404)
     return Response(data, media_type="application/octet-stream", headers=FRAME_HEADERS)
@@ -67,7 +70,8 @@ async def frame(request: Request) -> Response:
 
 async def stream(request: Request) -> Response:
     """The next frames of a tab, see `TabFrames.stream`; 404 if there is no such tab. Query: see `display_of`"""
-    frames, display = FRAMES.get(request.path_params["tab"]), display_of(request.query_params)
+    frames = FRAMES.get(request.path_params["tab"])
+    display = display_of(request.query_params)
     if not frames or not display:
         return Response(status_code=404)
     return StreamingResponse(frames.stream(display), media_type="application/octet-stream", headers=FRAME_HEADERS)
@@ -93,7 +97,8 @@ class KeptFiles:
             await self.app(scope, receive, send)
             return
         encodings = dict(scope["headers"]).get(b"accept-encoding", b"")
-        key, messages = (scope["path"], b"gzip" in encodings), list[dict[str, Any]]()
+        key = (scope["path"], b"gzip" in encodings)
+        messages: list[dict[str, Any]] = []
 
         async def keep(message: dict[str, Any]) -> None:
             messages.append(dict(message))  # a copy, since layers further out add headers
@@ -127,7 +132,10 @@ class Guard:
     """
 
     def __init__(self, app: Any, hosts: tuple[str, ...], token: str, port: int) -> None:
-        self.app, self.hosts, self.token, self.cookie = KeptFiles(app), hosts, token, f"skysim_gui_{port}"
+        self.app = KeptFiles(app)
+        self.hosts = hosts
+        self.token = token
+        self.cookie = f"skysim_gui_{port}"
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -145,7 +153,8 @@ class Guard:
     def refusal(self, request: HTTPConnection) -> Response | None:
         """The response to a refused request; None if it is allowed."""
         headers = request.headers
-        host, origin = headers.get("host", ""), headers.get("origin", "")
+        host = headers.get("host", "")
+        origin = headers.get("origin", "")
         if "*" not in self.hosts and host_of(host) not in self.hosts:
             return PlainTextResponse("host name not allowed", 403)
         if origin and origin.partition("://")[2] != host:
@@ -220,7 +229,8 @@ def report_path(out: Path, name: str, user: str = "") -> Path | None:
 
 def be_patient() -> None:
     """Let a connection live although its browser answers late; NiceGUI takes both times from the reconnect time."""
-    core.sio.eio.ping_interval, core.sio.eio.ping_timeout = PING_INTERVAL_S, PING_TIMEOUT_S
+    core.sio.eio.ping_interval = PING_INTERVAL_S
+    core.sio.eio.ping_timeout = PING_TIMEOUT_S
 
 
 def stop_studies() -> None:
@@ -237,7 +247,8 @@ async def close(tab: Tab, closed_pages: memory.ClosedPages) -> None:
 
 def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers: int) -> None:
     """Register all routes, and prepare the workers of tabs."""
-    pool, closed_pages = Workers(workers), memory.ClosedPages()
+    pool = Workers(workers)
+    closed_pages = memory.ClosedPages()
     app.on_startup(be_patient)
     app.on_startup(memory.freeze)
     app.on_startup(partial(pool.prepare, str(find(scene).resolve())))
@@ -265,8 +276,7 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
         session = await pool.wait(lambda: tab.is_open, lambda text: tab.sensor.show_waiting(text, QUEUED))
         if session is None:  # the tab was closed while it waited
             return
-        tab.session, tab.new_session = session, pool.take
-        await tab.start()
+        await tab.start(session, pool.take)
 
 
 def serve(

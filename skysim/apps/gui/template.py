@@ -37,7 +37,8 @@ def make_worker() -> Worker:
     from skysim.core.errors import InputError
 
     cv2.setNumThreads(1)
-    worker, scene = Worker(), os.environ.get(SCENE)
+    worker = Worker()
+    scene = os.environ.get(SCENE)
     if scene:
         with suppress(InputError):
             worker.warm_up(scene)

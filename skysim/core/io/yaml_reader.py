@@ -21,7 +21,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from skysim import __version__
+from skysim.core import __version__
 from skysim.core.errors import OVERRIDES, InputError, Where, printable, unknown_name
 
 Files = list[tuple[Path, str]]  # paths and texts

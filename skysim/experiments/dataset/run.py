@@ -14,7 +14,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from skysim import __version__
+from skysim.core import __version__
 from skysim.core.errors import InputError
 from skysim.experiments.dataset import shards
 from skysim.experiments.dataset.labels import LabelledFrame, label_frame, labeller

@@ -16,9 +16,8 @@ from skysim.core.io.files import make_folder, write_text
 from skysim.core.io.yaml_reader import parse_yaml
 from skysim.core.types import Floats
 from skysim.experiments.datasheet.cells import FULL, QUICK, Cell, Designer, Size, check_scene
-from skysim.experiments.study import store
 from skysim.experiments.study.designs import Point
-from skysim.experiments.study.execution import runner
+from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.plan import Plan, Study, TrialSpec, make_plan
 from skysim.scene.scene import Scene
 

@@ -102,7 +102,7 @@ def check(plan: Plan, to_run: bool) -> None:
     to_run : whether the trackers and controllers must be installed
     """
     from skysim.experiments.study.analysis import cost, search
-    from skysim.experiments.study.store import COLUMNS
+    from skysim.experiments.study.execution.store import COLUMNS
 
     study = plan.study
     for n, name in enumerate(study.responses):

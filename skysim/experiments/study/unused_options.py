@@ -1,7 +1,7 @@
 """Refuse options of a study that have no effect: keys of `set`, `trial` and factors.
 
 A key is refused if it has no effect at any level of any factor, each factor varied alone. The rules of scenes
-(`scene.keys.unused`) hold, and those below for the kinds of trial. `exposure.rate_hz` is always tolerated, because it
+(`scene.unused`) hold, and those below for the kinds of trial. `exposure.rate_hz` is always tolerated, because it
 bounds the exposure time.
 """
 
@@ -21,12 +21,12 @@ from skysim.experiments.study.plan import (
     Trial,
     TrialSection,
 )
-from skysim.scene.keys import unused
-from skysim.scene.keys.unused import Rule
+from skysim.scene import unused
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig
 from skysim.scene.sections.layouts import CelestialConfig, OnPoints
 from skysim.scene.sections.light import DomeConfig, StarsConfig
+from skysim.scene.unused import Rule
 from skysim.tracking import settings
 
 STREAK_ALGORITHMS = ("default", "streak")  # detectors and centroiders that use the streak measured by a gyro

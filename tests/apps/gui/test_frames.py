@@ -19,11 +19,10 @@ import httpx
 from astropy.io import fits
 
 from skysim.apps.gui.messages import ALL_PIXELS, LIMITS, Display, Lights, Pixels
-from skysim.apps.gui.page.frame import served as served_module
-from skysim.apps.gui.page.frame.live import Contents
-from skysim.apps.gui.page.frame.sensor import FRAMES
-from skysim.apps.gui.page.frame.served import KEPT_FRAMES, ServedFrame, TabFrames, display_of
 from skysim.apps.gui.server import Guard
+from skysim.apps.gui.shared.live import Contents
+from skysim.apps.gui.views import served as served_module
+from skysim.apps.gui.views.served import FRAMES, KEPT_FRAMES, ServedFrame, TabFrames, display_of
 from skysim.apps.gui.worker.pixels import (
     BINS,
     HEADER_BYTES,

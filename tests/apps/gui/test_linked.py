@@ -29,7 +29,7 @@ from labpage import (
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from skysim.apps.gui.messages import Detection, Lights, MotionLog, TrackerResult
-from skysim.apps.gui.page.panels import lights, strips
+from skysim.apps.gui.panels import lights, strips
 from skysim.apps.gui.worker import playback
 from skysim.apps.gui.worker.scene import geometry
 from skysim.scene import loader

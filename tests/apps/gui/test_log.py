@@ -13,9 +13,9 @@ from labpage import CHROMIUM, angles, changed, exported, onto_the_page, panel, s
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.page import forms
-from skysim.apps.gui.page.shell import log
-from skysim.apps.gui.page.shell.csv_table import csv_table
+from skysim.apps.gui.page import log
+from skysim.apps.gui.shared import forms
+from skysim.apps.gui.shared.csv_table import csv_table
 from skysim.apps.gui.worker.tasks import Worker
 from skysim.core.errors import InputError
 from skysim.scene import loader

@@ -15,7 +15,7 @@ from nicegui import core
 from nicegui.client import Client
 from nicegui.page import page
 
-from skysim.apps.gui.page.page import Tab
+from skysim.apps.gui.page.tab import Tab
 
 
 class Hand:

@@ -280,7 +280,7 @@ def test_colors_and_the_grid_are_drawn(page: Any) -> None:
     page.get_by_role("checkbox", name="grid").click()
 
 
-NAMES = """async ([names, size]) => { const { drawNames } = await import("skysim-frame/marks.js");
+NAMES = """async ([names, size]) => { const { drawNames } = await import("skysim-views/marks.js");
   const boxes = [], pen = { fillRect: (...box) => boxes.push(box), fillText() {} };
   drawNames(pen, names, (x, y) => [x, y], size, "#fff");
   return boxes; }"""

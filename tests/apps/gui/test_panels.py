@@ -22,12 +22,12 @@ from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui import memory
 from skysim.apps.gui.messages import Detection, Lights, TrackerResult
-from skysim.apps.gui.page import forms, keys
-from skysim.apps.gui.page.frame import overlay
-from skysim.apps.gui.page.frame.sensor import FRAMES, Sensor
-from skysim.apps.gui.page.frame.served import TabFrames
-from skysim.apps.gui.page.frame.star_names import NAMES
 from skysim.apps.gui.server import FILES, Guard, KeptFiles, host_of, report_path, user_of
+from skysim.apps.gui.shared import forms, keys
+from skysim.apps.gui.views import overlay
+from skysim.apps.gui.views.sensor import Sensor
+from skysim.apps.gui.views.served import FRAMES, TabFrames
+from skysim.apps.gui.views.star_names import NAMES
 from skysim.apps.gui.worker import export, photo, pixels, playback, study_process, tasks, workbench
 from skysim.apps.gui.worker.photo import SUFFIXES
 from skysim.apps.gui.worker.scene import lens as lenses
@@ -41,8 +41,7 @@ from skysim.dynamics import multibody
 from skysim.experiments.study import loader as study_loader
 from skysim.results import scoring, stretch
 from skysim.scene import loader
-from skysim.simulation import exposure, run
-from skysim.simulation.lab import build_tracker
+from skysim.simulation.flight import open_flight, simulate_motion
 from skysim.sources import catalog, stars
 
 
@@ -52,8 +51,8 @@ def test_a_body_has_its_name_and_magnitude() -> None:
     assert [Sensor.name(sensor, id) for id in (9_000_599, 32349, 20)] == ["Jupiter", "Sirius", "HIP 20"]
     settings = {"light.bodies": "{}", "start_time": "2012-06-24T21:00:00", "exposure.frames": "1"}
     settings |= {"motion.start": "{ra_deg: 154.9, dec_deg: 4.8}", "motion.rate_deg_s": "[0, 0, 0]"}
-    lab = run.prepare(loader.load("shefex2", settings))
-    lights = workbench.true_lights(exposure.render_frame(lab, 0)[1], workbench.magnitude_by_id(lab))
+    flight = simulate_motion(loader.load("shefex2", settings))
+    lights = workbench.true_lights(flight.render(0)[1], workbench.magnitude_by_id(flight.lab))
     assert lights[0].id == 9_000_301
     assert lights[0].magnitude == pytest.approx(-8.84, abs=0.01)
 
@@ -291,8 +290,9 @@ def test_other_numbers_are_rounded_to_a_65535th_of_their_range() -> None:
 def test_a_frame_s_pose_and_lens_lead_from_a_light_s_pixel_to_the_light() -> None:
     """Under the dome by the depth at which its ray meets the surface; under the stars by the rotation alone."""
     for scene, within_rad in (("afit_simsat", 2e-4), ("shefex2", 2e-5)):
-        lab = run.prepare(loader.load(scene, {"exposure.frames": "1", "motion.rate_deg_s": "[0, 0, 0]"}))
-        lens, (_, truth) = lenses.scene_lens(lab), exposure.render_frame(lab, 0)
+        flight = simulate_motion(loader.load(scene, {"exposure.frames": "1", "motion.rate_deg_s": "[0, 0, 0]"}))
+        lab, (_, truth) = flight.lab, flight.render(0)
+        lens = lenses.scene_lens(lab)
         pose = lenses.scene_pose(lab, lens, truth)
         camera = lab.scene.camera
         nodes_px = [np.linspace(-0.5, size - 0.5, lens.n) for size in (camera.width_px, camera.height_px)]
@@ -555,7 +555,7 @@ def test_kept_frames_of_a_flight_are_those_that_are_rendered_again(monkeypatch: 
     for kept_bytes in (playback.KEPT_BYTES, 0):
         monkeypatch.setattr(playback, "KEPT_BYTES", kept_bytes)
         worker.begin_flight()
-        while worker.advance_flight(1.0).phase != "done":
+        while not worker.advance_flight(1.0).is_done:
             pass
         assert [frame.place is None for frame in worker.flight.frames] == [kept_bytes == 0] * 2
         worker.flight_frame(0)
@@ -606,7 +606,7 @@ def test_a_flight_is_that_of_the_command_line_and_its_frames_are_kept() -> None:
                 await session.run("advance_flight", 0.01)
             steps = [await session.run("begin_flight")]
             await session.run("move", 0.0, 0.0, 1.0, False)  # other tasks have their turn
-            while steps[-1].phase != "done":
+            while not steps[-1].is_done:
                 steps.append(await session.run("advance_flight", 0.5))
                 if len(steps) == 3:
                     await session.run("move", 0.0, 0.0, 1.0, False)
@@ -615,9 +615,8 @@ def test_a_flight_is_that_of_the_command_line_and_its_frames_are_kept() -> None:
             assert log.t_s[-1] > 1.0
             assert set(log.curves) >= {"momentum", "pointing"}
             # They are the frames of the command line: the same truth, errors and lights.
-            scene = loader.load("simsat_slew", {"exposure.frames": "4"})
-            lab = run.prepare(scene)
-            expected = [scoring.row(one, scene, lab.camera.mount) for one in run.run(lab, build_tracker(lab.camera))]
+            flight = open_flight(loader.load("simsat_slew", {"exposure.frames": "4"}))
+            expected = [scoring.score(shot).row for shot in flight.shots()]
             np.testing.assert_array_equal([row.cross_arcsec for row in rows], [one.cross_arcsec for one in expected])
             np.testing.assert_array_equal([row.roll_arcsec for row in rows], [one.roll_arcsec for one in expected])
             assert len(rows) == 4
@@ -625,7 +624,7 @@ def test_a_flight_is_that_of_the_command_line_and_its_frames_are_kept() -> None:
             assert view.t_s == rows[2].t_s
             assert view.result.solved
             files = await session.run("export")
-            frame, _ = exposure.render_frame(lab, 2)
+            frame, _ = flight.render(2)
             np.testing.assert_array_equal(fits.getdata(BytesIO(files["frame.fits"])), frame.image_dn)
             assert view.pixels.data == pixels.levels_of(frame.image_dn).data()
             with pytest.raises(InputError, match="the flight has no frame 4"):

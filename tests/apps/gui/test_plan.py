@@ -15,14 +15,14 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 from labpage import CHROMIUM, SLOW_MS, chosen, come, panel, set_to, status
 
 from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan
-from skysim.apps.gui.page.panels.plan import (
+from skysim.apps.gui.panels.plan import (
     ambiguity_text,
     greatest_tilt_deg,
     prediction_text,
     survey_flight,
     survey_lines,
 )
-from skysim.apps.gui.page.style import color_scale
+from skysim.apps.gui.shared.style import color_scale
 from skysim.apps.gui.worker.scene import planning, survey
 from skysim.apps.gui.worker.tasks import Worker
 from skysim.core import quaternion
@@ -112,19 +112,17 @@ def test_a_survey_takes_the_last_frame_of_a_hold_if_the_vehicle_rests(pixels: fl
     start_s, exposure_s = guidance.plan(scene.motion).start_s, 0.1
     rate_rad_s = pixels / exposure_s / scene.camera.focal_px
     t_s = [0.0, start_s[1] - 0.01, start_s[1], start_s[2] - 0.11, start_s[2] - 0.09, start_s[3], start_s[4] - 0.2]
-    flight = SimpleNamespace(
-        bench=SimpleNamespace(scene=scene),
-        moved=SimpleNamespace(trajectory=SimpleNamespace(rate_at=lambda _: np.array([0.0, rate_rad_s, 0.0]))),
-        frames=[SimpleNamespace(view=SimpleNamespace(t_s=begin, exposure_s=exposure_s)) for begin in t_s],
-    )
-    assert survey.frames_at_rest(flight) == (taken, 2)  # type: ignore[arg-type]
+    trajectory = SimpleNamespace(rate_at=lambda _: np.array([0.0, rate_rad_s, 0.0]))
+    flight: Any = SimpleNamespace(lab=SimpleNamespace(scene=scene), is_over=True, trajectory=lambda: trajectory)
+    views: Any = [SimpleNamespace(t_s=begin, exposure_s=exposure_s) for begin in t_s]
+    assert survey.frames_at_rest(flight, views) == (taken, 2)
 
 
 def flight_of(worker: Worker, overrides: dict[str, str]) -> None:
     """Open the scene and compute its flight."""
     worker.open("afit_simsat", overrides, False)
     worker.begin_flight()
-    while worker.advance_flight(10.0).phase != "done":
+    while not worker.advance_flight(10.0).is_done:
         pass
 
 
@@ -137,9 +135,10 @@ def test_a_survey_goes_on_with_the_frames_flown() -> None:
     for count in (8, 16):
         flight_of(worker, survey_flight("afit_simsat", bench, plan.angles_deg))
         assert worker.flight is not None
-        rows, holds = survey.frames_at_rest(worker.flight)
+        views = [kept.view for kept in worker.flight.frames]
+        rows, holds = survey.frames_at_rest(worker.flight.flight, views)
         assert holds == len(rows) == 8
-        wxyz = np.array([worker.flight.frames[row].view.body_wxyz for row in rows])
+        wxyz = np.array([views[row].body_wxyz for row in rows])
         wanted = stops.from_angles(np.array(plan.angles_deg)).as_quat(scalar_first=True)
         np.testing.assert_allclose(np.abs(np.sum(wxyz * wanted, axis=1)), 1, rtol=0, atol=1e-9)
         found = worker.adjust_survey(8)

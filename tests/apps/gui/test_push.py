@@ -82,12 +82,12 @@ def test_a_vehicle_without_gravity_swings_about_where_it_is_pulled(free: Lab) ->
 def test_a_frame_sees_the_motion_of_its_exposure(free: Lab) -> None:
     push = Push(free, Rotation.identity())
     window = exposure_window(free.scene, 0)
-    still = push.seen(free).trajectory
+    still = push.seen()
     assert still.rate_at(window.open_s).tolist() == [0, 0, 0]
     for _ in range(20):
         push.advance(Grip((0.5, 0.0, 0.0), (0.0, 0.5, 0.0)), 0.1)
     rate = push.simulation.rate_body_rad_s.copy()
-    seen = push.seen(free).trajectory
+    seen = push.seen()
     close_s = window.close_s(free.scene.camera.height_px)
     turned = (seen.attitude_at(window.open_s).inv() * seen.attitude_at(close_s)).as_rotvec()
     np.testing.assert_allclose(turned, rate * (close_s - window.open_s), rtol=0.05, atol=1e-6)

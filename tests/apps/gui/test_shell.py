@@ -11,11 +11,11 @@ from labpage import CHROMIUM, NARROW, WIDE, Server, changed, come, onto_the_page
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.page import style
-from skysim.apps.gui.page.frame import overlay
-from skysim.apps.gui.page.page import PANELS
-from skysim.apps.gui.page.shell.palette import Command, matching
-from skysim.apps.gui.page.shell.wording import for_page
+from skysim.apps.gui.page.actions import Command, matching
+from skysim.apps.gui.page.tab import PANELS
+from skysim.apps.gui.shared import style
+from skysim.apps.gui.shared.wording import for_page
+from skysim.apps.gui.views import overlay
 from skysim.apps.gui.worker.study_process import MAX_STUDIES, StudyProcess
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core.errors import InputError

@@ -26,8 +26,8 @@ from labpage import (
     status,
 )
 
-from skysim.apps.gui.page.shell import history
-from skysim.apps.gui.state import View
+from skysim.apps.gui.page import history
+from skysim.apps.gui.shared.state import View
 from skysim.core.errors import InputError
 
 pytest_plugins = ["labpage"]
@@ -83,15 +83,16 @@ def test_a_movement_is_one_step_and_replaces_no_other(monkeypatch: pytest.Monkey
     """However soon after a page's opening or an edit it begins."""
     sent: list[str] = []
     monkeypatch.setattr(history.ui, "run_javascript", sent.append)
-    tab = SimpleNamespace(state=VIEWS[0], view=object(), run_panel=SimpleNamespace(wanted_s=None))
+    shown = SimpleNamespace(state=VIEWS[0])
     written = history.History.__new__(history.History)
-    written.tab, written.home, written.written = tab, "shefex2", None
+    written.page, written.home, written.written = shown, "shefex2", None
+    written.is_settling = lambda: False
     written.showing, written.moving, written.unchanged = False, False, 0
     turned = [replace(VIEWS[0], angles_deg=(float(n), 0.0, 0.0)) for n in range(3)]
     edited = replace(turned[2], overrides={"camera.f_number": "2"})
     after = replace(edited, angles_deg=(9.0, 0.0, 0.0))
     pushed = []
-    for tab.state in (VIEWS[0], *turned, edited, after):
+    for shown.state in (VIEWS[0], *turned, edited, after):
         written.write()
         pushed.append(", true," in sent[-1])
     assert pushed == [False, True, False, False, True, True]

@@ -15,7 +15,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +30,7 @@ from skysim.apps.stream.pacing import Pace
 from skysim.apps.stream.packet import Packet, unpack
 from skysim.core.errors import InputError
 from skysim.scene import loader
-from skysim.simulation import run
-from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.motion import CapturedFrame, ClosedLoop, OnboardCamera
+from skysim.simulation.flight import Flight, open_flight
 
 FRAMES = 4
 OVERRIDES = {"exposure.frames": str(FRAMES), "light.limit_mag": "5"}
@@ -41,12 +39,12 @@ OVERRIDES = {"exposure.frames": str(FRAMES), "light.limit_mag": "5"}
 @pytest.fixture(scope="module")
 def frames() -> list[np.ndarray]:
     """The frames of a run of the scene."""
-    lab = run.prepare(loader.load("shefex2", OVERRIDES))
-    return [frame.image_dn for frame, _, _ in run.render_frames(lab)]
+    return [shot.frame.image_dn for shot in open_flight(loader.load("shefex2", OVERRIDES)).shots(solves=False)]
 
 
-def unsimulated_testbed() -> Lab:
-    return build_lab(loader.load("shefex2", OVERRIDES))
+def streamed_flight(*, endless: bool = False) -> Flight:
+    """A flight as `skysim stream` opens it."""
+    return open_flight(loader.load("shefex2", OVERRIDES), endless=endless, keeps_history=False)
 
 
 def packet(index: int, dropped: int = 0, pixels: Any = None) -> Packet:
@@ -129,7 +127,7 @@ def test_late_frames_are_dropped_and_counted(frames: list[np.ndarray]) -> None:
             return index % 2 == 0
 
     stats = sender.SenderStats()
-    sender.send(unsimulated_testbed(), Slow(0.0, 10.0), [], stats, packets.append)
+    sender.send(streamed_flight(), Slow(0.0, 10.0), [], stats, packets.append)
     assert [one.header["index"] for one in packets] == list(range(0, FRAMES, 2))
     assert [one.header["dropped"] for one in packets] == list(range(FRAMES // 2))
     assert (stats.rendered, stats.dropped) == (
@@ -314,24 +312,19 @@ def test_head_answers_like_get_without_the_body(hub: tuple[http.FrameHub, str], 
 
 def test_an_endless_stream_continues_beyond_the_scene_s_frames_and_a_day() -> None:
     """The clock is set forward by ten days; the free rotation does not depend on it."""
-    lab = replace(unsimulated_testbed(), endless=True)
-    loop = ClosedLoop(lab, discards_history=True)
-    size_bytes = loop.simulation.states.nbytes
-    camera, offset_s = OnboardCamera(loop, None), 10 * 86_400
-    loop.simulation.step = loop.simulation.first_step = round(offset_s / loop.simulation.step_s)
-    camera.index = round(offset_s * lab.scene.exposure.rate_hz)
-    packets: list[CapturedFrame] = []
-    while len(packets) < FRAMES + 1:
-        loop.tick(10)
-        packets += camera.capture_due()
-    mids_s = [captured.frame.t_mid_s - offset_s for captured in packets]
-    first_s = lab.scene.exposure.first_s + lab.scene.exposure.time_s / 2
-    np.testing.assert_allclose(
-        mids_s, first_s + np.arange(len(packets)) / lab.scene.exposure.rate_hz, rtol=0, atol=1e-8
-    )
-    assert loop.simulation.states.nbytes == size_bytes
-    rotation = packets[-1].truth.cam_from_lab * packets[0].truth.cam_from_lab.inv()
-    rate_rad_s = np.radians(np.linalg.norm(lab.scene.motion.rate_deg_s))
+    flight = streamed_flight(endless=True)
+    scene, simulation = flight.lab.scene, flight.motion.simulation
+    size_bytes = simulation.states.nbytes
+    offset_s = 10 * 86_400
+    simulation.step = simulation.first_step = round(offset_s / simulation.step_s)
+    flight.schedules[0].index = round(offset_s * scene.exposure.rate_hz)
+    shots = list(islice(flight.shots(solves=False), FRAMES + 1))
+    mids_s = [shot.frame.t_mid_s - offset_s for shot in shots]
+    first_s = scene.exposure.first_s + scene.exposure.time_s / 2
+    np.testing.assert_allclose(mids_s, first_s + np.arange(len(shots)) / scene.exposure.rate_hz, rtol=0, atol=1e-8)
+    assert simulation.states.nbytes == size_bytes
+    rotation = shots[-1].truth.cam_from_lab * shots[0].truth.cam_from_lab.inv()
+    rate_rad_s = np.radians(np.linalg.norm(scene.motion.rate_deg_s))
     assert rotation.magnitude() == pytest.approx(rate_rad_s * (mids_s[-1] - mids_s[0]), rel=1e-6)
 
 

@@ -11,9 +11,8 @@ from estimator.trackers.exposure_control import Control, Exposure, Observation, 
 from skysim.camera.detector.detector import saturation_dn
 from skysim.scene import loader
 from skysim.scene.sections.light import UniformGlowConfig
-from skysim.simulation import exposure
-from skysim.simulation import run as simulation
-from skysim.simulation.lab import Lab
+from skysim.simulation.exposure import render_at_rest
+from skysim.simulation.lab import Lab, build_lab
 
 CONTROL = Control(mean_dn=100.0)
 GOOD = Observation(mean_dn=40.0, stars=12, overexposed=0)
@@ -114,18 +113,18 @@ def test_boxes_beyond_the_image_are_refused() -> None:
 def lab() -> Lab:
     """A field without bright stars, which a glare hides altogether."""
     coma = {"motion.start": "{ra_deg: 190, dec_deg: 25}", "motion.rate_deg_s": "[0, 0, 0]"}
-    return simulation.prepare(loader.load("shefex2", coma | {"exposure.frames": "34"}))
+    return build_lab(loader.load("shefex2", coma | {"exposure.frames": "34"}))
 
 
 def lit(lab: Lab, glare_e_s: float) -> Lab:
     """The lab with light from a body at the baffle's edge on the whole chip."""
     glow = [UniformGlowConfig(kind="uniform", e_s=glare_e_s)] if glare_e_s else []
-    return replace(lab, scene=lab.scene.model_copy(update={"background": glow}))
+    return lab.with_scene(lab.scene.model_copy(update={"background": glow}))
 
 
 def exposed(lab: Lab, time_s: float) -> Lab:
     told = lab.scene.exposure.model_copy(update={"time_s": time_s})
-    return replace(lab, scene=lab.scene.model_copy(update={"exposure": told}))
+    return lab.with_scene(lab.scene.model_copy(update={"exposure": told}))
 
 
 def flown(
@@ -135,7 +134,7 @@ def flown(
     state, states, seen = Exposure(start_s), [], []
     saturation = saturation_dn(lab.scene.camera.detector)
     for index, glare in enumerate(glare_e_s):
-        frame, _ = exposure.render_frame(exposed(lit(lab, glare), state.time_s), index)
+        frame, _ = render_at_rest(exposed(lit(lab, glare), state.time_s).camera, lab.start, index)
         blobs = DETECTORS["local"](frame.image_dn, 5.0, 3, 100)
         seen.append(observe(frame.image_dn, blobs.box_px, saturation, control))
         state = step(state, seen[-1], control)
@@ -180,13 +179,13 @@ def test_without_the_mean_the_same_intruder_would_lengthen_it(lab: Lab) -> None:
 @pytest.mark.slow
 def test_one_planet_shortens_nothing_and_four_do(lab: Lab) -> None:
     # Strengths multiplied until the brightest stars of the field saturate: one of them, then many.
-    truth = exposure.render_frame(lab, 0)[1]
+    truth = render_at_rest(lab.camera, lab.start)[1]
     inside = np.flatnonzero(np.isin(lab.camera.sources.id, truth.sources.id))
     brightest = inside[np.argsort(lab.camera.sources.strength[inside])[::-1]]
     for count, expected in ((1, 0.04), (6, 0.038)):
         strength = lab.camera.sources.strength.copy()
         strength[brightest[:count]] = 1e4 * strength[brightest[5]]
-        planets = replace(lab, sources=replace(lab.camera.sources, strength=strength))
+        planets = lab.with_camera(sources=replace(lab.camera.sources, strength=strength))
         states, seen = flown(planets, [0.0], 0.04, Control(mean_dn=150.0))
         assert seen[0].overexposed >= count
         assert states[0].time_s == pytest.approx(expected, abs=1e-9)

@@ -40,7 +40,7 @@ def test_a_board_that_leans_shows_the_cosine_of_its_angle(pair: Lab) -> None:
     """One LED comes nearer and the other farther, which cancels but for the square of half the pair's angle."""
     share = geometric_angle_arcsec(pair, Place(28.0, 5.0)) / geometric_angle_arcsec(pair, Place(28.0))
     # The dome's own normal leans there by a little, so that five degrees are added to it.
-    normal = test2.place_pair(pair, Place(28.0)).sources.normal[0]
+    normal = test2.place_pair(pair, Place(28.0)).camera.sources.normal[0]
     crop_board = np.array([-np.sin(np.radians(28)), 0, -np.cos(np.radians(28))])
     own = np.arctan2(np.cross(crop_board, normal)[1], crop_board @ normal)
     assert share == pytest.approx(np.cos(own + np.radians(5)) / np.cos(own), abs=2e-5)
@@ -50,9 +50,8 @@ def test_a_dome_that_is_moved_away_shows_less_by_the_longer_way(pair: Lab) -> No
     """The range from the camera grows; the pair in the image plane at R - M shrinks by as much."""
     places = [Place(28.0), Place(28.0, 0.0, 0.125)]
     camera_m = M_M * np.array([np.sin(np.radians(28)), 0, np.cos(np.radians(28))])
-    range_m = [
-        np.linalg.norm(test2.place_pair(pair, place).sources.place[:, :3].mean(axis=0) - camera_m) for place in places
-    ]
+    pairs_m = [test2.place_pair(pair, place).camera.sources.place[:, :3] for place in places]
+    range_m = [np.linalg.norm(pair_m.mean(axis=0) - camera_m) for pair_m in pairs_m]
     angle = [geometric_angle_arcsec(pair, place) for place in places]
     assert angle[1] / angle[0] == pytest.approx(range_m[0] / range_m[1], abs=5e-5)
     assert angle[1] < angle[0] - 4

@@ -12,7 +12,7 @@ from skysim.core.types import Frame
 from skysim.experiments.papers.compare import ExperimentOptions
 from skysim.experiments.papers.intervals import bootstrap_of_means
 from skysim.experiments.papers.shefex import camera, catalog, identification, optics
-from skysim.experiments.papers.shefex.setup import Field, pairs, random_fields, shefex_testbed
+from skysim.experiments.papers.shefex.setup import Field, pairs, random_fields, shefex_lab
 from skysim.scene.loader import load
 from skysim.tracking import onboard_model
 from skysim.tracking.exposure_control import ExposureController
@@ -36,7 +36,7 @@ def test_the_bootstrap_of_means_is_that_of_theory_and_leaves_out_what_is_missing
 
 
 def test_a_field_s_stars_are_the_catalog_s_where_the_attitude_puts_them() -> None:
-    camera = onboard_model.calibration(shefex_testbed().scene.camera)
+    camera = onboard_model.calibration(shefex_lab().scene.camera)
     for field in random_fields(5, 3):
         shown = camera.pixels(field.cam_from_ref.apply(pairs().vectors))
         shown = shown[camera.contains(np.nan_to_num(shown, nan=-1e9))]
@@ -79,7 +79,7 @@ def test_where_a_line_passes_the_limit() -> None:
 @pytest.mark.parametrize("rate_deg_s", [2.0, 4.0])
 def test_smear_is_rate_times_time_and_the_peak_falls_as_a_line_s(rate_deg_s: float) -> None:
     """A line of L pixels over one centered star's pixel: (1 / L) of erf(1 / (2 sqrt 2 sigma)), ends far away."""
-    length_px = np.radians(rate_deg_s) * 0.05 * shefex_testbed().scene.camera.focal_px
+    length_px = np.radians(rate_deg_s) * 0.05 * shefex_lab().scene.camera.focal_px
     assert optics.smear_px(rate_deg_s) == pytest.approx(length_px, rel=2e-3)
     alone = erf(0.5 / (0.7 * np.sqrt(2)))
     loss_mag = 2.5 * np.log10(alone * length_px)
@@ -93,7 +93,7 @@ def test_the_blur_disk_is_the_defocus_over_the_f_number() -> None:
 
 def test_the_chip_s_fields_are_those_of_its_half_sizes() -> None:
     half = np.array([659, 493, np.hypot(659, 493)]) / 2 * 9.9e-6 / 25e-3
-    told = optics.field_deg(onboard_model.calibration(shefex_testbed().scene.camera))
+    told = optics.field_deg(onboard_model.calibration(shefex_lab().scene.camera))
     np.testing.assert_allclose(told, np.degrees(2 * np.arctan(half)), rtol=1e-9)
 
 
@@ -124,7 +124,7 @@ def test_an_empty_frame_of_a_coarse_converter_lengthens_the_exposure() -> None:
 
 def test_a_planet_s_light_is_pogson_s() -> None:
     loop = camera.ExposureLoop({}, camera.random_attitudes(1, 1)[0], 40)
-    before, after = loop.lab.camera.sources, camera.with_planets(loop.lab, 3)
+    before, after = loop.lab.camera.sources, camera.with_planets(loop.lab.camera, loop.rest, 3)
     changed = after.strength != before.strength
     assert changed.sum() == 3
     gained_mag = 2.5 * np.log10(after.strength[changed] / before.strength[changed])
@@ -139,5 +139,5 @@ def test_the_same_seed_gives_the_same_numbers() -> None:
 
 def test_a_lab_under_the_air_gathers_thirty_per_cent_less() -> None:
     """What the shutter lets in for 50 ms there, it lets in for 35 here."""
-    on_ground = optics.star_image(optics.ground_testbed(), 0.05).sum()
-    assert on_ground == pytest.approx(optics.star_image(shefex_testbed(), 0.035).sum(), rel=1e-6)
+    on_ground = optics.star_image(optics.ground_lab(), 0.05).sum()
+    assert on_ground == pytest.approx(optics.star_image(shefex_lab(), 0.035).sum(), rel=1e-6)

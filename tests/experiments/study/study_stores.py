@@ -6,8 +6,8 @@ import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
-from skysim.experiments.study import plan, store
-from skysim.experiments.study.execution import engines, runner
+from skysim.experiments.study import plan
+from skysim.experiments.study.execution import engines, runner, store
 
 STRAYS = """
 schema: 1

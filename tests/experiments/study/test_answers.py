@@ -11,9 +11,9 @@ from scipy.stats import qmc
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.experiments.study import loader, store
+from skysim.experiments.study import loader
 from skysim.experiments.study.analysis import sensitivity, table
-from skysim.experiments.study.execution import engines, replay, runner
+from skysim.experiments.study.execution import engines, replay, runner, store
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.report import export
 from skysim.results import metrics

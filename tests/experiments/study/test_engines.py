@@ -23,8 +23,8 @@ from study_stores import contents, done
 
 import skysim.experiments.study.execution
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan, store
-from skysim.experiments.study.execution import engines, runner, setups, trials, workers
+from skysim.experiments.study import loader, plan
+from skysim.experiments.study.execution import engines, runner, setups, store, trials, workers
 from skysim.experiments.study.execution.engines import Engine
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -45,7 +45,8 @@ budget: {failures: 1000}
 DRIVER = """
 import sys
 from pathlib import Path
-from skysim.experiments.study import loader, store
+from skysim.experiments.study import loader
+from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution import engines, runner
 told = loader.load(sys.argv[1])
 with store.writing(Path(sys.argv[2])) as kept:

@@ -11,9 +11,9 @@ import yaml
 from study_stores import done
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan, store
+from skysim.experiments.study import loader, plan
 from skysim.experiments.study.analysis import table
-from skysim.experiments.study.execution import replay, runner, setups
+from skysim.experiments.study.execution import replay, runner, setups, store
 
 STUDY: dict[str, Any] = {
     "schema": 1,

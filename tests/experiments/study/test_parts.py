@@ -19,10 +19,10 @@ import pytest
 from study_stores import STRAYS, done
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan, store
+from skysim.experiments.study import loader, plan
 from skysim.experiments.study.analysis import table, worst
 from skysim.experiments.study.designs import Point
-from skysim.experiments.study.execution import engines, runner, workers
+from skysim.experiments.study.execution import engines, runner, store, workers
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.report import export

@@ -20,9 +20,9 @@ from hypothesis import strategies as st
 from study_stores import STRAYS, contents, done
 
 from skysim.core.errors import InputError
-from skysim.experiments.study import loader, plan, store
+from skysim.experiments.study import loader, plan
 from skysim.experiments.study.designs import Point
-from skysim.experiments.study.execution import runner, setups, trials
+from skysim.experiments.study.execution import runner, setups, store, trials
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.setups import Setup
 from skysim.experiments.study.execution.trials import Row

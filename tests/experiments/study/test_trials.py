@@ -14,11 +14,10 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from skysim.core.paths import SCENES
-from skysim.core.types import Trajectory
 from skysim.experiments.study import plan
 from skysim.experiments.study.execution import detections, setups, trials
 from skysim.experiments.study.plan import CentroidTrial, FrameTrial, TrialSpec
-from skysim.simulation import exposure, run
+from skysim.simulation.exposure import render_at_rest
 from skysim.sources.solar_system.observer import observe_from
 from skysim.sources.solar_system.places import place
 
@@ -135,8 +134,7 @@ def test_lights_are_where_the_renderer_puts_them_and_as_bright(spec):
     ready = setups.prepared_setup(spec, {"background": []})
     lab = ready.lab
     lab_from_body = trials.random_attitude(ready, np.random.default_rng(5))
-    still = Trajectory(np.array([-1.0, 9.0]), Rotation.concatenate([lab_from_body] * 2), np.zeros((2, 3)))
-    _, truth = exposure.render_frame(replace(lab, trajectory=still), 0)
+    _, truth = render_at_rest(lab.camera, lab_from_body)
     xy_px, electrons = detections.visible_sources(lab, lab_from_body)
     size_px = np.array(lab.camera.canvas.shape[::-1])
     inner = np.flatnonzero(((truth.sources.xy_px > 40) & (truth.sources.xy_px < size_px - 41)).all(axis=1))
@@ -205,7 +203,7 @@ def test_lights_of_a_coded_trial_are_as_bright_as_rendered_ones(code):
     lab, lab_from_body = ready.lab.in_run(5), Rotation.from_rotvec([0.1, 0.05, 1.0])
     ((rows, xy_px, electrons),) = detections.visible_rows(lab, Rotation.concatenate([lab_from_body]))
     light_e = electrons * detections.brightness(lab, rows, 7)
-    _, truth = exposure.render_frame(lab.at_rest(lab_from_body, 7), 7)
+    _, truth = render_at_rest(lab.camera, lab_from_body, 7)
     size_px = np.array(lab.camera.canvas.shape[::-1])
     inner = np.flatnonzero(((xy_px > 40) & (xy_px < size_px - 41)).all(axis=1))
     assert len(inner) >= 2
@@ -282,7 +280,7 @@ def test_a_flights_filter_is_scored_at_every_tick():
     assert 0 < came.filter_arcsec < came.filter_worst_arcsec < 600
     assert came.availability == 1
     assert math.isfinite(came.drift_arcsec)
-    log = run.simulate_motion(trials.flight_testbed(ready, 5)).log
+    log = trials.trial_flight(ready, 5).simulate_motion().telemetry()
     error = (log.lab_from_ref * log.lab_from_body.inv()).magnitude()
     assert 0 < came.pointing_arcsec < came.pointing_worst_arcsec
     assert came.pointing_worst_arcsec == pytest.approx(np.degrees(error.max()) * 3600, rel=1e-9)
@@ -359,13 +357,13 @@ def test_a_flight_starts_anywhere_and_the_same_for_the_same_seed(name):
     ready = setups.prepared_setup(TrialSpec(name, ".", 1, {"exposure.frames": 1}, trial, True), {})
     kind = {"kind": "frames"}
     other = setups.prepared_setup(TrialSpec(name, ".", 1, {"exposure.frames": 1}, kind, True), {})
-    starts = [trials.flight_testbed(ready, seed).trajectory.lab_from_body[0] for seed in (5, 6, 5)]
+    starts = [trials.trial_flight(ready, seed).state.lab_from_body for seed in (5, 6, 5)]
     assert (starts[0].inv() * starts[2]).magnitude() == 0
     assert (starts[0].inv() * starts[1]).magnitude() > 0.01
     drawn = trials.random_attitude(other, trials.streams(other, 5)[0])
     assert (starts[0].inv() * drawn).magnitude() == 0
     scene_start = ready._replace(trial=plan.FlightTrial(kind="flight"))
-    fixed = trials.flight_testbed(scene_start, 5).trajectory.lab_from_body[0]
+    fixed = trials.trial_flight(scene_start, 5).state.lab_from_body
     assert (fixed.inv() * ready.lab.start).magnitude() == 0
 
 
@@ -375,8 +373,8 @@ def test_a_flight_from_a_random_start_is_flown_from_there():
     trial = {"kind": "flight", "start": {"tilt_deg": [5, 12]}}
     spec = TrialSpec("afit_simsat", ".", 1, changes, trial, True)
     ready = setups.prepared_setup(spec, {})
-    path = trials.run.simulate_motion(trials.flight_testbed(ready, 9)).trajectory
-    tilt_deg = np.degrees(np.arccos(path.lab_from_body.as_matrix()[:, 2, 2]))
+    flown = trials.trial_flight(ready, 9).simulate_motion().trajectory()
+    tilt_deg = np.degrees(np.arccos(flown.lab_from_body.as_matrix()[:, 2, 2]))
     assert 5 < tilt_deg[0] < 12
     assert tilt_deg[-1] == pytest.approx(tilt_deg[0], abs=0.2)  # held for a second
     (row,) = trials.run_segments(spec, (trials.Segment(0, {}, 0, range(1)),))
@@ -448,6 +446,6 @@ def test_a_tracked_frame_has_the_motion_of_its_time():
     truth = rendered(settings | {"trial.tracked": 2})
     assert (truth.cam_from_lab * rendered(settings).cam_from_lab.inv()).magnitude() < 1e-12
     setup = setups.prepared_setup(AT_REST, settings | {"trial.tracked": 2})
-    lab = trials.moving_testbed(setup, 5)[0]
-    step = trials.rotation_between(lab, truth.t_s - 0.1, truth.t_s)
+    moving = trials.moving_camera(setup, 5)
+    step = trials.rotation_between(moving, truth.t_s - 0.1, truth.t_s)
     assert np.degrees(step.magnitude()) == pytest.approx(0.2, rel=1e-9)

@@ -14,6 +14,7 @@ from typing import Annotated, NamedTuple
 
 import typer
 
+from skysim.apps.cli.option_names import with_location
 from skysim.apps.cli.options import (
     Json,
     Overrides,
@@ -23,7 +24,6 @@ from skysim.apps.cli.options import (
     scene_names,
     study_names,
     used_programs,
-    with_location,
 )
 from skysim.apps.cli.terminal import print_check, print_error, print_json
 from skysim.core.errors import InputError

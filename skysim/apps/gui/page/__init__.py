@@ -1,1 +1,1 @@
-"""The page in the browser: layout, 3-D view, overlay, forms, keyboard map and panels."""
+"""The page of a browser tab: its head, its keys and list of actions, its history in the browser, its arrangement."""

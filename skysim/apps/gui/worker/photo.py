@@ -27,11 +27,11 @@ from skysim.apps.gui.worker.workbench import (
 )
 from skysim.core.errors import InputError
 from skysim.core.io import images
-from skysim.experiments.study import loader, store
-from skysim.experiments.study.execution import replay
+from skysim.experiments.study import loader
+from skysim.experiments.study.execution import replay, store
 from skysim.experiments.study.execution.setups import prepared_setup
+from skysim.experiments.study.execution.store import STORE
 from skysim.experiments.study.execution.trials import run_trial
-from skysim.experiments.study.store import STORE
 from skysim.results import scoring, stretch
 
 

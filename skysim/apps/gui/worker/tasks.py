@@ -168,7 +168,8 @@ class Worker:
         """Adjust the dome to the frames flown so far, and plan further ones. Raises InputError if none are new."""
         if self.flight is None:
             raise InputError("", "no flight: fly the survey's attitudes")
-        return self.survey_of_scene.adjust(self.flight, frames)
+        views = [kept.view for kept in self.flight.frames]
+        return self.survey_of_scene.adjust(self.flight.flight, views, frames)
 
     def survey_map(self) -> bytes:
         """The file for `tracker.map`. Raises InputError if nothing is measured."""

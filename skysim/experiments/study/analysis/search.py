@@ -24,10 +24,10 @@ from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.execution.outcomes import FAILED
 from skysim.experiments.study.execution.runner import Progress, Watch, run_points
 from skysim.experiments.study.execution.setups import code_version, seed_of
+from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.execution.trials import REFUSED, Row
 from skysim.experiments.study.factors import Distribution, Range, Value
 from skysim.experiments.study.plan import Constraint, Plan, Search, Study
-from skysim.experiments.study.store import Store
 from skysim.results import metrics
 from skysim.results.metrics import Columns, Summary
 

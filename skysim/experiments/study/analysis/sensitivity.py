@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
+from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Plan
-from skysim.experiments.study.store import Store
 from skysim.results.metrics import CONFIDENCE, NO_VALUE, Summary
 
 AXES = {"cross_arcsec": ("x_arcsec", "y_arcsec"), "roll_arcsec": ("roll_arcsec",)}

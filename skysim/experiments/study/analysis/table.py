@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.experiments.study.store import Store
+from skysim.experiments.study.execution.store import Store
 from skysim.results import metrics
 from skysim.results.files.row_parts import Rows
 from skysim.results.metrics import Summary

@@ -1,1 +1,1 @@
-"""Execution of a study's trials: in this process, a process pool or a Dask cluster; replay of one trial."""
+"""Execution of a study's trials in this process, a process pool or a Dask cluster; their store; replay of one."""

@@ -16,11 +16,11 @@ from skysim.core.io import files as file_io
 from skysim.core.types import Frame, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.setups import Setup, prepared_setup
+from skysim.experiments.study.execution.store import Store, to_sql
 from skysim.experiments.study.execution.trials import REFUSED, Row, Segment
 from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Plan
-from skysim.experiments.study.store import Store, to_sql
+from skysim.results.annotate import annotate, visible
 from skysim.results.files import frames
-from skysim.results.report import annotate, visible
 from skysim.tracking import factory
 
 MAX_FRAMES = 100  # maximum number of frames written for a flight

@@ -15,9 +15,9 @@ from skysim.core.errors import InputError
 from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
 from skysim.experiments.study.execution.setups import code_version, scene_hash
+from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.execution.trials import Row, Segment, TrialJob
 from skysim.experiments.study.plan import Plan, TrialSpec, resolve_point
-from skysim.experiments.study.store import Store
 
 CHUNK_S = 0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies
 MANY = 16  # workers; more have longer chunks, and complete MANY / CHUNK_S a second: a Dask scheduler handles hundreds

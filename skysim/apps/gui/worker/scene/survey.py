@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.calibration.survey_plan import Mask, SurveyAccuracy
 from estimator.core.types import Centroids
-from skysim.apps.gui.messages import SurveyFound, SurveyPlan
-from skysim.apps.gui.worker.playback import Playback
+from skysim.apps.gui.messages import FrameView, SurveyFound, SurveyPlan
 from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
@@ -26,6 +25,7 @@ from skysim.experiments.dome_survey.results.findings import Coverage
 from skysim.experiments.dome_survey.survey_run import SurveyRun
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import HoldConfig, SlewConfig
+from skysim.simulation.flight import Flight
 from skysim.simulation.lab import Lab
 from skysim.tracking import dome_map_file, onboard_model
 from skysim.tracking import settings as tracker_settings
@@ -56,13 +56,15 @@ class Survey:
         """Whether a scene is the surveyed one, but for its sections `motion` and `exposure`."""
         return self.scene.model_copy(update={"motion": scene.motion, "exposure": scene.exposure}) == scene
 
-    def adjust(self, flight: Playback, count: int) -> SurveyFound:
+    def adjust(self, flight: Flight, views: Sequence[FrameView], count: int) -> SurveyFound:
         """Adjust the dome to all frames so far and those of a flight, and plan `count` further attitudes.
+
+        views : the frames of the flight so far, in order
 
         Raises InputError if the flight has no further frames; the survey is then as before.
         """
         allow(count)
-        new, missed = self.new_frames(flight)
+        new, missed = self.new_frames(flight, views)
         taken = [*self.taken, *new]
         frames = self.survey_frames(taken)
         try:
@@ -93,30 +95,29 @@ class Survey:
         self.taken, self.run = taken, run or self.run
         return found
 
-    def new_frames(self, flight: Playback) -> tuple[list[TakenFrame], int]:
+    def new_frames(self, flight: Flight, views: Sequence[FrameView]) -> tuple[list[TakenFrame], int]:
         """The frames of a flight at which the vehicle rests, one of each hold, and the number of holds without one.
 
         Raises InputError if there are none, or the survey has them already.
         """
-        rows, holds = frames_at_rest(flight)
+        rows, holds = frames_at_rest(flight, views)
         if not rows:
             raise InputError(
                 "survey",
                 f"the vehicle rests at none of the flight's {holds} holds",
                 "a flight of the survey's attitudes with a vehicle that holds them, such as motion.control: prescribed",
             )
-        known = {frame.row for frame in self.taken if frame.flown == flight.bench.scene}
+        known = {frame.row for frame in self.taken if frame.flown == flight.lab.scene}
         if known >= set(rows):
             raise InputError("survey", "it has the frames of this flight", "a flight of the next attitudes")
         settings = tracker_settings.assumed_settings(self.lab.scene)
         camera = onboard_model.assumed_camera(self.lab.scene)
         new = []
         for row in (row for row in rows if row not in known):
-            view = flight.frames[row].view
-            frame, _ = flight.flight.render(row)
-            lab_from_body = quaternion.to_rotation(np.array(view.body_wxyz))
+            frame, _ = flight.render(row)
+            lab_from_body = quaternion.to_rotation(np.array(views[row].body_wxyz))
             lights = detect_lights(settings, camera, frame.image_dn)
-            new.append(TakenFrame(flight.bench.scene, row, lab_from_body, lights))
+            new.append(TakenFrame(flight.lab.scene, row, lab_from_body, lights))
         return new, holds - len(rows)
 
     def survey_frames(self, taken: Sequence[TakenFrame]) -> list[SurveyFrame]:
@@ -192,22 +193,23 @@ def known_share(run: SurveyRun | None) -> Floats:
     return np.where(run.accuracy.measured, np.clip(share, 0.0, 1.0), 0.0)
 
 
-def frames_at_rest(flight: Playback) -> tuple[list[int], int]:
+def frames_at_rest(flight: Flight, views: Sequence[FrameView]) -> tuple[list[int], int]:
     """Rows of a flight's frames at which the vehicle rests, of each hold the last one, and the number of holds.
 
     It rests if its image moves by less than REST_PX during the exposure, as its true rate says: a controller may not
     reach the attitude, or not hold it.
     """
-    motion = flight.bench.scene.motion
-    if not flight.flight.is_over or not all(isinstance(one, SlewConfig | HoldConfig) for one in motion.maneuver):
+    scene = flight.lab.scene
+    motion = scene.motion
+    if not flight.is_over or not all(isinstance(one, SlewConfig | HoldConfig) for one in motion.maneuver):
         return [], 0
-    reference, by_hold = guidance.plan(motion), dict[int, int]()
+    reference = guidance.plan(motion)
+    by_hold: dict[int, int] = {}
     holds = {leg for leg, one in enumerate(motion.maneuver) if isinstance(one, HoldConfig)}
-    for row, kept in enumerate(flight.frames):
-        begin_s, exposure_s = kept.view.t_s, kept.view.exposure_s
-        leg = int(np.searchsorted(reference.start_s, begin_s, side="right")) - 1
-        if leg in holds and begin_s + exposure_s <= reference.start_s[leg + 1]:
-            rate_rad_s = np.linalg.norm(flight.flight.trajectory().rate_at(begin_s + exposure_s / 2))
-            if rate_rad_s * exposure_s * flight.bench.scene.camera.focal_px < REST_PX:
+    for row, view in enumerate(views):
+        leg = int(np.searchsorted(reference.start_s, view.t_s, side="right")) - 1
+        if leg in holds and view.t_s + view.exposure_s <= reference.start_s[leg + 1]:
+            rate_rad_s = np.linalg.norm(flight.trajectory().rate_at(view.t_s + view.exposure_s / 2))
+            if rate_rad_s * view.exposure_s * scene.camera.focal_px < REST_PX:
                 by_hold[leg] = row
     return list(by_hold.values()), len(holds)

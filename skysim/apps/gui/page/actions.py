@@ -1,0 +1,182 @@
+"""Actions of the user: by keys, and by a palette of all of them, which is filtered while the user types (Ctrl-K)."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from nicegui import ui
+from nicegui.events import KeyEventArguments
+
+from skysim.apps.gui.shared import keys
+from skysim.apps.gui.shared.context import PageContext
+from skysim.apps.gui.views.sensor import Sensor
+from skysim.apps.gui.worker.scene import pointing
+
+Action = Callable[[], Awaitable[None] | None]
+
+# Ctrl-K also from a field; the browser's own action is suppressed.
+OPEN_JS = """
+document.addEventListener("keydown", event => {
+  if (!(event.ctrlKey || event.metaKey) || event.key.toLowerCase() !== "k") return;
+  event.preventDefault();
+  emitEvent("palette", null);
+}, true);
+"""
+
+
+class Command(NamedTuple):
+    """An entry: its name, the label of its key if it has one, and what it does."""
+
+    name: str
+    key: str
+    action: Action
+
+
+async def perform(action: Action) -> None:
+    """Do an action, to its end if it takes a while."""
+    done = action()
+    if done is not None:
+        await done
+
+
+def matching(commands: list[Command], text: str) -> list[Command]:
+    """The commands whose name has every word of a text, in the order of the list."""
+    words = text.lower().split()
+    return [command for command in commands if all(word in command.name.lower() for word in words)]
+
+
+class Palette:
+    """The dialog. Arrows choose, Enter or a click does.
+
+    found : commands that match;  chosen : index of the one that Enter does
+    """
+
+    def __init__(self, commands: Callable[[], list[Command]]) -> None:
+        self.commands = commands
+        self.found: list[Command] = []
+        self.chosen = 0
+        with ui.dialog().props("position=top no-shake") as self.dialog, ui.card().classes("lab-palette"):
+            self.field = ui.input(placeholder="type an action", on_change=self.filter)
+            self.field.props('dense borderless autofocus aria-label="Action"').classes("w-full").mark("palette")
+            self.field.on("keydown.down.prevent", lambda: self.choose(self.chosen + 1))
+            self.field.on("keydown.up.prevent", lambda: self.choose(self.chosen - 1))
+            self.field.on("keydown.enter.prevent", self.enter)
+            self.list = ui.element("div").classes("lab-commands").props('role="listbox"')
+        ui.add_body_html(f"<script>{OPEN_JS}</script>")
+        ui.on("palette", self.open)
+
+    def open(self) -> None:
+        self.field.set_value("")
+        self.filter()
+        self.dialog.open()
+
+    def filter(self) -> None:
+        self.found = matching(self.commands(), str(self.field.value or ""))
+        self.choose(0)
+
+    def choose(self, index: int) -> None:
+        """Mark an entry as the one that Enter does, and draw the list."""
+        self.chosen = min(max(index, 0), max(len(self.found) - 1, 0))
+        self.list.clear()
+        with self.list:
+            if not self.found:
+                ui.label("No such action.").classes("quiet")
+            for n, command in enumerate(self.found):
+                row = ui.element("div").props(f'role="option" aria-selected="{str(n == self.chosen).lower()}"')
+                row.classes("lab-command" + " chosen" * (n == self.chosen)).on("click", lambda n=n: self.do(n))
+                with row:
+                    ui.label(command.name).classes("ellipsis")
+                    if command.key:
+                        ui.html(f"<kbd>{command.key}</kbd>", sanitize=False)
+
+    async def enter(self) -> None:
+        if self.found:
+            await self.do(self.chosen)
+
+    async def do(self, index: int) -> None:
+        self.dialog.close()
+        await perform(self.found[index].action)
+
+
+class Actions:
+    """What keys and commands do on a page.
+
+    step : shows the next or the previous frame of the flight (1 or -1)
+    performers : by the action of a key, of those that are also commands
+    others : commands that are not in `keys.KEYS`
+    steps : (3,) right, up, roll: movements requested by keys that no frame shows yet
+    moving : whether such a frame is being rendered
+    """
+
+    def __init__(
+        self,
+        page: PageContext,
+        sensor: Sensor,
+        step: Callable[[int], Awaitable[None]],
+        performers: Mapping[str, Action],
+        others: Sequence[Command],
+    ) -> None:
+        self.page = page
+        self.sensor = sensor
+        self.step = step
+        self.performers = {**performers, "help": self.toggle_help}
+        self.others = others
+        self.steps = np.zeros(3)
+        self.moving = False
+        self.help = keys.help_dialog()
+        self.palette = Palette(self.commands)
+        ui.keyboard(on_key=self.key, ignore=["input", "textarea"])
+
+    def commands(self) -> list[Command]:
+        """Every action with its key."""
+        by_key = [key for key in keys.KEYS if key.action in self.performers]
+        return [Command(key.help, key.label, partial(self.perform, key.action)) for key in by_key] + [*self.others]
+
+    async def key(self, event: KeyEventArguments) -> None:
+        """Do what a pressed key is for, unless a dialog is open."""
+        name = event.key.name.lower() if len(event.key.name) == 1 else event.key.name
+        action = keys.ACTION_BY_KEY.get(name)
+        if not event.action.keydown or action is None or event.modifiers.ctrl or event.modifiers.meta:
+            return
+        if self.palette.dialog.value or (self.help.value and action not in ("help", "close")):
+            return
+        if action == "move":
+            right, up, roll_sign = keys.MOVES[name]
+            step = pointing.COARSE if event.modifiers.shift else pointing.FINE
+            roll = pointing.ROLL_COARSE_DEG if event.modifiers.shift else pointing.ROLL_FINE_DEG
+            await self.move(right * step, up * step, roll_sign * roll)
+        elif action == "step":
+            await self.step(1 if name == "." else -1)
+        elif not event.action.repeat:
+            await self.perform(action)
+
+    async def move(self, right: float, up: float, roll_deg: float) -> None:
+        """Move the camera; steps requested while a frame is rendered are summed for the next frame."""
+        self.page.stop_playback()
+        self.page.show_message("")
+        self.steps += (right, up, roll_deg)
+        if self.moving:
+            return
+        self.moving = True
+        try:
+            while self.steps.any():
+                steps = self.steps.tolist()
+                self.steps = np.zeros(3)
+                await self.page.show_live("move", *steps, self.page.solving)
+                await self.sensor.wait_drawn()
+        finally:
+            self.moving = False
+
+    async def perform(self, action: str) -> None:
+        """Do what a key is for, without an older message."""
+        self.page.show_message("")
+        if action == "close":
+            self.help.close()
+        elif action in self.performers:
+            await perform(self.performers[action])
+
+    def toggle_help(self) -> None:
+        self.help.set_value(not self.help.value)

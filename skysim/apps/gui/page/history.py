@@ -1,0 +1,123 @@
+"""The page's view in the browser: in the address, in its history and in its storage.
+
+The browser's history is the list of undone and redone views: Ctrl-Z goes back, Ctrl-Shift-Z forward. So a reload, the
+back button and a shared link read a view from the address in the same way as undo does.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from nicegui import ui
+
+from skysim.apps.gui.shared.context import Shown
+from skysim.apps.gui.shared.state import View
+
+SETTLED = 3  # times of the timer without a change after which the next one is a new step
+WRITE_S = 0.4  # browsers refuse more than about 200 entries in 30 s
+JS = """
+window.skysimHistory = {
+  index: () => (history.state && history.state.skysim) || 0,
+  write(query, push, home) {
+    const at = this.index() + (push ? 1 : 0);
+    history[push ? "pushState" : "replaceState"]({ skysim: at }, "", query);
+    try { localStorage.setItem("skysim.view", JSON.stringify({ home, query })); } catch { /* storage is off */ }
+  },
+  read(home) {
+    if (/[?&]scene=/.test(location.search)) return location.search;
+    try {
+      const kept = JSON.parse(localStorage.getItem("skysim.view") || "{}");
+      return kept.home === home ? kept.query : "";
+    } catch { return ""; }
+  },
+  undo() { if (this.index() > 0) history.back(); },
+  redo() { history.forward(); },
+};
+window.addEventListener("popstate", () => emitEvent("view", location.search));
+document.addEventListener("keydown", event => {
+  const typing = event.target.closest && event.target.closest("input, textarea, [contenteditable]");
+  if (typing || !(event.ctrlKey || event.metaKey)) return;
+  const key = event.key.toLowerCase(), redo = key === "y" || (key === "z" && event.shiftKey);
+  if (key !== "z" && key !== "y") return;
+  event.preventDefault();
+  skysimHistory[redo ? "redo" : "undo"]();
+}, true);
+"""
+
+
+class History:
+    """Writes a page's view to the browser, and shows the view of an address.
+
+    home : the server's scene; a stored view is that of a server for the same one
+    show_query : shows the view of an address;  is_settling : whether the page does not show its view yet
+    written : the view in the address;  pending : the newest query that is asked for while another is being shown
+    moving : whether the last change was of attitude or time alone;  unchanged : times of the timer since then
+    """
+
+    def __init__(
+        self,
+        page: Shown,
+        home: str,
+        show_query: Callable[[str], Awaitable[None]],
+        is_settling: Callable[[], bool],
+    ) -> None:
+        self.page = page
+        self.home = home
+        self.show_query = show_query
+        self.is_settling = is_settling
+        self.written: View | None = None
+        self.showing = False
+        self.moving = False
+        self.unchanged = 0
+        self.pending: str | None = None
+        ui.add_body_html(f"<script>{JS}</script>")
+        ui.on("view", self.asked)
+        ui.timer(WRITE_S, self.write)
+
+    async def read(self) -> str:
+        """The query of the page's address, or else of the stored view."""
+        return str(await ui.run_javascript(f"skysimHistory.read({json.dumps(self.home)})", timeout=10) or "")
+
+    def write(self) -> None:
+        """Timer: write a changed view; a movement that goes on replaces the address, other changes add a step."""
+        view = self.page.state
+        if view is self.written or self.showing or self.is_settling():
+            self.unchanged += 1
+            return
+        before = self.written
+        self.written = view
+        moves = before is not None and view.same_step(before)
+        goes_on = moves and self.moving and self.unchanged < SETTLED
+        push = before is not None and before != view and not goes_on
+        self.moving = moves
+        self.unchanged = 0
+        arguments = ", ".join(json.dumps(value) for value in (view.query(), push, self.home))
+        ui.run_javascript(f"skysimHistory.write({arguments})")
+
+    def undo(self) -> None:
+        ui.run_javascript("skysimHistory.undo()")
+
+    def redo(self) -> None:
+        ui.run_javascript("skysimHistory.redo()")
+
+    def adopt(self) -> None:
+        """The address names the page's view already."""
+        self.written = self.page.state
+        self.moving = False
+
+    async def asked(self, event: Any) -> None:
+        """The browser has gone to another address of this page: show its view; of several, the newest."""
+        self.pending = str(event.args)
+        if self.showing:
+            return
+        self.showing = True
+        try:
+            while self.pending is not None:
+                query = self.pending
+                self.pending = None
+                await self.show_query(query)
+                self.adopt()
+        finally:
+            self.showing = False

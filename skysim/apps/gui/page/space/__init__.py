@@ -1,1 +1,0 @@
-"""The laboratory in three dimensions."""

@@ -1,0 +1,435 @@
+"""The page of a browser tab: builds its parts, opens scenes, and shows frames in all views."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from nicegui import run, ui
+
+from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
+from skysim.apps.gui.page.actions import Action, Actions, Command
+from skysim.apps.gui.page.arrangement import Arrangement
+from skysim.apps.gui.page.head import Head
+from skysim.apps.gui.page.history import History
+from skysim.apps.gui.page.log import LogPanel
+from skysim.apps.gui.panels import lights, monte_carlo
+from skysim.apps.gui.panels.attitude import AttitudeCard
+from skysim.apps.gui.panels.lights import LightsPanel
+from skysim.apps.gui.panels.monte_carlo import MonteCarloPanel
+from skysim.apps.gui.panels.photo import PhotoPanel
+from skysim.apps.gui.panels.plan import PlanPanel
+from skysim.apps.gui.panels.run import RunPanel
+from skysim.apps.gui.panels.settings import ScenePanel, TrackerPanel
+from skysim.apps.gui.shared import forms, keys, style
+from skysim.apps.gui.shared.live import Contents
+from skysim.apps.gui.shared.state import View
+from skysim.apps.gui.shared.wording import for_page
+from skysim.apps.gui.views.sensor import Sensor
+from skysim.apps.gui.views.served import FRAMES
+from skysim.apps.gui.views.space import Scene3D
+from skysim.apps.gui.worker import export
+from skysim.apps.gui.worker.photo import Photo
+from skysim.apps.gui.worker.session import Session, WorkerLost
+from skysim.core.errors import InputError
+from skysim.scene.loader import load
+
+PAUSE_S = 0.005  # between the parts of a page that is built, in which the keys of other pages are answered
+PANELS = ("Run", "Lights", "Scene", "Tracker", "Plan", "Monte Carlo", "Image", "Log")
+
+
+class Tab:
+    """One tab: its worker, its scene, and its page elements. It is the `PageContext` of its parts.
+
+    session : its worker, set when it has got one
+    new_session : gives another worker, None if there are too many
+    folder : where scenes are saved;  out : where studies are;  cameras : live ones that it may watch
+    user : its browser, see `server.user_of`
+    state, scene_info, view, is_open : see `Shown`
+    contents : of the fields that change with every frame
+    editing, filling : held while the scene is changed, or a form of its keys is filled
+    """
+
+    session: Session
+    new_session: Callable[[], Session | None]
+
+    def __init__(self, scene: str, folder: Path, out: Path, cameras: Sequence[str] = (), user: str = "") -> None:
+        self.id = secrets.token_hex(8)
+        self.user = user
+        self.folder = folder
+        self.out = out
+        self.cameras = cameras
+        self.state = View(scene)
+        self.scene_info: SceneInfo | None = None
+        self.view: FrameView | None = None
+        self.is_open = True
+        self.restarting = False
+        self.contents = Contents()
+        self.editing = asyncio.Lock()
+        self.filling = asyncio.Lock()
+
+    async def close(self) -> None:
+        """Release the tab's resources after its browser has gone: frames, study and worker."""
+        self.is_open = False
+        FRAMES.pop(self.id, None)
+        self.study_panel.close()
+        if hasattr(self, "session"):
+            await asyncio.to_thread(self.session.close)
+
+    def use(self, session: Session) -> None:
+        """Take a worker."""
+        self.session = session
+        self.sensor.source = session
+
+    async def restart(self) -> None:
+        """Show the view again with a new worker after the old one has ended."""
+        lost = self.session
+        session = self.new_session()
+        await asyncio.to_thread(lost.close)
+        if session is None:
+            self.show_message("the worker of this page has stopped, and all others are in use: reload to wait for one")
+            return
+        self.use(session)
+        self.view = None
+        wanted = self.state
+        self.log("the worker of this page has stopped; a new one shows the view again")
+        await self.restore(wanted)
+
+    # Page elements.
+
+    async def build(self) -> None:
+        """Build all elements, in parts between which other pages get their turn."""
+        ui.add_css(style.CSS)
+        ui.add_body_html(f"<script>{keys.SUPPRESS_DEFAULTS_JS}</script>")
+        ui.colors(
+            primary=style.DARK["accent"],
+            negative=style.DARK["bad"],
+            dark=style.DARK["panel"],
+            dark_page=style.DARK["ground"],
+        )
+        with ui.element("div").classes("lab"):
+            self.head = Head(self, self.contents, self.folder)
+            self.sensor = Sensor(self.id, self.contents)
+            self.sensor.show_setting_up(self.state.scene)
+            await asyncio.sleep(PAUSE_S)
+            with ui.element("div").classes("lab-side"):
+                Arrangement.splitter("side", "vertical", "Width of the panels")
+                self.attitude = AttitudeCard(self, self.contents)
+                await self.build_panels()
+            with ui.element("div").classes("lab-keys").mark("keys"):
+                for key in keys.KEYS:
+                    if key.description:
+                        ui.html(f"<span><kbd>{key.label}</kbd>{key.description}</span>", sanitize=False)
+        await asyncio.sleep(PAUSE_S)
+        self.history = History(self, self.state.scene, self.show_query, self.is_settling)
+        self.arrangement = Arrangement([self.run_panel.strips.chart, self.study_panel.chart])
+        self.actions = Actions(self, self.sensor, self.run_panel.step, self.performers(), self.commands())
+        # A timer waits for the browser, whereupon NiceGUI sends the page as it is: so timers come after all pauses.
+        ui.timer(lights.UPDATE_S, self.update_lights)
+        ui.timer(monte_carlo.POLL_S, self.study_panel.poll)
+
+    async def build_panels(self) -> None:
+        with ui.element("div").classes("lab-panes"):
+            with ui.element("div").classes("lab-space-pane"):
+                self.scene_3d = Scene3D(self, self.sensor)
+            Arrangement.splitter("space", "horizontal", "Height of the 3-D view")
+            with ui.tabs().props("dense align=left no-caps indicator-color=primary") as self.tabs:
+                # Otherwise the arrow keys would select tabs.
+                self.tabs.on("click", js_handler=keys.BLUR_JS)
+                for name in PANELS:
+                    ui.tab(name).mark(f"tab-{name}")
+            with ui.tab_panels(self.tabs, value=PANELS[0], animated=False, keep_alive=True).classes("lab-panels"):
+                with ui.tab_panel("Lights"):
+                    self.lights = LightsPanel(self.sensor)
+                with ui.tab_panel("Scene"):
+                    self.scene_panel = ScenePanel(self, self.folder, self.head.update_scenes)
+                await asyncio.sleep(PAUSE_S)
+                with ui.tab_panel("Run").classes("lab-run"):
+                    self.run_panel = RunPanel(self, self.contents, self.sensor)
+                with ui.tab_panel("Plan"):
+                    self.plan_panel = PlanPanel(self, self.scene_3d, self.run_panel)
+                await asyncio.sleep(PAUSE_S)
+                with ui.tab_panel("Monte Carlo"):
+                    self.study_panel = MonteCarloPanel(self, self.out, self.user, self.id)
+                await asyncio.sleep(PAUSE_S)
+                with ui.tab_panel("Tracker"):
+                    self.tracker_panel = TrackerPanel(self, self.study_panel)
+                with ui.tab_panel("Image"):
+                    self.photo = PhotoPanel(self, self.cameras)
+                with ui.tab_panel("Log"):
+                    self.log_panel = LogPanel(self)
+        self.tabs.on_value_change(self.fill_form)
+
+    def update_lights(self) -> None:
+        """Timer: fill the table of lights while it is open."""
+        if self.tabs.value == "Lights":
+            self.lights.update()
+
+    # Actions of keys and of the command palette.
+
+    def performers(self) -> dict[str, Action]:
+        """What the keys are for, by the names of their actions."""
+        return {
+            "identify": self.identify,
+            "noise": self.head.toggle_noise,
+            "monte_carlo": self.start_study,
+            "play": self.run_panel.toggle,
+            "live": self.head.go_live,
+            "attitude": self.attitude.focus,
+            "sensor": partial(self.set_up_tracker, "sensor"),
+            "identifier": partial(self.set_up_tracker, "identifier"),
+            "runs": self.set_up_study,
+            "log": partial(self.show_panel, "Log"),
+        }
+
+    def commands(self) -> list[Command]:
+        """Further commands: those of the flight, of the history and of the arrangement, panels, and exports."""
+        return [
+            Command("show the next frame of the flight", ".", partial(self.run_panel.step, 1)),
+            Command("show the previous frame of the flight", ",", partial(self.run_panel.step, -1)),
+            Command("undo the last change", "Ctrl Z", self.history.undo),
+            Command("redo the change that was undone", "Ctrl Shift Z", self.history.redo),
+            Command("compute the flight of the scene, or stop that", "", self.run_panel.simulate),
+            Command("change between the dark and the light theme", "", self.arrangement.toggle),
+            Command("give frame, 3-D view and panels their first sizes", "", self.arrangement.reset),
+            *(Command(f"panel: {name}", "", partial(self.show_panel, name)) for name in PANELS),
+            *(Command(f"export: {name}", "", partial(self.head.export, name)) for name in export.FILE_BY_ITEM),
+        ]
+
+    async def identify(self) -> None:
+        """Render a new frame of the live scene, solve it, and log what the tracker found."""
+        self.stop_playback()
+        await self.show_live("render", True)
+        if self.view and self.view.result and self.scene_info:
+            self.log_panel.identified(self.view, self.scene_info)
+
+    async def start_study(self) -> None:
+        self.show_panel("Monte Carlo")
+        await self.study_panel.start()
+
+    def set_up_study(self) -> None:
+        self.show_panel("Monte Carlo")
+        self.study_panel.focus()
+
+    async def set_up_tracker(self, action: str) -> None:
+        """Open the tracker's form at sensor or identifier."""
+        self.show_panel("Tracker")
+        await self.fill_form()
+        self.tracker_panel.open(action)
+
+    # The view of the page's address.
+
+    async def start(self, session: Session, new_session: Callable[[], Session | None]) -> None:
+        """Show the first view: that of the page's address or of the browser's storage, else the server's scene."""
+        self.use(session)
+        self.new_session = new_session
+        await self.arrangement.restore()
+        await self.show_query(await self.history.read())
+        refusal = self.message_text
+        if self.is_open and self.view is None and await self.open(self.state.scene):
+            self.show_message(refusal)
+
+    async def show_query(self, query: str) -> None:
+        """Show the view of an address; refuse one that is not of this server."""
+        try:
+            wanted = View.from_query(query, self.head.scenes())
+            if wanted:
+                await asyncio.to_thread(forms.validated_scene, wanted.scene, wanted.overrides)
+        except InputError as error:
+            self.show_message(for_page(error))
+            return
+        if wanted:
+            await self.restore(wanted)
+
+    async def restore(self, wanted: View) -> None:
+        """Show a view again: open its scene if it is another, point there, then fly or replay."""
+        now = self.state
+        is_shown = self.view is not None and (now.scene, now.overrides) == (wanted.scene, wanted.overrides)
+        if not is_shown or wanted.angles_deg is None:
+            if not await self.open(wanted.scene, wanted.overrides, wanted.angles_deg):
+                return
+        elif wanted.kind == "live" and (now.kind != "live" or now.angles_deg != wanted.angles_deg):
+            self.stop_playback()
+            await self.show_live("point", wanted.angles_deg, self.solving)
+        if wanted.study != self.state.study:
+            await self.study_panel.show_study(wanted.study)
+        if wanted.kind == "flight":
+            await self.run_panel.restore(wanted.t_s, self.history.adopt)
+        elif wanted.kind == "replay" and wanted.study == self.state.study:
+            await self.study_panel.replay(wanted.trial)
+        elif wanted.kind == "photo":
+            self.show_message(f"{wanted.photo}: drop the image again to see it", "quiet")
+
+    def is_settling(self) -> bool:
+        """Whether the page does not show its state yet."""
+        return self.view is None or self.run_panel.wanted_s is not None
+
+    # The scene.
+
+    async def open(
+        self, scene: str, overrides: Mapping[str, str] | None = None, angles_deg: Triple | None = None
+    ) -> bool:
+        """Set up a scene and show a first frame, at its start or at other angles; keep the old scene if that fails."""
+        self.stop_playback()
+        self.run_panel.stop_computing()
+        overrides = dict(overrides or {})
+        name = Path(scene).name
+        if not self.view:  # the sensor view shows the message
+            self.sensor.show_setting_up(scene)
+        path = forms.absolute_path(scene)
+        activity = f"setting up {name} …" if self.view else ""
+        result = await self.run_task("open", path, overrides, self.solving, angles_deg, activity=activity)
+        if result is None:
+            self.head.picker.set_value(self.state.scene)
+            if self.view is None:
+                self.sensor.show_waiting(f"{name} cannot be set up:", self.message_text, in_vain=True)
+            return False
+        self.scene_info, view = result
+        control = (await asyncio.to_thread(load, path, overrides)).motion.control
+        self.set_state(scene=scene, overrides=overrides)
+        self.set_scene(self.scene_info, control.feedback if control else None)
+        self.show_live_view(view)
+        self.scene_panel.shown = self.tracker_panel.shown = None  # the file may be another one under the same name
+        await self.fill_form()
+        self.log(f"opened {name}" + (f" with {', '.join(overrides)}" if overrides else ""))
+        return True
+
+    def set_scene(self, info: SceneInfo, feedback: str | None) -> None:
+        """Show a new scene in all parts of the page. feedback : of its controller; None without one"""
+        self.head.set_scene(info)
+        self.attitude.set_scene(info)
+        self.scene_3d.set_scene(info)
+        self.sensor.clear_zoom()
+        self.run_panel.set_scene(feedback)
+        self.plan_panel.set_scene()
+        self.study_panel.set_scene()
+
+    async def apply_overrides(self, overrides: Mapping[str, str], dropped: Collection[str] = ()) -> None:
+        """Reopen the scene with further overrides and without some; edits made meanwhile follow one after the other."""
+        async with self.editing:
+            kept = {key: text for key, text in self.state.overrides.items() if key not in dropped}
+            await self.open(self.state.scene, {**kept, **overrides})
+
+    async def fill_form(self) -> None:
+        """Show the keys of the current scene in the panel of them that is open; it takes a while, so not in others."""
+        panels: dict[str, ScenePanel | TrackerPanel] = {"Scene": self.scene_panel, "Tracker": self.tracker_panel}
+        panel = panels.get(str(self.tabs.value))
+        async with self.filling:
+            while panel and self.view and self.is_open and panel.shown != self.opened:
+                current = self.opened
+                fields = await run.io_bound(forms.fields, *current)
+                if self.is_open and self.opened == current:
+                    panel.set_scene(fields)
+                    panel.shown = current
+
+    @property
+    def opened(self) -> tuple[str, Mapping[str, str]]:
+        """The open scene and its overrides."""
+        return self.state.scene, self.state.overrides
+
+    # What is shown.
+
+    @property
+    def solving(self) -> bool:
+        """Whether every frame is solved."""
+        return bool(self.head.identify.value)
+
+    @property
+    def message_text(self) -> str:
+        """The message in the head."""
+        return self.head.message_text
+
+    def set_state(self, **changes: Any) -> None:
+        """Change what the page shows, as the banner says."""
+        self.state = replace(self.state, **changes)
+        self.head.set_state(self.state)
+
+    def show_frame(self, view: FrameView, **state: Any) -> None:
+        """Show a frame of the scene: live, or of its flight. state : changes of what the page shows"""
+        self.set_state(**state)
+        self.view = view
+        self.attitude.show(view)
+        self.scene_3d.show(view)
+        self.sensor.show(view, self.scene_info)
+
+    def show_live_view(self, view: FrameView) -> None:
+        self.show_frame(view, kind="live", angles_deg=view.angles_deg)
+
+    def show_photo(self, photo: Photo, /, **state: Any) -> None:
+        """Show an image that is not of the scene as it is now: a photograph, or a trial again.
+
+        state : see `show_frame`
+        """
+        self.set_state(**state)
+        self.attitude.show_photo(photo)
+        self.sensor.show_photo(photo)
+
+    def show_panel(self, name: str) -> None:
+        """Open one of PANELS."""
+        self.tabs.set_value(name)
+
+    def stop_playback(self) -> None:
+        """Stop playback, a pushed vehicle and the live camera, because the sensor view is needed for something else."""
+        self.run_panel.pause()
+        self.scene_3d.push.stop()
+        self.photo.stop()
+
+    def show_message(self, text: str, color: str = "warn") -> None:
+        """Show a message in the head until the next action; warnings are also logged."""
+        if text == self.message_text:
+            return
+        self.head.set_message(text, color)
+        if text and color == "warn":
+            self.log(text)
+
+    def log(self, text: str) -> None:
+        """Add a line to the log."""
+        self.log_panel.add(text)
+
+    # What the worker is asked for.
+
+    async def ask(self, task: str, *arguments: Any) -> Any:
+        """Result of a task of the worker; None after an error, which is shown in one line, or if the tab has closed."""
+        try:
+            result = await self.session.run(task, *arguments)
+        except InputError as error:
+            if self.is_open:
+                self.show_message(for_page(error))
+            return None
+        except WorkerLost as error:
+            if self.is_open and not self.restarting:
+                self.restarting = True
+                self.show_message(f"{error}; a new one shows the view again")
+                try:
+                    await self.restart()
+                finally:
+                    self.restarting = False
+            return None
+        return result if self.is_open else None
+
+    async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:
+        """`ask`, with the mark of a busy page. activity : message until the task ends; it replaces an older one"""
+        self.show_message(activity, "quiet")
+        self.head.busy.set_visibility(True)
+        try:
+            return await self.ask(task, *arguments)
+        finally:
+            if self.is_open:
+                self.head.busy.set_visibility(False)
+                if activity and self.message_text == activity:
+                    self.show_message("")
+
+    async def show_live(self, task: str, *arguments: Any) -> FrameView | None:
+        """Show the frame of the live scene that a task renders; None if that failed or the tab has closed."""
+        begin = time.perf_counter()
+        view = await self.ask(task, *arguments)
+        if view is not None:
+            self.head.latency.set_text(f"{1e3 * (time.perf_counter() - begin):.0f} ms")
+            self.show_live_view(view)
+        return view

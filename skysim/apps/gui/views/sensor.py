@@ -1,0 +1,310 @@
+"""Sensor view: the newest frame with its marks, its display settings, and data on the light under the mouse."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import functools
+import math
+from collections.abc import Collection
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qsl
+
+import cv2
+import numpy as np
+from nicegui import ui
+
+from skysim.apps.gui.messages import (
+    LIMITS,
+    NO_LIGHTS,
+    Detection,
+    FrameView,
+    Lens,
+    Light,
+    Lights,
+    Pixels,
+    Pose,
+    SceneInfo,
+    TrackerResult,
+)
+from skysim.apps.gui.shared import keys
+from skysim.apps.gui.shared.live import Contents, LiveText
+from skysim.apps.gui.views import overlay
+from skysim.apps.gui.views.served import FRAMES, ServedFrame, Source, TabFrames, display_of
+from skysim.apps.gui.views.star_names import NAMES
+from skysim.apps.gui.worker.photo import Photo
+from skysim.core.types import Floats
+from skysim.results import stretch
+from skysim.sources.solar_system.bodies import NAMES as BODIES
+
+FIRST_START = "The first frame on a machine takes up to a minute, because the code is compiled."
+LABELS = NAMES | BODIES  # by number
+STRETCHES = list(stretch.CURVES)
+COLOR_MAPS = {
+    "gray": None,
+    "gray, inverted": None,
+    "viridis": cv2.COLORMAP_VIRIDIS,
+    "cividis": cv2.COLORMAP_CIVIDIS,
+    "inferno": cv2.COLORMAP_INFERNO,
+    "hot": cv2.COLORMAP_HOT,
+}
+AHEAD = 2  # frames that the browser fetches while it draws another one
+DRAW_TIMEOUT_S = 1.0  # for the browser to report a drawn frame
+
+
+class Canvas(ui.element, component="js/frame.js", esm={"skysim-views": "js"}):  # type: ignore[call-arg]
+    """The frame with its loupe and plot, implemented in frame.js."""
+
+
+class Sensor:
+    """The view and its controls. It shows a frame of the scene, or another image such as a user's.
+
+    id, contents : of the tab, and its live fields;  source : of pixels, set when the tab has got a worker
+    hover_px : place of the light under the mouse, or None
+    sent_number : of the last frame sent to the browser;  frames : the newest ones
+    """
+
+    source: Source
+
+    def __init__(self, id: str, contents: Contents) -> None:
+        self.id = id
+        self.contents = contents
+        self.shown = {"truth", "identified", "false"}
+        self.lights: Lights = NO_LIGHTS
+        self.result: TrackerResult | None = None
+        self.size_px = (4, 3)
+        self.prefix = "HIP"
+        self.lens: Lens | None = None
+        self.pose: Pose | None = None
+        self.statistics = ""  # numbers of the frame, shown while the mouse is on no light
+        self.hover_px: tuple[float, float] | None = None
+        self.sent_number = 0
+        self.frames = TabFrames(self.announce)
+        self.frame_drawn = asyncio.Event()
+        with ui.element("div").classes("lab-sensor"):
+            self.build_controls()
+            with Canvas().mark("sensor") as self.canvas:
+                self.hover = LiveText(contents).classes("mono").mark("hover")
+            with self.canvas.add_slot("wait"), ui.element("div").classes("lab-wait") as self.wait:
+                # No spinner: each takes a sixth of a core from the worker that it waits for, without a graphics card.
+                self.waited = ui.element("div").classes("lab-waited mono")
+                self.wait_label = ui.label().mark("wait")
+        contents.send = lambda changed: self.canvas.run_method("setContents", changed)
+        self.canvas.on("hover", self.hover_changed)
+        self.canvas.on("choose", self.light_chosen)
+        self.canvas.on("manual", lambda: self.limits.set_value("manual"))
+        self.canvas.on("drawn", self.drawn)
+        self.update_display()
+
+    def show_setting_up(self, scene: str) -> None:
+        """Show that the first frame of a scene is being made."""
+        self.show_waiting(f"Setting up {Path(scene).name} …", FIRST_START)
+
+    def show_waiting(self, *lines: str, in_vain: bool = False) -> None:
+        """Show what the first frame waits for, and for how long the page has waited; or why there is none (in_vain)."""
+        self.wait_label.set_text("\n".join(lines))
+        self.waited.set_visibility(not in_vain)
+
+    def build_controls(self) -> None:
+        with ui.element("div").classes("lab-bar"):
+            for kind in overlay.KINDS:
+                box = ui.checkbox(kind, value=kind in self.shown).props("dense size=xs")
+                box.style(f"color: {overlay.COLORS[kind]}").mark(f"overlay-{kind}")
+                box.on_value_change(lambda event, kind=kind: self.toggle(kind, event.value))
+            self.grid = ui.checkbox("grid", value=False, on_change=self.update_display).props("dense size=xs")
+            self.grid.mark("grid")
+            ui.space()
+            self.stretch = self.select("Stretch", STRETCHES, "w-28")
+            self.limits = self.select("Limits", LIMITS, "w-24")
+            self.colors = self.select("Colors", list(COLOR_MAPS), "w-24")
+
+    def select(self, name: str, options: Collection[str], width: str) -> ui.select:
+        """A list of display settings."""
+        chosen = ui.select(list(options), value=next(iter(options)), on_change=self.update_display)
+        chosen.props(f'dense borderless options-dense aria-label="{name}"').classes(width)
+        return chosen.on("popup-hide", js_handler=keys.BLUR_JS)
+
+    def update_display(self) -> None:
+        """Send the display settings; the browser applies them."""
+        self.canvas.props["display"] = {
+            "curve": self.stretch.value,
+            "limits": self.limits.value,
+            "table": color_table(str(self.colors.value)),
+            "grid": self.grid.value,
+        }
+        self.canvas.update()
+
+    def clear_zoom(self) -> None:
+        """Show the whole frame."""
+        self.canvas.run_method("fit")
+
+    def toggle(self, kind: str, on: bool) -> None:
+        self.shown = self.shown | {kind} if on else self.shown - {kind}
+        self.update_marks()
+
+    def display_image(self, pixels: Pixels, alone: bool) -> None:
+        """Display a new image, as large as the window allows. alone : see `TabFrames.add`"""
+        if not self.sent_number:
+            self.wait.set_visibility(False)
+        self.sent_number += 1  # so that each frame has its own address
+        fields = self.fields() | {"contents": self.contents.take()}
+        FRAMES[self.id] = self.frames
+        self.frames.add(self.sent_number, ServedFrame(pixels, fields, self.source), alone)
+
+    def announce(self, number: int) -> None:
+        """Let the browser request a frame."""
+        self.canvas.run_method("show", {"src": self.address(number)})
+
+    def drawn(self, event: Any) -> None:
+        """The browser reports a drawn frame, and how it draws the next ones."""
+        self.frames.drawn = int(event.args["src"].rpartition("/")[2])
+        self.frame_drawn.set()
+        display = display_of(dict(parse_qsl(str(event.args["display"]))))
+        if display:
+            self.source.display = display
+
+    async def wait_drawn(self) -> None:
+        """Wait until the browser has few frames to draw, so that they do not queue up there."""
+        while self.sent_number > self.frames.drawn + AHEAD:
+            self.frame_drawn.clear()
+            try:
+                await asyncio.wait_for(self.frame_drawn.wait(), DRAW_TIMEOUT_S)
+            except TimeoutError:
+                return
+
+    def show(self, view: FrameView, info: SceneInfo | None) -> None:
+        """Show a frame of the scene."""
+        self.prefix = info.prefix if info else "HIP"
+        self.statistics = statistics_text(view.size_px, view.statistics, view.result, view, info)
+        self.take(view, info.lens if info else None)
+
+    def show_photo(self, photo: Photo) -> None:
+        """Show a user's image or the frame of a study's trial."""
+        self.prefix = photo.prefix
+        self.statistics = statistics_text(photo.size_px, photo.statistics, photo.result)
+        self.take(photo, photo.lens)
+
+    def take(self, view: FrameView | Photo, lens: Lens | None) -> None:
+        """Take over lights, solution and pointing of a new image, and display it."""
+        self.lights = view.lights
+        self.result = view.result
+        self.size_px = view.size_px
+        self.pose = view.pose
+        is_new_lens = lens is not self.lens
+        if is_new_lens:
+            self.lens = lens
+            self.canvas.run_method("setLens", asdict(lens) if lens else None)
+        self.update_text()
+        self.display_image(view.pixels, alone=is_new_lens)
+
+    def update_text(self) -> None:
+        """Show data on the light under the mouse, or else the frame's numbers."""
+        at = self.hover_px
+        self.hover.set_text(self.light_text(*self.nearest(*at)) if at else self.statistics)
+
+    def address(self, number: int) -> str:
+        return f"/frame/{self.id}/{number}"
+
+    def fields(self) -> dict[str, Any]:
+        """What frame.js needs beside the pixels: pointing and marks."""
+        view = {
+            "pose": pose_fields(self.pose) if self.pose else None,
+            "label": self.description(),
+        }
+        return view | overlay.marks(self.lights, self.result, self.shown, self.name)
+
+    def update_marks(self) -> None:
+        """Send other marks of the newest frame; not as properties, which would be sent again whole with each change
+        of any of them."""
+        self.canvas.run_method("show", {"src": self.address(self.sent_number)} | self.fields())
+
+    def description(self) -> str:
+        """Text alternative of the view for screen readers."""
+        detections = self.result.detections if self.result else ()
+        identified = [self.name(detection.id) for detection in detections if detection.id >= 0]
+        return f"Sensor view: {len(self.lights)} true lights; identified: {', '.join(identified) or 'none'}"
+
+    def name(self, id: int) -> str:
+        if self.prefix != "HIP":
+            return f"{self.prefix} {id}"
+        return LABELS.get(id, f"HIP {id}" if id < 1_000_000 else f"star {id}")
+
+    def hover_changed(self, event: Any) -> None:
+        """The mouse is on another light, or on none."""
+        self.hover_px = (event.args["x"], event.args["y"]) if event.args["inside"] else None
+        self.update_text()
+
+    def light_chosen(self, event: Any) -> None:
+        """A click: what is known of the light there stays on the page until the mouse is on another one."""
+        self.hover_px = (event.args["x"], event.args["y"]) if event.args["id"] is not None else None
+        self.update_text()
+
+    def nearest(self, x: float, y: float) -> tuple[Detection | None, Light | None]:
+        """The nearest detection and the nearest true light within a few marks' width, or None."""
+        radius_px = max(8.0, self.size_px[0] / 60)
+
+        def nearest(places_px: Floats) -> int | None:
+            distance_px = np.hypot(*(places_px - (x, y)).T)
+            return int(distance_px.argmin()) if (distance_px < radius_px).any() else None
+
+        detections = self.result.detections if self.result else ()
+        spot = nearest(np.array([(one.x, one.y) for one in detections], float).reshape(-1, 2))
+        light = nearest(self.lights.xy_px)
+        return None if spot is None else detections[spot], None if light is None else self.lights[light]
+
+    def light_text(self, detection: Detection | None, light: Light | None) -> str:
+        """Text on a light: where it truly is, the detection and its error."""
+        lines = []
+        if light:
+            brightness = "" if math.isnan(light.magnitude) else f"V {light.magnitude:.2f}  "
+            lines += [f"truth      {light.x:8.2f} {light.y:8.2f}   {self.name(light.id)}"]
+            lines += [f"           {brightness}{light.electrons:.4g} e-"]
+        if detection:
+            identity = self.name(detection.id) if detection.id >= 0 else "not identified"
+            lines += [f"centroid   {detection.x:8.2f} {detection.y:8.2f} ± {detection.sigma_px:.3f} px"]
+            residual = "" if math.isnan(detection.residual_px) else f"   residual {detection.residual_px:.3f} px"
+            lines += [f"           {identity}", f"           flux {detection.flux:.4g}{residual}"]
+            if light:
+                lines += [f"           error {math.hypot(detection.x - light.x, detection.y - light.y):.3f} px"]
+        return "\n".join(lines)
+
+
+def pose_fields(pose: Pose) -> dict[str, Any]:
+    """A pose for frame.js."""
+    fields: dict[str, Any] = {"rotation": pose.rotation}
+    return fields | ({"place_m": pose.place_m, "depth_m": pose.depth_m} if pose.depth_m else {})
+
+
+@functools.cache
+def color_table(name: str) -> str:
+    """256 x (red, green, blue) of a color map, base64."""
+    ramp = np.arange(256, dtype=np.uint8)[:, None]
+    kind = COLOR_MAPS[name]
+    if kind is None:
+        table = np.repeat(ramp, 3, axis=1)
+        return base64.b64encode((255 - table if "inverted" in name else table).tobytes()).decode()
+    return base64.b64encode(cv2.applyColorMap(ramp, kind)[:, 0, ::-1].tobytes()).decode()
+
+
+def statistics_text(
+    size_px: tuple[int, int],
+    statistics: stretch.FrameStatistics,
+    result: TrackerResult | None,
+    view: FrameView | None = None,
+    scene_info: SceneInfo | None = None,
+) -> str:
+    """A frame's numbers in two columns; fewer for an image that is not of the scene (view is None)."""
+    field = ("field", f"{scene_info.field_deg:.4g}°") if scene_info else ("", "")
+    rows = [("frame", f"{size_px[0]} × {size_px[1]} px", *field)]
+    if view:
+        rows += [("exposure", f"{1e3 * view.exposure_s:.4g} ms", "rendering", f"{view.ms:.0f} ms")]
+    rows += [
+        ("sky", f"{statistics.sky_dn:.5g} DN", "scatter", f"{statistics.scatter_dn:.3g} DN"),
+        ("brightest", f"{statistics.peak_dn:.5g} DN", "saturated", f"{statistics.saturated} px"),
+    ]
+    lights = ("lights", f"{len(view.lights)} in the field") if view else ()
+    detected = ("identified", f"{result.identified} of {len(result.detections)}") if result else ()
+    rows += [(*lights, *detected, "", "", "", "")[:4]]
+    return "\n".join(f"{a:<11s}{b:<18s}{c:<11s}{d}".rstrip() for a, b, c, d in rows)

@@ -1,0 +1,128 @@
+"""3-D view of the laboratory (three.js): the shapes of its MJCF file, the lights and the vehicle's attitude."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import nicegui.elements.scene  # registers three.js with the page  # noqa: F401
+import numpy as np
+from nicegui import ui
+from numpy.typing import NDArray
+
+from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo
+from skysim.apps.gui.shared.context import PageContext
+from skysim.apps.gui.shared.style import DARK, color_scale
+from skysim.apps.gui.views.push import PushControl
+from skysim.apps.gui.views.sensor import Sensor
+from skysim.core.types import Floats
+from skysim.dynamics.multibody import Shape
+
+VIEWS = {
+    "outside": "from beside the laboratory",
+    "camera": "from the star camera along its boresight",
+    "bearing": "from the bearing upwards",
+    "top": "from above",
+}
+UPDATE_S = 0.1
+AXIS = 0.35  # length of the axes over the distance from which the laboratory is seen
+MOST_AXIS_M = 1.2
+DIGITS = 5  # of meters
+
+
+class Space(ui.element, component="js/space.js", esm={"skysim-views": "js"}):  # type: ignore[call-arg]
+    """The picture, implemented in space.js."""
+
+
+class Scene3D:
+    """The view and its buttons; `set_scene` builds it, `show` sets the attitude, which is sent a little later.
+
+    newest_view : that is not sent yet;  waits : whether `send_newest` will be called
+    """
+
+    def __init__(self, page: PageContext, sensor: Sensor) -> None:
+        self.page = page
+        self.sensor = sensor
+        self.newest_view: FrameView | None = None
+        self.waits = False
+        self.canvas = Space().classes("w-full h-full").mark("space")
+        with ui.element("div").classes("lab-looks"):
+            for name, text in VIEWS.items():
+                button = ui.button(name, color=None, on_click=lambda name=name: self.look(name))
+                button.props("dense outline size=xs")
+                button.props(f'title="look {text}"').mark(f"look-{name}")
+        hint = ui.label("drag: rotate · drag the vehicle: push it · right drag: pan · wheel: zoom")
+        hint.classes("lab-turn")
+        self.push = PushControl(page, sensor, self.canvas, self.update)
+
+    def look(self, name: str) -> None:
+        """Look from a preset, also to undo how the user has turned the view."""
+        self.canvas.run_method("look", name)
+
+    def set_scene(self, scene_info: SceneInfo) -> None:
+        lab = scene_info.geometry
+        outside = lab.views["outside"]
+        distance_m = sum((a - b) ** 2 for a, b in zip(outside.eye_m, outside.target_m, strict=True)) ** 0.5
+        self.canvas.run_method(
+            "build",
+            {
+                "shapes": [shape_fields(shape) for shape in lab.shapes],
+                "lights": light_fields(lab),
+                "views": {name: view._asdict() for name, view in lab.views.items()},
+                "background": DARK["ground"],
+                "prefix": scene_info.prefix,
+                "axis": min(AXIS * distance_m, MOST_AXIS_M),
+            },
+        )
+
+    def color_lights(self, ids: NDArray[np.int64], values: Floats) -> None:
+        """Color some lights by values from 0 to 1, until the scene changes."""
+        colors = (f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in 255 * color_scale(values))
+        self.canvas.run_method("color", list(zip(ids.tolist(), colors, strict=True)))
+
+    def show(self, view: FrameView) -> None:
+        """Send the newest attitude soon, so that of many frames in a short time only the last is sent."""
+        self.newest_view = view
+        if not self.waits:
+            self.waits = True
+            asyncio.get_running_loop().call_later(UPDATE_S, self.send_newest)
+
+    def send_newest(self) -> None:
+        self.waits = False
+        self.update()
+
+    def update(self) -> None:
+        """Send the vehicle's attitude, and the lights that are on the frame and that are identified."""
+        view = self.newest_view
+        self.newest_view = None
+        if view is None or not self.page.is_open:
+            return
+        found = view.result.detections if view.result else ()
+        identified = {spot.id: self.sensor.name(spot.id) for spot in found if spot.id >= 0}
+        fields = {"wxyz": view.body_wxyz, "seen": view.lights.id.tolist()}
+        self.canvas.run_method("show", fields | {"identified": list(identified.items())})
+
+
+def shape_fields(shape: Shape) -> dict[str, Any]:
+    """A shape for space.js."""
+    return {
+        "name": shape.name,
+        "kind": shape.kind,
+        "size": shape.size_m,
+        "position": shape.position_m,
+        "wxyz": shape.parent_from_shape_wxyz,
+        "rgba": shape.rgba,
+        "on_vehicle": shape.on_vehicle,
+        "vertices": shape.vertices_m.round(DIGITS).ravel().tolist(),
+        "faces": shape.faces.ravel().tolist(),
+    }
+
+
+def light_fields(lab: LabGeometry) -> dict[str, Any]:
+    """The lights for space.js."""
+    return {
+        "id": lab.ids.tolist(),
+        "place": lab.lights_m.round(DIGITS).ravel().tolist(),
+        "radius": lab.radius_m.round(DIGITS).tolist(),
+        "lit": lab.lit.tolist(),
+    }

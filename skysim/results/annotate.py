@@ -1,0 +1,130 @@
+"""Draw markers and captions on frames: truth, detections and identified sources."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.types import Floats, SourceTruth
+from skysim.results.stretch import to_8bit
+from skysim.sources.false_lights import light_name
+
+LEGEND_PX = 20  # height of the legend
+MIN_SNR = 3.0  # of the true sources that are marked: no one sees fainter ones
+TRUTH_BGR, DETECTED_BGR, MATCHED_BGR = (200, 160, 60), (80, 80, 235), (110, 220, 90)
+
+
+def frame_levels(image: NDArray) -> tuple[float, float]:
+    """Black and white levels in DN: the 30th percentile (the sky), and the 99.95th percentile or a quarter of the peak.
+
+    The higher of the two, so that a few bright sources do not leave a large part of the image white.
+    """
+    low, high = np.percentile(image, (30, 99.95))
+    return float(low), max(float(high), float(low) + 1.0, float(image.max()) * 0.25)
+
+
+def enlarged(image: NDArray) -> tuple[NDArray[np.uint8], int, int]:
+    """The stretched frame in BGR, its scale (2 if smaller than 1000 pixels), and the size of markers in pixels."""
+    scale = 2 if max(image.shape) < 1000 else 1
+    picture = cv2.cvtColor(to_8bit(image, "square root", levels_dn=frame_levels(image)), cv2.COLOR_GRAY2BGR)
+    picture = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST), np.uint8)
+    return picture, scale, max(8, min(picture.shape[:2]) // 70)
+
+
+def visible(sources: SourceTruth) -> NDArray[np.bool_]:
+    """(N,) whether a true source has a signal-to-noise ratio above MIN_SNR, or none is known."""
+    return ~(sources.snr <= MIN_SNR)
+
+
+def annotate(
+    image: NDArray,
+    detected_px: Floats,
+    matched_px: Floats,
+    labels: list[str] | None = None,
+    truth_px: Floats | None = None,
+) -> NDArray[np.uint8]:
+    """The stretched frame in BGR with blue ticks (truth), red squares (detections), green circles (matched stars).
+
+    All markers leave their center open. A frame smaller than 1000 pixels is enlarged twice, so that the markers do
+    not cover its stars. `labels` are written beside the matched stars. With a truth there is a legend below.
+    """
+    picture, scale, size = enlarged(image)
+    for x, y in pixel_positions(truth_px, scale):
+        draw_ticks(picture, x, y, size, TRUTH_BGR)
+    for x, y in pixel_positions(detected_px, scale):
+        cv2.rectangle(picture, (x - size, y - size), (x + size, y + size), DETECTED_BGR, 1)
+    for n, (x, y) in enumerate(pixel_positions(matched_px, scale)):
+        cv2.circle(picture, (x, y), size + 4, MATCHED_BGR, 1, cv2.LINE_AA)
+        if labels:
+            draw_label(picture, labels[n], x + size + 6, y + 4, MATCHED_BGR)
+    if truth_px is None:
+        return picture
+    meanings = {f"true, SNR > {MIN_SNR:g}": TRUTH_BGR, "detected": DETECTED_BGR, "matched": MATCHED_BGR}
+    return with_legend(picture, meanings)
+
+
+def annotate_truth(image: NDArray, sources: SourceTruth) -> NDArray[np.uint8]:
+    """The stretched frame in BGR with ticks at the flux centroid of each visible source and the 40 brightest labeled.
+
+    Blue marks unsaturated sources, red those expected to saturate. A frame smaller than 1000 pixels is enlarged twice.
+    """
+    picture, scale, size = enlarged(image)
+    labeled = set(np.argsort(-sources.electrons)[:40].tolist())
+    seen = visible(sources)
+    for n, (x, y) in enumerate(pixel_positions(sources.flux_xy_px, scale)):
+        if not seen[n]:
+            continue
+        color = DETECTED_BGR if sources.saturated[n] else TRUTH_BGR
+        draw_ticks(picture, x, y, size, color)
+        if n in labeled:
+            draw_label(picture, light_name(int(sources.id[n])), x + size + 2, y - size, color)
+    return with_legend(picture, {f"true, SNR > {MIN_SNR:g}": TRUTH_BGR, "saturated": DETECTED_BGR})
+
+
+def with_legend(picture: NDArray[np.uint8], meanings: dict[str, tuple[int, int, int]]) -> NDArray[np.uint8]:
+    """The picture with a strip below it that names the colors of its markers; pixels keep their places."""
+    strip = cv2.copyMakeBorder(picture, 0, LEGEND_PX, 0, 0, cv2.BORDER_CONSTANT, value=(0, 0, 0))
+    x = 6
+    for text, color in meanings.items():
+        draw_label(strip, text, x, len(strip) - 6, color)
+        x += 14 + 8 * len(text)
+    return np.asarray(strip, np.uint8)
+
+
+def draw_ticks(picture: NDArray[np.uint8], x: int, y: int, size: int, color: tuple[int, int, int]) -> None:
+    """Draw four strokes around (x, y), with an open center."""
+    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        begin, end = size - 4, size + 6
+        cv2.line(picture, (x + begin * dx, y + begin * dy), (x + end * dx, y + end * dy), color, 1)
+
+
+def draw_label(picture: NDArray[np.uint8], text: str, x: int, y: int, color: tuple[int, int, int]) -> None:
+    """Draw a small label with its lower left corner at (x, y)."""
+    cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
+
+
+def contact_sheet(images: list[NDArray], captions: list[str], scale: int) -> NDArray[np.uint8]:
+    """Frames of one size side by side, enlarged `scale` times and captioned.
+
+    All use the black and white levels of the first frame, so that their brightnesses can be compared.
+    """
+    low, high = np.percentile(images[0], 30), float(np.percentile(images[0], 99.95))
+    tiles = []
+    for image, caption in zip(images, captions, strict=True):
+        gray = to_8bit(image, "square root", levels_dn=(low, high))
+        large = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
+        picture = cv2.copyMakeBorder(large, 24, 2, 2, 2, cv2.BORDER_CONSTANT, value=40)
+        draw_label(picture, caption, 6, 16, (255, 255, 255))
+        tiles.append(picture)
+    return np.hstack(tiles)
+
+
+def pixel_positions(xy_px: Floats | None, scale: int) -> list[tuple[int, int]]:
+    """Integer pixel positions in an image enlarged `scale` times; empty for None.
+
+    Pixel centers are at integers, so the center of pixel x moves to x * scale + (scale - 1) / 2.
+    """
+    if xy_px is None:
+        return []
+    return [(round(x), round(y)) for x, y in xy_px * scale + (scale - 1) / 2]
