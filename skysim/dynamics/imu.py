@@ -95,14 +95,15 @@ def ideal_increments(
     Raises InputError for fewer than two knots or an interval outside them.
     """
     if len(t_s) < 2:
-        raise InputError(f"imu: {len(t_s)} samples of the motion; allowed: two or more")
+        raise InputError("imu", f"{len(t_s)} samples of the motion", "two or more")
     first_s, last_s = np.min(ends_s, initial=np.inf) - step_s, np.max(ends_s, initial=-np.inf)
     if len(ends_s) and not (
         t_s[0] - TIME_TOLERANCE_S <= first_s and last_s <= t_s[-1] + TIME_TOLERANCE_S
     ):  # also rejects NaN
         raise InputError(
-            f"imu: samples from {first_s:.6f} to {last_s:.6f} s; allowed: within the motion,"
-            f" {t_s[0]:.6f} to {t_s[-1]:.6f} s"
+            "imu",
+            f"samples from {first_s:.6f} to {last_s:.6f} s",
+            f"within the motion, {t_s[0]:.6f} to {t_s[-1]:.6f} s",
         )
     position = np.asarray(position_body_m, dtype=float)
     knots = inertial_knots(

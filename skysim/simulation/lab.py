@@ -148,7 +148,7 @@ class Lab:
         """The LEDs of the dome as `led_list` returns them. Raises InputError without a dome."""
         scene = self.scene
         if not isinstance(scene.light, DomeConfig):
-            raise InputError(f"light.kind: {scene.light.kind} has no list of LEDs; allowed: dome")
+            raise InputError("light.kind", f"{scene.light.kind} has no list of LEDs", "dome")
         return led_list(scene.light, self.camera.band, scene.name)
 
 
@@ -237,7 +237,7 @@ def build_head(
             band = Band.from_camera(scene.camera)
             sources = light_sources(scene, band, main.orbit, stars)
     except InputError as error:
-        raise InputError(f"heads.{n}.{error}") from None
+        raise error.under(f"heads.{n}") from None
     main_from_head = Rotation.from_rotvec(head.rotation_deg, degrees=True)
     mount = Mount(np.array(head.position_m), main_from_head.inv() * main.mount.cam_from_body)
     return replace(
@@ -305,7 +305,7 @@ def light_sources(
         return display.display_sources(scene.light, stars, scene.start_time, band)
     if scene.light.variability_seed is not None:
         if not stars.scatter_mag.any():
-            raise InputError(f"light.variability_seed: {scene.light.catalog} has no variable stars; allowed: gaia_v8.0")
+            raise InputError("light.variability_seed", f"{scene.light.catalog} has no variable stars", "gaia_v8.0")
         stars = star_sources.varied(stars, scene.light.variability_seed)
     velocity_m_s: Floats | tuple[float, ...] = star_sources.AT_REST
     if scene.light.bodies or scene.light.satellites or scene.light.air or orbit:

@@ -135,7 +135,7 @@ def test_a_misspelled_tolerance_is_answered_with_key_and_line() -> None:
         loader.load("afit_simsat", {"tracker.survey.led_sigma": "{tolerence: 1 mm}"})
     assert str(caught.value) == (
         "tracker.survey.led_sigma.tolerence: unknown key; did you mean tolerance?;"
-        " allowed: distribution, tolerance, sigma (--set)"
+        " allowed: distribution, tolerance, sigma (overrides)"
     )
 
 

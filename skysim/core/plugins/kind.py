@@ -36,6 +36,5 @@ class PluginKind(NamedTuple):
         """Raise InputError for an unknown name; commands are those of programs, by name."""
         allowed = [*self.own, *self.entry_points(), *commands]
         if name not in allowed:
-            raise InputError(
-                f"{self.key}: {unknown_name(self.kind, name, allowed)}; a program takes --program {name}=COMMAND"
-            )
+            problem, names = unknown_name(self.kind, name, allowed)
+            raise InputError(self.key, problem, f"{names}, or a program as {name}=COMMAND")

@@ -115,7 +115,7 @@ class Program:
         try:
             self.start()
         except ProgramError as error:
-            raise InputError(f"{key}: {name}: {error}") from None
+            raise InputError(key, f"{name}: {error}") from None
 
     def start(self) -> None:
         """Start the process and wait until it is ready. Raises ProgramError."""

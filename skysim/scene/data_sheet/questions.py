@@ -26,7 +26,7 @@ class Question(NamedTuple):
 
     keys        : of the section `camera` that the answer gives
     where       : where a data sheet states it
-    parse       : from the typed text to the value of the file, several for several keys; raises ValueError
+    parse       : from the typed text to the value of the file, several for several keys; raises InputError
     assume      : from the values known so far to the assumption; None if the key is then left out
     consequence : of not knowing it; empty if it must be given
     skipped     : why it is not asked, by the values known so far; empty if it is
@@ -46,7 +46,7 @@ def assumed(value: Any, why: str) -> Callable[[Values], Assumed]:
 
 
 def without_lens(values: Values) -> str:
-    return "" if "focal_length" in values else "without --focal-length"
+    return "" if "focal_length" in values else "without focal_length"
 
 
 def not_by_rows(values: Values) -> str:

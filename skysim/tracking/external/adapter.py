@@ -56,7 +56,7 @@ class ExternalTracker:
 
     def solve_centroids(self, centroids: Centroids) -> Attitude:
         """Not supported by external trackers. Raises InputError."""
-        raise InputError(f"tracker.name: {self.program.name} solves frames, not centroids; allowed: {OWN}")
+        raise InputError("tracker.name", f"{self.program.name} solves frames, not centroids", OWN)
 
 
 def build_setup(scene: scenes.Scene, camera: Camera, settings: Settings, lights: Stars | Leds) -> Setup:

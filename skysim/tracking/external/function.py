@@ -44,7 +44,7 @@ class FunctionTracker:
 
     def solve_centroids(self, centroids: Centroids) -> Attitude:
         """Not supported: a function takes an image. Raises InputError."""
-        raise InputError(f"tracker.name: {self.name} solves frames, not centroids; allowed: {OWN}")
+        raise InputError("tracker.name", f"{self.name} solves frames, not centroids", OWN)
 
 
 def to_answer(value: Any) -> Any:

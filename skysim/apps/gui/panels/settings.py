@@ -141,7 +141,7 @@ class KeyForm:
         try:
             after = await run.io_bound(forms.with_value, self.page.state.scene, before, key, value)
         except InputError as error:
-            self.show_error(key, for_page(str(error)).removeprefix(f"{key}: "))
+            self.show_error(key, error.fault if error.key == key else for_page(error))
             return
         changed = {one: text for one, text in after.items() if before.get(one) != text}
         await self.page.apply_overrides(changed, before.keys() - after.keys())
@@ -218,7 +218,7 @@ class ScenePanel:
         try:
             path = await run.io_bound(forms.save, self.folder, name, state.scene, state.overrides, title)
         except InputError as error:
-            self.page.show_message(str(error))
+            self.page.show_message(for_page(error))
             return
         self.page.log(f"saved {path}")
         self.saved()

@@ -1,23 +1,18 @@
-"""Messages of the command line in words of the page, which has no options."""
+"""Errors in words of the page, which has fields instead of parameters and options."""
 
 from __future__ import annotations
 
-import re
+from skysim.core.errors import OVERRIDES, InputError
 
-REPLACED = (  # in this order
-    (r" \(--set\)", ""),
-    (r", or another --out\b", ", or a study of another name"),
-    (r"\banother --out\b", "a study of another name"),
-    (r"; allowed: skysim study resume, ", "; allowed: "),
-    (r"--fov\b", "the field of view"),
-    (r"--date\b", "the date"),
-    (r"--set ", ""),
-    (r"--([a-z])", r"\1"),  # of any other option its word
-)
+LABELS = {  # of the fields, by the parameter's key; a key of a scene is the label of its field
+    "solve.fov_deg": "the field of view",
+    "solve.time_utc": "the date",
+    "solve.catalog": "the catalog",
+    "survey.tilt_deg": "the tilt",
+}
 
 
-def for_page(message: str) -> str:
-    """A message without the options of the command line."""
-    for pattern, words in REPLACED:
-        message = re.sub(pattern, words, message)
-    return message
+def for_page(error: InputError) -> str:
+    """An error with the label of the field at fault; without a place if the value was typed in the page."""
+    where = None if error.where == OVERRIDES else error.where
+    return str(InputError(LABELS.get(error.key, error.key), error.problem, error.allowed, where))

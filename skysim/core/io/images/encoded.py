@@ -40,9 +40,9 @@ def decode_image(path: Path, data: bytes) -> NDArray:
         with silent_stderr():
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise InputError(f"{path}: cannot be decoded: {' '.join(str(error).split())}") from None
+        raise InputError(path, f"cannot be decoded: {error}") from None
     if image is None:
-        raise InputError(f"{path}: cannot be decoded; it may be truncated or not an image")
+        raise InputError(path, "cannot be decoded; it may be truncated or not an image")
     return image
 
 
@@ -54,7 +54,7 @@ def check_encoded_size(path: Path, data: bytes) -> None:
     except Exception:  # of many types, from Pillow or struct, for a truncated or damaged header
         sizes = []
     if not sizes:
-        raise InputError(f"{path}: cannot be decoded; it may be truncated or not an image")
+        raise InputError(path, "cannot be decoded; it may be truncated or not an image")
     for sides, each_bytes in sizes:
         check_pixels(path, *sides, each_bytes=each_bytes)
 
@@ -123,8 +123,9 @@ def check_planes(path: Path, data: bytes) -> None:
     size = tiff.image_size(data) if data.startswith(tiff.MAGICS) else None
     if size and size[2] > 1 and size[3] > 8 and size[4]:
         raise InputError(
-            f"{path}: a TIFF file of separate color planes (PlanarConfiguration 2) of {size[3]} bits; allowed:"
-            " interleaved colors, monochrome, or planes of 8 bits"
+            path,
+            f"a TIFF file of separate color planes (PlanarConfiguration 2) of {size[3]} bits",
+            "interleaved colors, monochrome, or planes of 8 bits",
         )
 
 

@@ -30,8 +30,8 @@ class LiveCamera:
             ok, frame = self.capture.read()
         if not ok or frame is None:
             if self.frame_count:
-                raise InputError(f"{self.source}: ends after {self.frame_count} frames")
-            raise InputError(f"{self.source}: no camera found; allowed: an index such as 0, a video file, a URL")
+                raise InputError(self.source, f"ends after {self.frame_count} frames")
+            raise InputError(self.source, "no camera found", "an index such as 0, a video file, a URL")
         self.frame_count += 1
         return np.asarray(frame)
 

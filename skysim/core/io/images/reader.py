@@ -73,16 +73,16 @@ def image_suffix(name: str) -> str:
 def check_name(path: Path) -> None:
     """Raise InputError for a missing or too large file, and for one with the suffix of no known format."""
     if not path.is_file():
-        raise InputError(f"{path}: no such file")
+        raise InputError(path, "no such file")
     if not image_suffix(path.name):
-        raise InputError(f"{path}: unknown image suffix; allowed: {', '.join(IMAGE_SUFFIXES)}")
+        raise InputError(path, "unknown image suffix", ", ".join(IMAGE_SUFFIXES))
     check_bytes(path)
 
 
 def check_numbers(path: Path, pixels: NDArray) -> NDArray:
     """The pixels. Raises InputError unless they are real numbers."""
     if pixels.dtype.kind not in "uif":
-        raise InputError(f"{path}: pixels of type {pixels.dtype}; allowed: integers and floats")
+        raise InputError(path, f"pixels of type {pixels.dtype}", "integers and floats")
     return pixels
 
 
@@ -96,7 +96,7 @@ def monochrome(image: NDArray) -> NDArray:
     if image.ndim == 2:
         return image
     if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
-        raise InputError(f"an image of shape {image.shape}; allowed: (height, width) and color with 3 or 4 channels")
+        raise InputError("", f"an image of shape {image.shape}", "(height, width) and color with 3 or 4 channels")
     if image.shape[2] == 1:
         return np.ascontiguousarray(image[:, :, 0])
     if image.dtype in (np.uint8, np.uint16, np.float32):
