@@ -79,8 +79,8 @@ def test_only_a_report_of_several_frames_has_plots_against_time(run, tmp_path) -
     one = dataclasses.replace(run, scores=run.scores[:1]).save(tmp_path / "one")
     three = run.save(tmp_path / "three")
     headings = [re.findall("<h2>(.*?)</h2>", (folder / "report.html").read_text("utf-8")) for folder in (three, one)]
-    assert headings[0][:3] == ["Scene", "Errors", "Motion"]
-    assert headings[1] == ["Scene", *headings[0][3:]]
+    assert headings[0][:3] == ["The last solved frame", "Errors", "Motion"]
+    assert headings[1] == ["The last solved frame", *headings[0][3:]]
 
 
 def test_a_table_has_one_row_a_frame(run) -> None:

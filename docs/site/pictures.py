@@ -9,7 +9,7 @@ import cv2
 
 from skysim.core.io import files
 from skysim.dynamics.multibody.view.picture import picture
-from skysim.results import report, telemetry_report
+from skysim.results import annotate, telemetry_report
 from skysim.scene import loader
 from skysim.simulation.flight import simulate_motion
 
@@ -46,7 +46,7 @@ def main() -> None:
         f"{rate} deg/s, {truth.sources.streak_px.max():.1f} px"
         for rate, (_, truth) in zip(RATES_DEG_S, exposures, strict=True)
     ]
-    sheet = report.contact_sheet([image.image_dn[WINDOW] for image, _ in exposures], captions, scale=3)
+    sheet = annotate.contact_sheet([image.image_dn[WINDOW] for image, _ in exposures], captions, scale=3)
     files.write_image(IMAGES / "smear.png", sheet)
     screenshots()
 

@@ -306,7 +306,7 @@ class Reference:
 
     def attitudes(self, t_s: Floats) -> Rotation:
         """lab_from_ref at (N,) times."""
-        return Rotation.from_quat(np.array([self.state_at(float(t))[0] for t in t_s]), scalar_first=True)
+        return Rotation.from_quat(np.array([self.state_at(float(t))[0] for t in t_s]).reshape(-1, 4), scalar_first=True)
 
 
 def plan(

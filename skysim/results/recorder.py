@@ -12,8 +12,10 @@ import numpy as np
 from skysim.core.io.files import make_folder, write_image, write_table
 from skysim.core.types import Frame, FrameRow, Telemetry, Truth
 from skysim.dynamics import imu
-from skysim.results import report, scoring, telemetry_report
+from skysim.results import run_report, scoring, telemetry_report
+from skysim.results.annotate import annotate_truth
 from skysim.results.files.frames import remove_results, write_frame
+from skysim.results.report import Report
 from skysim.results.scoring import Score
 from skysim.simulation.checks import Check
 from skysim.simulation.lab import StarCamera
@@ -56,7 +58,7 @@ class Recorder:
         write_frame(self.folder, frame, truth, self.camera.scene)
         path = self.folder / f"frame_{frame.index:04d}.fits"
         if preview:
-            write_image(path.with_suffix(".preview.png"), report.annotate_truth(frame.image_dn, truth.sources))
+            write_image(path.with_suffix(".preview.png"), annotate_truth(frame.image_dn, truth.sources))
         return path
 
     def finish(
@@ -66,8 +68,8 @@ class Recorder:
         imu_samples: imu.Increments | None,
         plan: Check,
         pictures: Sequence[Path] = (),
-    ) -> dict[str, Any]:
-        """Write tables, annotated image and report. Returns the statistics that `skysim run --json` prints.
+    ) -> tuple[dict[str, Any], Report]:
+        """Write tables, annotated image and report. Returns the report, and before it what `skysim run --json` prints.
 
         pictures : image files of the laboratory
         """
@@ -84,24 +86,27 @@ class Recorder:
         stages_ms = {stage: 1e3 * float(np.median(seconds)) for stage, seconds in self.seconds.items()}
         flight = telemetry_report.figure(log) if len(self.rows) > 1 or log.t_s[-1] > SHORT_S else b""
         facts = [(name, [text]) for name, text in scene.summary] + [(fact.name, fact.lines) for fact in plan.facts]
-        report.write_page(
-            page,
+        motion = telemetry_report.summary(log)
+        report = run_report.run_report(
             scene.title,
             command,
             names,
             self.rows,
-            stages_ms,
-            annotated,
-            flight,
-            pictures,
-            facts,
-            plan.findings,
+            stages_ms=stages_ms,
+            annotated=annotated,
+            motion=motion,
+            motion_figure=flight,
+            views=pictures,
+            facts=facts,
+            findings=plan.findings,
         )
-        return report.summary(self.rows) | {
+        report.save(page)
+        statistics = run_report.summary(self.rows) | {
             "stages_ms": stages_ms,
             "report": str(page),
-            "flight": telemetry_report.summary(log),
+            "flight": motion,
             "pictures": [str(path) for path in pictures],
             "exposures_ms": [1e3 * row.exposure_s for row in self.rows],
             "findings": plan.findings,
         }
+        return statistics, report

@@ -12,6 +12,7 @@ from skysim.core.types import FrameRow, Telemetry
 from skysim.dynamics import imu
 from skysim.results import scoring
 from skysim.results.recorder import Recorder
+from skysim.results.report import Report
 from skysim.results.scoring import Score, image_tag
 from skysim.scene.scene import Scene
 from skysim.simulation.checks import Check, check
@@ -132,17 +133,17 @@ class FlightRecorder:
 
     def finish(
         self, command: str, plan: Check, draw: Callable[[Lab, Telemetry, Path], Sequence[Path]] | None = None
-    ) -> list[dict[str, Any]]:
-        """Write tables, images and reports; return the statistics of each camera.
+    ) -> list[tuple[dict[str, Any], Report]]:
+        """Write tables, images and reports; return statistics and report of each camera.
 
         draw : makes pictures of the laboratory for the main camera's report
         """
         main = run_of(self.flight, [() for _ in self.recorders])
         pictures = draw(main.lab, main.telemetry, self.folders[0]) if draw else ()
-        statistics = []
+        finished = []
         for run, recorder in zip((main, *main.heads.values()), self.recorders.values(), strict=True):
             is_main = run is main
             own_plan = plan if is_main else run.check()
             shown = pictures if is_main else ()
-            statistics.append(recorder.finish(command, run.telemetry, run.imu_samples, own_plan, shown))
-        return statistics
+            finished.append(recorder.finish(command, run.telemetry, run.imu_samples, own_plan, shown))
+        return finished

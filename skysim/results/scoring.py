@@ -15,8 +15,9 @@ from estimator.core.types import Attitude, RateEstimate, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, FrameRow, Mount, Truth
-from skysim.results import metrics, report, stretch
-from skysim.results.report import annotate, visible
+from skysim.results import metrics, stretch
+from skysim.results.annotate import annotate, visible
+from skysim.results.report.as_html import embed
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.flight import Shot
@@ -192,4 +193,4 @@ def score(shot: Shot) -> Score:
 def image_tag(image: NDArray[np.uint8]) -> str:
     """An HTML <img> element of an image, reduced to at most 800 pixels in width."""
     data = cv2.imencode(".jpg", stretch.reduce_width(image, 800))[1].tobytes()
-    return f'<img src="{report.embed(data, "jpeg")}">'
+    return f'<img src="{embed(data, "jpeg")}">'

@@ -77,7 +77,7 @@ def center_from_cam(camera: Camera) -> Rotation:
 
 def annotated_image(image: NDArray, report: Report, tracker: StarTracker) -> NDArray[np.uint8]:
     """The image annotated with detections, matched stars and their numbers."""
-    from skysim.results.report import annotate
+    from skysim.results.annotate import annotate
 
     match, detected_px = report.attitude.match, report.centroids.xy_px
     if match is None:

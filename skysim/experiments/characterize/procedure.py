@@ -9,13 +9,15 @@ import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.io import files
-from skysim.experiments.characterize import checks, preset, report
+from skysim.experiments.characterize import checks, preset
+from skysim.experiments.characterize.characterize_report import characterize_report
 from skysim.experiments.characterize.frames import read_stack
 from skysim.experiments.characterize.night import lens
 from skysim.experiments.characterize.night.lens import Night
 from skysim.experiments.characterize.sensor import sensor
 from skysim.experiments.characterize.sensor.estimate import Estimate
 from skysim.experiments.characterize.sensor.sensor import Sensor
+from skysim.results.report import Report
 from skysim.scene import loader
 from skysim.scene.data_sheet.sheet import PLACEHOLDER_LENS
 from skysim.scene.sections.camera import CameraConfig, GaussianPsfConfig
@@ -68,8 +70,8 @@ def measure_night(config: CameraConfig, raw: dict[str, Any], folder: Path, found
 
 def write_results(
     folder: Path, config: CameraConfig, raw: dict[str, Any], found: Sensor, night: Night | None, name: str
-) -> dict[str, Any]:
-    """Write the preset; returns its statistics, which `characterize.json` holds too."""
+) -> tuple[dict[str, Any], Report]:
+    """Write preset and report; returns the statistics, which `characterize.json` holds too, and the report."""
     path = folder / "camera.yaml"
     preset.write(path, preset.preset_text(raw, config, found, night, name))
     statistics = {
@@ -85,8 +87,9 @@ def write_results(
         "remarks": found.remarks + (night.remarks if night else []),
     }
     files.write_text(folder / "characterize.json", files.to_json(statistics))
-    report.write_page(folder / "report.html", statistics, config, found, night)
-    return statistics
+    report = characterize_report(statistics, config, found, night)
+    report.save(folder / "report.html")
+    return statistics, report
 
 
 def night_statistics(config: CameraConfig, night: Night) -> dict[str, Any]:

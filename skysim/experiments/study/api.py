@@ -12,6 +12,8 @@ from skysim.experiments.study import loader
 from skysim.experiments.study.analysis import table as tables
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.plan import Plan
+from skysim.experiments.study.report.study_report import study_report
+from skysim.results.report import Report
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,6 +41,11 @@ class StudyResult:
 
         with store.open_store(self.path) as kept:
             return Table(dict(tables.trial_columns(kept)))
+
+    def report(self) -> Report:
+        """Its report for people: answers, figures and tables."""
+        with store.open_store(self.path) as kept:
+            return study_report(self.plan, kept)
 
     def to_pandas(self) -> pd.DataFrame:
         """`table` as a data frame; needs pandas."""

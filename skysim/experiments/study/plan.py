@@ -337,6 +337,10 @@ class Study(ConfigModel):
     thresholds: tuple[Threshold, ...] = ()
     optimize: Search | None = None
 
+    def trial_count(self, points: int) -> int:
+        """Number of trials at so many points or, of a search that runs to its end, of all candidates."""
+        return (self.optimize.candidates if self.optimize else points) * self.replicates
+
 
 @dataclass(frozen=True, slots=True)
 class TrialSpec:

@@ -3,12 +3,15 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from skysim.apps.cli import terminal
 from skysim.core.types import FrameRow
 from skysim.experiments.tracker_comparison import TrackerScore
 from skysim.results.metrics import Summary
+from skysim.results.report import Report, as_text
+from skysim.results.run_report import frame_table, run_report
 
 TRIPLE = ("roll", "pitch", "yaw")
 
@@ -44,37 +47,52 @@ def score(name: str) -> TrackerScore:
 def test_a_scoreboard_fits_the_terminal_and_keeps_what_counts(
     width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(terminal, "terminal_width", lambda: width)
+    monkeypatch.setattr(as_text, "terminal_width", lambda: width)
     terminal.print_scores([score("own"), score("somebody_else")], Path("out/scoreboard"))
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= width
-    kept = next(line for line in lines if line.startswith("what"))
+    kept = next(line for line in lines if line.startswith("tracker"))
     assert re.search(r"frames +right % .*wrong +refused +failed +cross ″ .*roll ″", kept)
     assert ("95 % ms" in kept) == (width == 240)
     assert not any("…" in line for line in lines)
 
 
+def report(motion: dict[str, float]) -> Report:
+    picture = np.zeros((4, 4, 3), np.uint8)
+    stages = dict.fromkeys(["render", "detector", "detect", "centroid", "identify", "solve"], 12.34)
+    pictures = {"annotated": picture, "motion_figure": b"", "views": []}
+    return run_report(
+        "title",
+        "skysim run x",
+        TRIPLE,
+        [row(0), row(1)],
+        stages_ms=stages,
+        motion=motion,
+        facts=[],
+        findings=[],
+        **pictures,
+    )
+
+
 def test_the_summary_of_a_run_fits_the_terminal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(terminal, "terminal_width", lambda: 80)
-    errors = {f"{angle}_arcsec_{what}": 1234.5 for angle in ("cross", "roll") for what in ("median", "worst")}
-    stages = dict.fromkeys(["render", "detector", "detect", "centroid", "identify", "solve"], 12.34)
+    monkeypatch.setattr(as_text, "terminal_width", lambda: 80)
     motion = {"pointing_deg_worst": 0.0687, "pointing_deg_end": 0.069, "torque_nm_worst": 0.0757, "imu_deg_worst": 1.0}
-    motion |= {"imu_deg_end": 0.005, "gyro_saturated_s": 0.0}
-    run = {"solved": 60, "frames": 60, "wrong": 0, "stages_ms": stages, "flight": motion, "report": "out/x/report.html"}
-    terminal.print_summary(run | errors)
+    report(motion | {"imu_deg_end": 0.005, "gyro_saturated_s": 0.0}).print()
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
-    assert [line[:8] for line in lines if "IMU" in line or "pointing" in line] == ["motion: ", " " * 8]
+    assert lines[0] == "Motion"
+    assert [line.partition(":")[0] for line in lines[1:3]] == ["pointing", "IMU alone"]
+    assert lines[-2].startswith("2 of 2 frames solved, 0 wrong; ")  # the answer, above the prompt
 
 
-@pytest.mark.parametrize(("width", "left_out"), [(80, 4), (110, 1), (240, 0)])
+@pytest.mark.parametrize(("width", "left_out"), [(80, 10), (110, 5), (240, 0)])
 def test_the_rows_of_a_run_fit_the_terminal(
     width: int, left_out: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(terminal, "terminal_width", lambda: width)
-    terminal.print_rows([row(0), row(1)], TRIPLE, [10.0, 10.0])
+    monkeypatch.setattr(as_text, "terminal_width", lambda: width)
+    as_text.print_table(frame_table(TRIPLE, [row(0), row(1)]))
     out = capsys.readouterr().out
     lines, named = out.splitlines(), " ".join(out.split()).partition("in a wider terminal: ")[2]
     assert len(named.split(", ") if named else []) == left_out

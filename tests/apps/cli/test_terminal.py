@@ -9,6 +9,8 @@ import pytest
 
 from skysim.apps.cli import terminal
 from skysim.experiments.study.execution.runner import Progress
+from skysim.results.report import Cell, Column, Table
+from skysim.results.report.as_text import print_table
 from skysim.tracking.external.interface import Answer, check_answer
 
 HOSTILE = "m[red].png [/b] no match [/tmp/x] :bug: \\"
@@ -22,7 +24,8 @@ class Screen(io.StringIO):
 
 
 def test_a_table_shows_cells_heads_and_title_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
-    terminal.print_table(HOSTILE, ["file", HOSTILE], [["a[/b]/m[red].png", terminal.colored("WRONG", "red")]])
+    table = Table([Column("file", kind="text"), Column(HOSTILE)], [["a[/b]/m[red].png", Cell("WRONG", "bad")]])
+    print_table(table, HOSTILE)
     title, heads, line = capsys.readouterr().out.splitlines()
     assert title.strip() == HOSTILE
     assert heads.split(maxsplit=1)[1].strip() == HOSTILE

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.datasheet import cells, page, performance, run
+from skysim.experiments.datasheet import cells, datasheet_report, performance, run
 from skysim.experiments.datasheet.cells import Designer, Size
 from skysim.experiments.datasheet.components import components
 from skysim.experiments.datasheet.statement import Statement, numbers, sections, state
@@ -67,13 +67,14 @@ def test_a_stopped_datasheet_goes_on_and_is_the_same(small: None, tmp_path: Path
         measured(tmp_path / "stopped", stop_after(4))
     again = state(measured(tmp_path / "stopped"))
     assert untimed(again) == untimed(whole)
-    paths = page.write_all(tmp_path / "whole", whole, True)
+    report = datasheet_report.datasheet_report(whole, True)
+    paths = datasheet_report.write_all(tmp_path / "whole", whole, report)
     assert json.loads(paths["json"].read_text())["fields"] == 12
     text = paths["report"].read_text(encoding="utf-8")
     assert all(section.title in text for section in sections(whole))
     assert text.count("<img") == 5
-    page.write_markdown(tmp_path / "sheet.md", whole, True)
-    assert (tmp_path / "sheet.md").read_text(encoding="utf-8").count("\n## ") == len(sections(whole))
+    assert report.markdown().count("\n## ") == len(sections(whole))
+    assert len(list((tmp_path / "whole").glob("*.png"))) == 5
     with pytest.raises(InputError, match="contains another study"):
         run.measure("shefex2", load("shefex2", {}), {"camera.f_number": "2"}, tmp_path / "whole", quick=True, workers=1)
 

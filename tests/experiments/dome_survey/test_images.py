@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io as std_io
 import json
+import re
 import shutil
 import sys
 import threading
@@ -160,14 +161,15 @@ def test_coverage_and_next_attitudes_are_in_the_result(result: dict[str, Any], f
 def test_the_report_has_the_numbers_and_the_faults_with_places(result: dict[str, Any], folder: Path) -> None:
     page = (folder / "by_imu" / "report.html").read_text()
     assert result["report"] == str(folder / "by_imu" / "report.html")
-    assert f"<b>{result['surveyed']} / {result['leds']}</b>" in page
-    assert f"<tr><td>{DEAD}</td><td>dark</td>" in page
+    assert f"{result['surveyed']} of {result['leds']} LEDs measured" in page
+    assert re.search(rf">{DEAD}</td><td[^>]*>dark</td>", page)
     place_mm = ", ".join(f"{1e3 * one:.1f}" for one in result["faults"]["found_m"][str(FAR)])
-    assert f"<tr><td>{FAR}</td><td>displaced</td>" in page
+    assert re.search(rf">{FAR}</td><td[^>]*>displaced</td>", page)
     assert f"({place_mm}) mm" in page
-    assert page.count("<td>exchanged</td>") == 2
+    assert page.count(">exchanged</td>") == 2
     assert page.count('src="data:image/png;base64,') == 2
-    assert page.count("<tr>", page.index('id="next"')) == 1 + len(result["next"])
+    coverage = page[page.index("<h2>Coverage and next attitudes") : page.index("<h2>Faults")]
+    assert coverage.count("<tr><td") == len(result["next"])
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from skysim.apps.cli.main import app
 from skysim.core.errors import InputError
 from skysim.core.io import files
 from skysim.core.paths import ROOT
-from skysim.experiments.papers import compare, intervals, page, published
+from skysim.experiments.papers import compare, intervals, papers_report, published
 from skysim.experiments.papers.compare import Cause, Drawing, ExperimentOptions, ExperimentResult, RowResult
 from skysim.experiments.papers.published import Experiment, Row
 from skysim.experiments.papers.registry import EXPERIMENTS, check_ids, reproduce
@@ -190,36 +189,22 @@ def test_its_report_and_its_page_show_what_its_json_says(tmp_path: Path) -> None
     assert html.count("data:image/png") == 1
 
 
-class Verdicts(HTMLParser):
-    """The class and the verdict of every line of the report."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.lines: list[tuple[str, str]] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        told = dict(attrs).get("class") or ""
-        if tag == "tr":
-            self.line = told
-        if tag == "td" and told.startswith("v "):
-            self.lines.append((self.line, told[2:]))
-
-
-def test_what_disagrees_is_red_in_the_report_and_bold_in_the_page(tmp_path: Path) -> None:
+def test_what_disagrees_is_red_in_the_report_and_bold_in_the_page() -> None:
     one = Experiment(title="t", source="s", rows={"ten": TEN, "a | b": TEN})
     found = ExperimentResult(
         {"ten": RowResult(exact(12)), "a | b": RowResult(exact(10))}, (Drawing("<empty>", lambda fig: None),)
     )
-    done = [compare.compare("x", one, found, 0.0)]
-    page.write_html(tmp_path / "x.html", done, page.CommandArguments(("x",), True, 3))
-    page.write_markdown(tmp_path / "x.md", done, page.CommandArguments(("x",), True, 3))
-    html = (tmp_path / "x.html").read_text("utf-8")
-    parsed = Verdicts()
-    parsed.feed(html)
-    assert parsed.lines == [("disagrees", "disagrees"), ("", "agrees")]
-    assert "skysim reproduce x --quick --seed 3" in html
+    report = papers_report.papers_report([compare.compare("x", one, found, 0.0)], ("x",), True, 3)
+    html, text = report.html(), report.markdown()
+    assert re.findall(r'<td class="text (\w+)">(agrees|disagrees)</td>', html) == [
+        ("bad", "disagrees"),
+        ("good", "agrees"),
+    ]
+    assert html.count("skysim reproduce x --quick --seed 3") == text.count("skysim reproduce x --quick --seed 3") == 1
     assert "&lt;empty&gt;" in html
-    assert "| **disagrees** |" in (tmp_path / "x.md").read_text("utf-8")
+    assert "Of 2 published numbers 1 agree, 0 are explained and 1 disagree" in report.verdict
+    assert "| **disagrees** |" in text
+    assert "| agrees |" in text
 
 
 # The page that the command wrote.
@@ -234,7 +219,7 @@ def parts() -> dict[str, list[list[str]]]:
     sections = re.split(r"^### (\S+)$", PAGE.read_text("utf-8"), flags=re.MULTILINE)[1:]
     found = {}
     for id, text in zip(sections[::2], sections[1::2], strict=True):
-        rows = [line for line in text.splitlines() if line.startswith("| ")][1:]
+        rows = [line for line in text.splitlines() if line.startswith("| ")][2:]
         found[id] = [re.split(r" ?(?<!\\)\| ?", row)[1:-1] for row in rows]
     return found
 

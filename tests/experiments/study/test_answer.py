@@ -12,10 +12,10 @@ from study_stores import done
 
 from skysim.experiments.study import loader
 from skysim.experiments.study.analysis import answer
-from skysim.experiments.study.analysis.table import PointRow, format_summary, table
+from skysim.experiments.study.analysis.table import PointRow, format_summary
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.plan import Study, resolve_point
-from skysim.experiments.study.report import overview, page
+from skysim.experiments.study.report import overview, study_report
 from skysim.results import metrics
 from skysim.results.metrics import Summary
 from skysim.simulation import checks
@@ -333,13 +333,10 @@ def test_a_report_begins_with_scene_findings_and_answers(tmp_path: Path) -> None
     plan = loaded(tmp_path, figures=[{"kind": "map", "value": "stars_least"}])
     assert done(plan, tmp_path / "study.sqlite").failed == 0
     with store.open_store(tmp_path / "study.sqlite") as kept:
-        lines = table(kept, [*page.responses(plan.study), *answer.RESPONSES])
-        about, answers = overview.overview(plan), answer.headline(plan.study, lines, True)
-        said_first: dict[str, Any] = {"about": about, "answers": answers, "replay": "again"}
-        page.write_page(tmp_path / "r.html", kept, plan.study, "run", lines, **said_first)
-    text = (tmp_path / "r.html").read_text(encoding="utf-8")
-    parts = ('id="about"', 'id="findings"', 'id="answers"', 'id="done"', "<figure>", 'id="points"')
+        report = study_report.study_report(plan, kept, "again")
+    text = report.save(tmp_path / "r.html").read_text(encoding="utf-8")
+    parts = ("trials, 0 failed", "<b>Answer</b>", "<figure>", "<h2>Scene", "<h2>Checks of the scene", "<h2>Points")
     places = [text.index(part) for part in parts]
     assert places == sorted(places)
     assert "Is it ambiguous anywhere?" in text
-    assert text.count("<code>again ") == 2  # the worst trials of a map of two attitudes
+    assert text.count("<code>skysim study replay again ") == 2  # the worst trials of a map of two attitudes

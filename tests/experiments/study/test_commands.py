@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from skysim.apps.cli import main, study_summary, terminal
+from skysim.apps.cli import main
 
 STUDY = """schema: 1
 title: a question
@@ -145,30 +145,6 @@ def test_a_store_of_an_earlier_skysim_is_refused_in_one_line(typed, tmp_path):
             "skysim: out/question/study.sqlite: written by an earlier skysim, without the attitudes of the trials;"
             " allowed: run the study again, with another --out\n"
         )
-
-
-HEADS = ["point", "leds", "placement", "identified", "coverage", "stars_least"]
-CELLS = [
-    ["0", "200", "poisson", "0.5 (0.45..0.55)", "0.9 (0.85..0.95)", "3"],
-    ["1", "2800", "a long name", "1", "1", "4"],
-]
-
-
-@pytest.mark.parametrize(("width", "count"), [(80, 6), (73, 6), (72, 5), (60, 5), (59, 4), (42, 4), (41, 3), (10, 3)])
-def test_a_narrow_terminal_keeps_the_factors_and_as_many_responses_as_fit(width, count):
-    """Columns of 5, 4, 11, 16, 16 and 11 characters, two between each: 24 with the factors, 42, 60 and 73 in all."""
-    assert study_summary.fitting_columns(HEADS, CELLS, 3, width) == count
-
-
-def test_a_table_at_80_columns_is_not_cut_and_names_what_it_drops(monkeypatch, capsys):
-    monkeypatch.setattr(study_summary, "terminal_width", lambda: 60)
-    monkeypatch.setattr(terminal, "terminal_width", lambda: 60)
-    study_summary.print_points(HEADS, CELLS, factors=2)
-    out = capsys.readouterr().out
-    assert max(map(len, out.splitlines())) <= 60
-    assert "…" not in out
-    assert "a long name" in out
-    assert "in the report, or in a wider terminal: stars_least" in out
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import yaml
 
-from skysim.apps.cli.study_summary import print_front
 from skysim.core.errors import InputError
 from skysim.experiments.study import loader, plan
 from skysim.experiments.study.analysis import cost, search
@@ -23,9 +22,11 @@ from skysim.experiments.study.execution.outcomes import FAILED, Outcome
 from skysim.experiments.study.execution.setups import code_version, seed_of
 from skysim.experiments.study.execution.trials import Row, TrialJob
 from skysim.experiments.study.factors import Settings
+from skysim.experiments.study.report.study_report import front_table
 from skysim.results.files.builder.parts import parts_list
 from skysim.results.files.builder.prices import find_prices, read_prices
 from skysim.results.metrics import Summary
+from skysim.results.report.as_text import print_blocks
 from skysim.scene import loader as scene_loader
 
 pytest.importorskip("optuna")
@@ -389,7 +390,7 @@ def test_bad_prices_are_the_study_s_fault(tmp_path: Path) -> None:
 
 
 def test_the_terminal_s_front_has_levels_error_and_cost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The two of three candidates that no other beats, as a table; as paragraphs where the terminal is narrow."""
+    """The two of three candidates that no other beats, as a table."""
     study = loaded(tmp_path, changed(objectives=[{"response": "angle_arcsec_median"}, {"response": "cost"}])).study
     assert study.optimize is not None
     values = ((40.0, 100.0), (30.0, 200.0), (50.0, 300.0))
@@ -402,12 +403,13 @@ def test_the_terminal_s_front_has_levels_error_and_cost(tmp_path: Path, capsys: 
     heads, cells = search.front_cells(study, result)
     assert heads == ["candidate", "x", "y", "angle_arcsec_median", "cost"]
     assert cells == [["1", "0.25", "0.5", "30 (20..60)", "200"], ["0", "0", "0.5", "40 (20..60)", "100"]]
-    print_front(heads, cells, 3)
+    print_blocks(front_table(study, result))
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "front of 3 candidates:"
+    assert lines[0] == "3 candidates, 3 of them feasible; the front:"
     assert [line.split() for line in lines[-2:]] == [" ".join(one).split() for one in cells]
-    print_front(heads, [], 3)
-    assert capsys.readouterr().out == "no front: none of 3 candidates is feasible\n"
+    none = [one._replace(feasible=False) for one in candidates]
+    print_blocks(front_table(study, search.SearchResult(none, [], True)))
+    assert capsys.readouterr().out == "3 candidates, 0 of them feasible.\n"
     assert search.front_columns(result) == {"front": [1, 0], "costs": [100.0, 200.0, 300.0]}
 
 

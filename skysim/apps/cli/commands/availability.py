@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skysim.apps.cli.options import Json, Overrides, SceneArg, load
-from skysim.apps.cli.terminal import print_json, print_table, progress_callback
+from skysim.apps.cli.terminal import print_json, progress_callback
 from skysim.core.constants import DAY_S, HOUR_S, JULIAN_YEAR_DAY
 from skysim.core.errors import InputError
+from skysim.results.report.as_text import print_table
+from skysim.results.report.blocks import Column, Table
 
 if TYPE_CHECKING:
     from skysim.scene.scene import Scene
@@ -54,7 +56,8 @@ def availability(
     rows = [[name, f"more than {limit:g}° away", f"{100 * fractions[name]:.2f} %"] for name, limit in limits.items()]
     rows.append(["stars", f"at least {exclusion.stars}", f"{100 * fractions['stars']:.2f} %"])
     rows.append(["all", "available", f"{100 * fractions['all']:.2f} %"])
-    print_table(f"{config.name}: {span} of {found.t_s[-1] / HOUR_S:.4g} h", ["", "condition", "fraction of time"], rows)
+    columns = [Column("", kind="text"), Column("condition"), Column("fraction of time")]
+    print_table(Table(columns, rows), f"{config.name}: {span} of {found.t_s[-1] / HOUR_S:.4g} h")
 
 
 def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Pointing:

@@ -10,8 +10,9 @@ import typer
 from typer.core import TyperGroup
 
 from skysim.apps.cli.options import Json, Overrides, complete_scene
-from skysim.apps.cli.terminal import print_error, print_json, print_list, terminal_width
+from skysim.apps.cli.terminal import print_error, print_json, print_list
 from skysim.core.errors import InputError, printable, unknown_name
+from skysim.results.report.as_text import terminal_width
 from skysim.scene.data_sheet.questions import QUESTIONS
 from skysim.scene.data_sheet.sheet import PLACEHOLDER_LENS, option
 

@@ -8,7 +8,9 @@ from typing import Annotated, Literal
 import typer
 
 from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load
-from skysim.apps.cli.terminal import print_catalog, print_json, print_table, print_titles, progress
+from skysim.apps.cli.terminal import print_catalog, print_json, print_titles, progress
+from skysim.results.report.as_text import print_table
+from skysim.results.report.blocks import Column, Table
 
 scenes_app = typer.Typer(
     invoke_without_command=True, help="List the shipped scenes; show every key of a scene, or export it for MuJoCo."
@@ -100,7 +102,8 @@ def scenes_parts(
         print_json({"parts": [line._asdict() for line in found.lines], "total": found.total})
         return
     rows = [*map(parts.cells, found.lines), ["total", "", "", "", "", f"{found.total:.2f}", ""]]
-    print_table(f"Parts of {loaded.name}, prices: {prices}", parts.COLUMNS, rows)
+    columns = [Column(head, kind="text" if head in ("part", "what") else "number") for head in parts.COLUMNS]
+    print_table(Table(columns, rows), f"Parts of {loaded.name}, prices: {prices}")
 
 
 @catalog_app.command("build")

@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from skysim.apps.cli.options import Json, OpenReport
-from skysim.apps.cli.terminal import colored, print_json, print_list, print_table, progress_callback
+from skysim.apps.cli.terminal import print_json, print_list, progress_callback
 from skysim.core.errors import InputError
-
-if TYPE_CHECKING:
-    from rich.text import Text
-
-    from skysim.experiments.papers.compare import Reproduction
-
-VERDICT_COLORS = {"agrees": "green", "explained": "yellow", "disagrees": "bold red"}
+from skysim.results.report.as_text import print_blocks
 
 
 def reproduce(
@@ -45,9 +39,8 @@ def reproduce(
         ]
         print_list(listed, json, lambda entry: f"{entry['id']:20s} {entry['title']}")
         return
-    from skysim.core.io import files
-    from skysim.experiments.papers import page
     from skysim.experiments.papers.compare import ExperimentOptions
+    from skysim.experiments.papers.papers_report import papers_report, section, verdict
     from skysim.experiments.papers.registry import check_ids
     from skysim.experiments.papers.registry import reproduce as reproduce_one
 
@@ -56,44 +49,18 @@ def reproduce(
         with progress_callback(id, quiet=json) as watch:
             reproductions.append(reproduce_one(id, ExperimentOptions(quick, seed, watch)))
         if not json:
-            print_reproduction(reproductions[-1])
-    arguments = page.CommandArguments(tuple(ids), quick, seed)
-    written: list[Path] = []
-    if report:
-        written.append(files.make_folder(out) / "report.html")
-        page.write_html(written[-1], reproductions, arguments)
-        if open_:
-            typer.launch(str(written[-1]))
-    if markdown:
-        files.make_folder(markdown.parent)
-        written.append(markdown)
-        page.write_markdown(markdown, reproductions, arguments)
+            print_blocks([section(reproductions[-1], drawn=False)])
+    page = out / "report.html"
+    paths = [*([page] if report else []), *([markdown] if markdown else [])]
+    if paths:
+        made = papers_report(reproductions, ids, quick, seed)
+        for path in paths:
+            made.save(path)
+    if open_:
+        typer.launch(str(page))
     if json:
         print_json([line.as_dict() for result in reproductions for line in result.comparisons])
         return
-    print(", ".join(f"{count} {kind}" for kind, count in page.total_counts(reproductions).items()))
-    for path in written:
+    print_blocks([verdict(reproductions)])
+    for path in paths:
         print(path)
-
-
-def print_reproduction(reproduction: Reproduction) -> None:
-    """Print an experiment's table, with notes on the rows that disagree or have a weakness."""
-    from skysim.experiments.papers.compare import format_published, format_summary
-
-    headers = ["what", "published", "ours", "verdict"]
-    lines: list[list[str | Text]] = [
-        [
-            line.row.quantity,
-            format_published(line.row),
-            format_summary(line.result.ours),
-            colored(line.verdict, VERDICT_COLORS[line.verdict]),
-        ]
-        for line in reproduction.comparisons
-    ]
-    published = reproduction.published
-    title = f"{reproduction.id}: {published.title} ({published.source}), {reproduction.seconds:.1f} s"
-    print_table(title, headers, lines)
-    for line in reproduction.comparisons:
-        if line.verdict != "agrees" or line.weakness:
-            print(f"  {line.row.quantity}: {line.note or 'cause unknown'}")
-    print()

@@ -56,9 +56,10 @@ def run(
     json: Json = False,
 ) -> None:
     """Simulate a scene: motion, frames, attitude solutions and their scores."""
-    from skysim.results import scoring
+    from skysim.results.report import Facts
     from skysim.results.run import FlightRecorder
     from skysim.simulation.checks import check
+    from skysim.simulation.checks.facts import TRACKER_KNOWS
     from skysim.simulation.compilation import on_two_processes
     from skysim.simulation.flight import open_flight
 
@@ -74,19 +75,20 @@ def run(
         with on_two_processes(*LOADED[-1]), terminal.progress_callback(loaded.title) as update:
             rows = recorder.record(flight.shots(progress=update))
         command = shlex.join(["skysim", *sys.argv[1:]])
-        statistics, *others = recorder.finish(command, plan, terminal.write_3d_views if scene_3d else None)
+        finished = recorder.finish(command, plan, terminal.write_3d_views if scene_3d else None)
+    (statistics, report), *others = finished
     heads = dict(zip([head.name for head in loaded.heads], others, strict=True))
     if json:
         result = {"scene": loaded.name, **statistics, "rows": [asdict(row) for row in rows]}
-        terminal.print_json(result | {"heads": heads} if heads else result)
+        head_results = {name: head for name, (head, _) in heads.items()}
+        terminal.print_json(result | {"heads": head_results} if heads else result)
     else:
-        terminal.print_rows(rows, scoring.angle_names(loaded), statistics["exposures_ms"])
-        terminal.print_summary(statistics)
-        for name, head in heads.items():
-            terminal.print_head(name, head)
-        for fact in plan.facts:
-            if fact.name == "tracker knows":
-                terminal.print_fact(fact)
+        known = [(fact.name, fact.lines) for fact in plan.facts if fact.name == TRACKER_KNOWS]
+        terminal.print_blocks([Facts(known)])
+        report.print()
+        print(f"report: {statistics['report']}")
+        for name, (head, head_report) in heads.items():
+            terminal.print_wrapped(f"{name}: {head_report.verdict}; report: {head['report']}")
     if open_:
         typer.launch(statistics["report"])
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
@@ -22,20 +21,15 @@ from skysim.apps.cli.options import (
     used_programs,
 )
 from skysim.apps.cli.study_summary import (
-    print_answers,
-    print_front,
-    print_points,
     print_replay,
     print_study_status,
     print_worst,
     study_status,
-    trial_count,
 )
 from skysim.apps.cli.terminal import print_error, print_json, print_titles, trial_progress
 from skysim.core.errors import InputError, printable, unknown_name
 
 if TYPE_CHECKING:
-    from skysim.experiments.study.analysis.search import SearchResult
     from skysim.experiments.study.execution.engines import Engine
     from skysim.experiments.study.execution.store import Store
     from skysim.experiments.study.plan import Plan
@@ -139,8 +133,8 @@ def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
 def report(study: StudyArg, out: Out = None, open_: OpenReport = False, json: Json = False) -> None:
     """Write the report of a study, finished or not, and print its table."""
     study, out = located(study, out)
-    plan, overrides = load_stored_plan(study, out)
-    write_report(plan, study, out, overrides, json, open_)
+    plan, _ = load_stored_plan(study, out)
+    write_report(plan, study, out, json, open_)
 
 
 @app.command()
@@ -277,7 +271,7 @@ def run_and_report(
     from skysim.experiments.study.analysis import search
     from skysim.experiments.study.execution import runner, store
 
-    path, total = folder_of(study, out) / store.STORE, trial_count(plan)
+    path, total = folder_of(study, out) / store.STORE, plan.study.trial_count(len(plan.points))
     resume_command = command(study, out, "resume")
     with store.writing(path) as stored, interruptible(resume_command, stored), closing(engine):
         runner.prepare_store(plan, stored, resumed, overrides)
@@ -294,7 +288,7 @@ def run_and_report(
         print_error(f"{counts['done']} of {total} trials done within the budget; continue: {resume_command}")
     if counts["failed"]:
         print_error(f"{counts['failed']} trials failed; list them: {command(study, out, 'status')}")
-    write_report(plan, study, out, overrides, json, open_)
+    write_report(plan, study, out, json, open_)
 
 
 @contextmanager
@@ -307,47 +301,28 @@ def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
         raise
 
 
-def write_report(plan: Plan, study: str, out: Path | None, overrides: dict[str, str], json: bool, open_: bool) -> None:
-    """Write the HTML report, print the table of results, and open the report in the browser if `open_`."""
-    from skysim.experiments.study.analysis import answer, search, table
-    from skysim.experiments.study.report import page
-    from skysim.experiments.study.report.overview import overview
+def write_report(plan: Plan, study: str, out: Path | None, json: bool, open_: bool) -> None:
+    """Write the HTML report, print it, and open it in the browser if `open_`."""
+    from skysim.experiments.study.analysis import search, table
+    from skysim.experiments.study.report import study_report
 
-    path, about = folder_of(study, out) / "report.html", overview(plan)
+    path = folder_of(study, out) / "report.html"
     with open_store(study, out) as stored:
-        repeat = command(study, out, "optimize" if plan.study.optimize else "run", overrides)
-        lines = table.table(stored, list(dict.fromkeys([*page.responses(plan.study), *answer.RESPONSES])))
-        headline = answer.headline(plan.study, lines, about.may_be_ambiguous, command(study, out, "worst"))
-        headline += answer.one_unit(about.fixed) if headline else []
-        answers = headline + answer.ranges(plan.study, lines)
-        texts: dict[str, Any] = {"about": about, "answers": answers, "replay": command(study, out, "replay")}
-        shown = table.select_responses(lines, page.responses(plan.study))
-        result = search.collect_result(plan, stored) if plan.study.optimize else None
-        page.write_page(path, stored, plan.study, repeat, shown, **texts, **analysis(plan, stored, result))
-        lines = table.select_responses(lines, plan.study.responses)
+        command = study_report.commands(plan, stored, study, out)
+        found = study_report.analyze(plan, stored, command)
+        report = study_report.compose(plan.study, stored, found, command)
         progress = study_status(plan, stored)
+    report.save(path)
     if open_:
         typer.launch(str(path))
-    if json:
-        found = {"report": str(path), "points": table.to_columns(lines), "answers": answers, "findings": about.findings}
-        print_json(progress | found | (search.front_columns(result) if result else {}))
+    if not json:
+        report.print()
+        print(f"store: {progress['store']} (code {progress['code']})")
+        print(f"report: {path}")
         return
-    print_points(*table.cells(lines), factors=len(plan.study.factors))
-    if result:
-        print_front(*search.front_cells(plan.study, result), len(result.candidates))
-    print_answers(about.findings, headline)
-    print_study_status(progress)
-    print(f"report: {path}")
-
-
-def analysis(plan: Plan, stored: Store, result: SearchResult | None) -> dict[str, Any]:
-    """Extra content of the report: Sobol indices, or a search's Pareto front and the cost of each candidate."""
-    from skysim.experiments.study.analysis import sensitivity
-
-    if result is not None:
-        costs = {candidate.number: candidate.cost for candidate in result.candidates}
-        return {"front": [candidate.number for candidate in result.front], "costs": costs}
-    return {"indices": sensitivity.indices(plan, stored)} if plan.study.design.kind == "saltelli" else {}
+    columns = table.to_columns(table.select_responses(found.lines, plan.study.responses))
+    told = {"report": str(path), "points": columns, "answers": found.answers, "findings": found.about.findings}
+    print_json(progress | told | (search.front_columns(found.result) if found.result else {}))
 
 
 def located(study: str, out: Path | None) -> tuple[str, Path | None]:
@@ -421,7 +396,8 @@ def open_store(study: str, out: Path | None) -> AbstractContextManager[Store]:
     return store.open_store(folder_of(study, out) / store.STORE)
 
 
-def command(study: str, out: Path | None, verb: str, overrides: dict[str, str] | None = None) -> str:
+def command(study: str, out: Path | None, verb: str) -> str:
     """The shell command that applies `verb` to the study."""
-    words = ["skysim", "study", verb, study, *(["--out", str(out)] if out else [])]
-    return shlex.join([*words, *(f"--set={key}={value}" for key, value in (overrides or {}).items())])
+    from skysim.experiments.study.report.study_report import shell_command
+
+    return shell_command(study, out, {}, verb)

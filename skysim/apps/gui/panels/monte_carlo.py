@@ -170,8 +170,7 @@ class MonteCarloPanel:
         if unused:
             self.page.show_message(f"trials of {self.kind.value} do not use {', '.join(unused)}", "quiet")
         self.page.set_state(study=self.process.folder.name)
-        resumable = (self.process.folder / STORE).is_file()
-        await self.process.start(path, "resume" if resumable else "run")
+        await self.process.start(path)
         if not self.page.is_open:  # closed meanwhile, when there was no process to end
             self.process.stop(signal.SIGTERM)
         return True

@@ -23,8 +23,8 @@ from skysim.core.io import files as file_io
 from skysim.core.io.yaml_reader import VERSION, set_key
 from skysim.core.paths import SCENES
 from skysim.results import scoring
+from skysim.results.annotate import annotate
 from skysim.results.files import frames
-from skysim.results.report import annotate
 from skysim.scene.loader import find
 
 FILE_BY_ITEM = {  # file by menu entry

@@ -14,6 +14,7 @@ import numpy as np
 import yaml
 
 from skysim.core.errors import InputError
+from skysim.experiments.study.api import run_study
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution.store import STORE
 from skysim.results import metrics
@@ -83,12 +84,14 @@ class StudyProcess:
     def running(self) -> bool:
         return self.process is not None and self.process.returncode is None
 
-    async def start(self, study: Path, verb: str = "run") -> None:
-        """Start the process; its standard error is kept for `wait`. verb : run or resume"""
-        command = ["-m", "skysim", "study", verb, str(study), "--out", str(self.folder), "--workers", "1"]
+    async def start(self, study: Path) -> None:
+        """Start the process, which continues the study in the folder's store; its stderr is kept for `wait`."""
         self.process = await asyncio.create_subprocess_exec(
             sys.executable,
-            *command,
+            "-m",
+            "skysim.apps.gui.worker.study_process",
+            str(study),
+            str(self.folder),
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,
             start_new_session=True,
@@ -153,6 +156,17 @@ def histogram(error_arcsec: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
     return tuple(np.sqrt(edges[1:] * edges[:-1]).tolist()), tuple(counts.tolist())
 
 
+def run_and_report(study: Path, folder: Path) -> None:
+    """Run a study's missing trials and write its report: the body of the process, which SIGTERM ends as Ctrl-C does."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        run_study(study, out=folder, workers=1).report().save(folder / "report.html")
+    except InputError as error:
+        sys.exit(f"skysim: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
 def is_shown(name: str, user: str) -> bool:
     """Whether a user may see a study: all but the Monte Carlo studies that another user has started in the page."""
     return not name.startswith(PAGE_STUDY) or name.startswith(f"{PAGE_STUDY}{user}_")
@@ -163,3 +177,7 @@ def finished(folder: Path, user: str) -> list[Path]:
     folders = [path.parent for path in folder.glob("*/report.html") if (path.parent / STORE).is_file()]
     folders = [path for path in folders if is_shown(path.name, user)]
     return sorted(folders, key=lambda path: -(path / "report.html").stat().st_mtime)
+
+
+if __name__ == "__main__":
+    run_and_report(*map(Path, sys.argv[1:]))

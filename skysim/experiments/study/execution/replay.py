@@ -19,8 +19,8 @@ from skysim.experiments.study.execution.setups import Setup, prepared_setup
 from skysim.experiments.study.execution.store import Store, to_sql
 from skysim.experiments.study.execution.trials import Row, Segment
 from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Plan
+from skysim.results.annotate import annotate, visible
 from skysim.results.files import frames
-from skysim.results.report import annotate, visible
 from skysim.tracking import factory
 
 MAX_FRAMES = 100  # maximum number of frames written for a flight

@@ -5,13 +5,14 @@ from __future__ import annotations
 import shlex
 import sys
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from skysim.apps.cli.options import Json, Out, Overrides, SceneArg, Seed, load, output_folder
 from skysim.apps.cli.terminal import print_json, progress_callback
 from skysim.core.errors import InputError
+from skysim.results.report.as_text import print_wrapped
 
 
 class Excitation(StrEnum):
@@ -58,8 +59,7 @@ def balance(
 
     The star tracker is the instrument. Every flight is simulated, its frames are rendered and solved.
     """
-    from skysim.apps.cli.balance_summary import print_balance, print_flight
-    from skysim.experiments.balance import assumptions, observability, procedure, report
+    from skysim.experiments.balance import assumptions, balance_report, observability, procedure
 
     if estimate_only and flights is not None:
         raise InputError("--flights: has no effect with --estimate-only; allowed: none")
@@ -72,19 +72,34 @@ def balance(
         for one in procedure.balance(loaded, plan, uncertainty, watch):
             iterations.append(one)
             if not json:
-                print_flight(report.flight_row(len(iterations), one))
-    statistics = report.statistics(loaded.name, plan, iterations)
+                print_flight(balance_report.flight_row(len(iterations), one))
+    statistics = balance_report.statistics(loaded.name, plan, iterations)
     if in_flight:
-        statistics["in_flight"] = report.filter_rows(iterations[-1], procedure.assumed(loaded, uncertainty))
-    report.write_all(folder, statistics, iterations, shlex.join(["skysim", *sys.argv[1:]]))
+        statistics["in_flight"] = balance_report.filter_rows(iterations[-1], procedure.assumed(loaded, uncertainty))
+    report = balance_report.write_all(folder, statistics, iterations, shlex.join(["skysim", *sys.argv[1:]]))
     if json:
         print_json(statistics)
     else:
-        print_balance(statistics)
+        report.print()
+        print_wrapped(f"report: {statistics['report']}")
     observability.check_observed(
         iterations[-1].estimate,
         procedure.assumed(loaded, uncertainty).prior,
         [one.flight.record for one in iterations],
         bars.inertia,
         bars.moment_kg_m(iterations[-1].flight.vehicle),
+    )
+
+
+def print_flight(row: dict[str, Any]) -> None:
+    """Print one flight: offset with its standard deviation, torque, where the trim masses go."""
+    from skysim.experiments.balance.balance_report import offset_text
+
+    places = "/".join(f"{one:.3f}" for one in row["next_trim_mm"])
+    moved = f"; trim masses to {places} mm" if row["next_trim_mm"] != row["trim_mm"] else ""
+    contact = f", {row['after_contact']} of them after a contact" if row["after_contact"] else ""
+    print_wrapped(
+        f"flight {row['flight']}: {row['solved']} of {row['frames']} frames solved{contact};"
+        f" center of mass at {offset_text(row)} um;"
+        f" gravity torque {row['torque_nm']:.2g} N m, at most {row['torque_bound_nm']:.2g} N m{moved}"
     )

@@ -9,8 +9,9 @@ import typer
 
 from skysim.apps.cli.commands.camera import complete_camera
 from skysim.apps.cli.options import Json, Out
-from skysim.apps.cli.terminal import print_json, print_table, print_wrapped, progress
+from skysim.apps.cli.terminal import print_json, progress
 from skysim.core.errors import InputError
+from skysim.results.report.as_text import print_wrapped
 
 
 def characterize(
@@ -49,8 +50,12 @@ def characterize(
     found = procedure.measure_sensor(config, *folders)
     sky = procedure.measure_night(config, raw, night, found) if night else None
     name = Path(camera).stem
-    statistics = procedure.write_results(output_folder(out, name), config, raw, found, sky, name)
-    print_json(statistics) if json else print_results(statistics)
+    statistics, report = procedure.write_results(output_folder(out, name), config, raw, found, sky, name)
+    if json:
+        print_json(statistics)
+    else:
+        report.print()
+        print_wrapped(f"report: {statistics['report']}")
 
 
 def write_simulated(config: Any, folder: Path, seed: int, json: bool) -> None:
@@ -63,31 +68,3 @@ def write_simulated(config: Any, folder: Path, seed: int, json: bool) -> None:
         print_json({"frames": len(paths), "folder": str(folder)})
     else:
         print_wrapped(f"{len(paths)} frames: --darks {folder / 'darks'} --flats {folder / 'flats'}")
-
-
-def print_results(statistics: dict[str, Any]) -> None:
-    """Print the table of the values, what is not known, and the file."""
-    night = statistics["night"]
-    lines = [
-        [
-            row["what"],
-            f"{row['value']:.5g}",
-            f"{row['low']:.5g} to {row['high']:.5g}",
-            "-" if row["file"] is None else f"{row['file']:.5g}",
-            row["unit"],
-        ]
-        for row in statistics["values"] + (night["values"] if night else [])
-    ]
-    print_table("", ["what", "measured", "95 %", "file", "unit"], lines)
-    print()
-    if statistics["temperature_c"] is not None:
-        print_wrapped(f"dark current at {statistics['temperature_c']:g} °C")
-    print_wrapped(f"linearity error {100 * statistics['linearity_error']:.2g} %, of 5 to 95 % of the saturation")
-    if night:
-        print_wrapped(
-            f"{night['stars']} star images in {night['frames']} frames; {night['identified']} frames identified"
-            + (f", residuals {night['rms_px']:.2g} px rms" if night["rms_px"] is not None else "")
-        )
-    for remark in statistics["remarks"]:
-        print_wrapped(f"unknown: {remark}")
-    print_wrapped(f"{statistics['preset']}: for camera.preset; {statistics['report']}")

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skysim.apps.cli.options import Json, OpenReport, Overrides, SceneArg, Seed, load
-from skysim.apps.cli.terminal import print_json, print_table, print_wrapped, trial_progress
+from skysim.apps.cli.terminal import print_json, trial_progress
 from skysim.core.errors import InputError
+from skysim.results.report.as_text import print_table, print_wrapped
+from skysim.results.report.blocks import Column, Table
 
 if TYPE_CHECKING:
     from skysim.experiments.datasheet.model.check import Agreement
-    from skysim.experiments.datasheet.statement import Statement
 
 
 def datasheet(
@@ -48,8 +49,9 @@ def datasheet(
 
     Stopped or killed, it goes on where it was when it is called again.
     """
+    from skysim.core.io import files
     from skysim.core.io.yaml_reader import parse_overrides
-    from skysim.experiments.datasheet import page, run
+    from skysim.experiments.datasheet import datasheet_report, run
     from skysim.experiments.datasheet.model import check, export, fit
     from skysim.experiments.datasheet.statement import numbers, state
 
@@ -67,9 +69,11 @@ def datasheet(
 
         sheet = run.measure(scene, loaded, overrides, folder, quick=quick, fields=fields, workers=workers, watch=watch)
     statement = state(sheet)
-    paths = page.write_all(folder, statement, quick)
+    report = datasheet_report.datasheet_report(statement, quick)
+    paths = datasheet_report.write_all(folder, statement, report)
     if markdown:
-        page.write_markdown(markdown, statement, quick)
+        files.make_folder(markdown.parent)
+        files.write_text(markdown, report.markdown())
     if model:
         agreements = check.agreements(sheet)
         constants = fit.constants(sheet) | {"agreement": [one._asdict() for one in agreements]}
@@ -77,7 +81,7 @@ def datasheet(
     if json:
         print_json(numbers(statement))
     else:
-        print_statement(statement)
+        report.print()
         print(f"report: {paths['report']}")
         if model:
             print_agreements(agreements)
@@ -85,17 +89,6 @@ def datasheet(
                 print(path)
     if open_:
         typer.launch(str(paths["report"]))
-
-
-def print_statement(statement: Statement) -> None:
-    """Print the sections of the terms, of their causes and of the probabilities; the report has the others."""
-    from skysim.experiments.datasheet.statement import sections
-
-    for section in sections(statement)[:3]:
-        print_table(section.title, section.headers, section.rows)
-        for text in section.texts:
-            print_wrapped(text)
-        print()
 
 
 def print_agreements(agreements: list[Agreement]) -> None:
@@ -111,8 +104,9 @@ def print_agreements(agreements: list[Agreement]) -> None:
         ]
         for one in agreements
     ]
-    headers = ["fitted to", "rate °/s", "frames", "p of x", "p of y", "p of roll", "correlation", "of the model"]
-    print_table("The model, fitted to half of the fields (even or odd numbers), beside the other half", headers, rows)
+    heads = ["rate °/s", "frames", "p of x", "p of y", "p of roll", "correlation", "of the model"]
+    table = Table([Column("fitted to", kind="text"), *map(Column, heads)], rows)
+    print_table(table, "The model, fitted to half of the fields (even or odd numbers), beside the other half")
     print_wrapped(
         "p: Kolmogorov-Smirnov; of a right model one in twenty is below 0.05. correlation: mean over the axes and the"
         " pairs of frames of the sequences."

@@ -17,6 +17,7 @@ from skysim.apps.cli import survey_summary
 from skysim.apps.cli.options import Json, Out, Overrides, SceneArg, Seed, load, output_folder
 from skysim.apps.cli.terminal import print_error, print_json, progress, progress_callback
 from skysim.core.errors import InputError
+from skysim.results.report.as_text import print_blocks, print_wrapped
 
 if TYPE_CHECKING:
     from estimator.core.camera import Camera
@@ -151,7 +152,7 @@ def survey(
         statistics = simulated(request, checks or CHECKS, frames_to)
     if json:
         print_json(statistics)
-    else:
+    elif mode in survey_summary.PRINTERS:
         survey_summary.PRINTERS[mode](statistics)
 
 
@@ -308,12 +309,13 @@ def print_so_far(request: Request, pictures: list[SurveyImage], before: Calibrat
     """Print how many images there are, which LEDs they measure, and the attitudes to hold next."""
     from skysim.experiments.dome_survey.folder.images import frames_with_attitude
     from skysim.experiments.dome_survey.results import findings
+    from skysim.experiments.dome_survey.results.survey_report import coverage_blocks
 
     found = frames_with_attitude(pictures, before, request.uncertainty, stages)
     print(f"{len(pictures)} of {request.frames} images, {len(found)} with an attitude")
     if found:
         so_far = findings.coverage_before(found, before, request.uncertainty, before.floor_px)
-        survey_summary.print_coverage(with_next(request, so_far, before))
+        print_blocks(coverage_blocks(with_next(request, so_far, before)))
 
 
 def image_camera(path: Path) -> tuple[Camera, tuple[float, float] | None]:
@@ -335,13 +337,14 @@ def coverage_shown(
 ) -> Iterator[None]:
     """Print which LEDs the frames show, and the attitudes to hold next, if they are too few for a survey."""
     from skysim.experiments.dome_survey.results import findings
+    from skysim.experiments.dome_survey.results.survey_report import coverage_blocks
 
     try:
         yield
     except InputError:
         if frames:
             so_far = findings.coverage_before(frames, prior, request.uncertainty, noise_px or prior.floor_px)
-            survey_summary.print_coverage(with_next(request, so_far, prior))
+            print_blocks(coverage_blocks(with_next(request, so_far, prior)))
         raise
 
 
@@ -380,12 +383,16 @@ def write_results(request: Request, run: SurveyRun, before: CalibrationPrior, la
 
 
 def write_report(request: Request, run: SurveyRun, statistics: dict[str, Any]) -> dict[str, Any]:
-    """Write the statistics of a survey as JSON and as a page, and return them with the page's path."""
+    """Write a survey's statistics as JSON, and its report, which is printed too; return them with the report's path."""
     from skysim.core.io import files
-    from skysim.experiments.dome_survey.results import page
+    from skysim.experiments.dome_survey.results.survey_report import survey_report
 
     path = request.folder / "report.html"
     statistics |= {"report": str(path)}
-    page.write_page(path, statistics, run, shlex.join(["skysim", *sys.argv[1:]]))
+    report = survey_report(statistics, run, shlex.join(["skysim", *sys.argv[1:]]))
+    report.save(path)
     files.write_text(request.folder / "survey.json", files.to_json(statistics))
+    if not request.quiet:
+        report.print()
+        print_wrapped(f"{statistics['map']}: for tracker.map; report: {path}")
     return statistics

@@ -1,43 +1,78 @@
-"""Page of a characterized camera: table of the values, and figures of what they were fitted to."""
+"""The report of a characterized camera: its values, and figures of what they were fitted to."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from skysim.core.io.files import write_text
 from skysim.experiments.characterize.night.lens import Night
 from skysim.experiments.characterize.night.star_images import ImageSize
 from skysim.experiments.characterize.sensor.dark_current import DarkCurrent
 from skysim.experiments.characterize.sensor.photon_transfer import BLACK, CURVATURE, FIRST_DARK, GAIN, LIGHT, model
 from skysim.experiments.characterize.sensor.sensor import Sensor
 from skysim.results.plots import INK, png
-from skysim.results.report import embed, render_page
+from skysim.results.report import Column, Facts, Figure, Items, Report, Section, Table, Verdict
 from skysim.scene.sections.camera import CameraConfig
 
 
-def write_page(
-    path: Path, statistics: dict[str, Any], config: CameraConfig, found: Sensor, night: Night | None
-) -> None:
-    """Write one HTML file with its figures embedded."""
-    figures = [
-        (png(lambda fig: draw_transfer(fig.subplots(1, 2), found), (10, 4)), TRANSFER_TEXT),
-        *([(png(lambda fig: draw_dark(fig.subplots(), dark), (10, 4)), DARK_TEXT)] if (dark := found.dark) else []),
-        *([(png(lambda fig: draw_size(fig.subplots(), config, night), (10, 4)), SIZE_TEXT)] if night else []),
+def characterize_report(statistics: dict[str, Any], config: CameraConfig, found: Sensor, night: Night | None) -> Report:
+    """The report of a characterized camera. statistics : as in `characterize.json`"""
+    figures = [Figure(png(lambda fig: draw_transfer(fig.subplots(1, 2), found), SIZE_IN), TRANSFER_TEXT)]
+    if dark := found.dark:
+        figures.append(Figure(png(lambda fig: draw_dark(fig.subplots(), dark), SIZE_IN), DARK_TEXT))
+    if night:
+        figures.append(Figure(png(lambda fig: draw_size(fig.subplots(), config, night), SIZE_IN), SIZE_TEXT))
+    values = value_table(statistics)
+    blocks = [
+        verdict(statistics, len(values.rows)),
+        Items([f"unknown: {remark}" for remark in statistics["remarks"]], tone="bad"),
+        Section("Figures", figures),
+        Section("Values", [values, facts(statistics)]),
     ]
-    rows = statistics["values"] + (statistics["night"]["values"] if night else [])
-    page = render_page(
-        "characterize.html",
-        title=f"{statistics['camera']}, measured",
-        rows=rows,
-        statistics=statistics,
-        figures=[(embed(figure), text) for figure, text in figures],
-    )
-    write_text(path, page)
+    return Report(f"{statistics['camera']}, measured", blocks)
 
 
+def verdict(statistics: dict[str, Any], values: int) -> Verdict:
+    """How many values are known, and how well the law of photon transfer holds."""
+    unknown, misfit = len(statistics["remarks"]), statistics["misfit"]
+    text = f"{values} values measured, {unknown} unknown; misfit of the photon transfer {misfit:.2f}"
+    return Verdict(f"{text} (1 if the law holds).", "warning" if unknown else "good")
+
+
+def facts(statistics: dict[str, Any]) -> Facts:
+    """The preset, and the conditions of the values."""
+    celsius, night = statistics["temperature_c"], statistics["night"]
+    rows = [
+        ("for camera.preset", [statistics["preset"]]),
+        ("dark current at", ["an unknown temperature" if celsius is None else f"{celsius:g} °C"]),
+        ("linearity error", [f"{100 * statistics['linearity_error']:.2g} %, of 5 to 95 % of the saturation"]),
+        ("flicker of the lamp", [f"{100 * statistics['flicker']:.2g} %"]),
+    ]
+    if night:
+        residuals = "" if night["rms_px"] is None else f", residuals {night['rms_px']:.2g} px rms"
+        stars = f"{night['stars']} star images in {night['frames']} frames"
+        rows.append(("night", [f"{stars}, of which {night['identified']} were identified{residuals}"]))
+    return Facts(rows)
+
+
+def value_table(statistics: dict[str, Any]) -> Table:
+    """The values with their intervals, and those of the camera's file."""
+    columns = [
+        Column("what", kind="text"),
+        Column("measured", format=".5g"),
+        Column("95 %"),
+        Column("file", format=".5g"),
+        Column("unit", kind="text"),
+    ]
+    rows = [
+        [row["what"], row["value"], f"{row['low']:.5g} to {row['high']:.5g}", row["file"], row["unit"]]
+        for row in statistics["values"] + (statistics["night"]["values"] if statistics["night"] else [])
+    ]
+    return Table(columns, rows)
+
+
+SIZE_IN = (10, 4)  # of a figure
 TRANSFER_TEXT = (
     "Photon transfer: temporal variance against the mean signal, of darks and flats. Line: the fit; open: beyond it."
     " Right: the signal over that of a linear sensor with the same lamp, less 1; line: the fitted amplifier."

@@ -1,4 +1,4 @@
-"""Statistics, picture and page of a balance: the estimates by flight, and beside them the simulated vehicle."""
+"""Statistics, picture and report of a balance: the estimates by flight, and beside them the simulated vehicle."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skysim.experiments.balance.assumptions import Assumptions
 from skysim.experiments.balance.flight import BalanceFlight
 from skysim.experiments.balance.observability import largest_tilt_deg
 from skysim.experiments.balance.procedure import Iteration, Plan, filtered
-from skysim.results.report import embed, render_page
+from skysim.results.report import Block, Cell, Column, Facts, Figure, Report, Section, Table, Text, Verdict
 
 INERTIA_NAMES = ("Jxx", "Jyy", "Jzz", "Jxy", "Jxz", "Jyz")
 MOMENT_NAMES = ("x", "y", "z")
@@ -121,28 +121,91 @@ def filter_rows(one: Iteration, assumptions: Assumptions) -> list[dict[str, Any]
     return estimate_rows(one.flight, filtered(one.flight.record, assumptions))
 
 
-def tables(statistics: dict[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
-    """Titles and rows of the tables of mass properties."""
-    found = [("With the trim masses at zero, from all flights", statistics["estimates"])]
-    if "in_flight" in statistics:
-        found.append(("By the filter in flight, from the last flight", statistics["in_flight"]))
-    return found
+def balance_report(statistics: dict[str, Any], picture: bytes, command: str) -> Report:
+    """The report of a balance. picture : see `balance_figure`, PNG"""
+    blocks = [
+        verdict(statistics),
+        Facts([("every number of this page", [Cell("balance.json", link="balance.json")])], on_terminal=False),
+        Section("Balance", [Figure(picture, CAPTION)]),
+        Section("Flights", [Text(FLIGHTS), flight_table(statistics["flights"])], on_terminal=False),
+        Section("With the trim masses at zero, from all flights", mass_blocks(statistics["estimates"])),
+        Section("By the filter in flight, from the last flight", mass_blocks(statistics.get("in_flight", []))),
+    ]
+    return Report(f"Balance of {statistics['scene']}", blocks, command)
 
 
-def write_all(folder: Path, statistics: dict[str, Any], iterations: Sequence[Iteration], command: str) -> None:
-    """Write picture, JSON and the page, with the picture embedded; their paths are added to the statistics."""
+CAPTION = "Gravity torque and offset flight by flight, and the attitude in the last flight."
+FLIGHTS = (
+    "The center of mass is measured from the bearing's center, with the trim masses where they were in the flight; ± is"
+    " 1σ."
+)
+
+
+def verdict(statistics: dict[str, Any]) -> Verdict:
+    """Whether the vehicle is balanced, and how well that is known."""
+    flights = statistics["flights"]
+    last, frames = flights[-1], sum(one["frames"] for one in flights)
+    return Verdict(
+        f"{'balanced' if statistics['balanced'] else 'not balanced'}: gravity torque at most (estimate and 2σ)"
+        f" {last['torque_bound_nm']:.2g} N m, bar {statistics['torque_bar_nm']:.2g} N m; the simulated vehicle's is"
+        f" {last['true_torque_nm']:.2g} N m; {len(flights)} flights, {frames} frames; misfit {statistics['misfit']:.2f}"
+        " (rms residual over its standard error)",
+        "good" if statistics["balanced"] else "bad",
+    )
+
+
+def flight_table(flights: Sequence[dict[str, Any]]) -> Table:
+    """One row per flight."""
+    columns = [
+        Column("flight"),
+        Column("frames solved"),
+        Column("greatest tilt", "°", ".1f"),
+        Column("trim masses", "mm"),
+        Column("center of mass", "µm"),
+        Column("of the simulated vehicle", "µm"),
+        Column("gravity torque", "N m", ".2g"),
+        Column("at most", "N m", ".2g"),
+    ]
+    rows = [
+        [
+            one["flight"],
+            f"{one['solved']} / {one['frames']}",
+            one["tilt_deg"],
+            ", ".join(f"{place:.3f}" for place in one["trim_mm"]),
+            offset_text(one),
+            ", ".join(f"{value:.3g}" for value in one["true_offset_um"]),
+            one["torque_nm"],
+            one["torque_bound_nm"],
+        ]
+        for one in flights
+    ]
+    return Table(columns, rows)
+
+
+def offset_text(flight: dict[str, Any]) -> str:
+    """The center of mass with its standard deviations."""
+    found = zip(flight["offset_um"], flight["offset_sigma_um"], strict=True)
+    return ", ".join(f"{value:.3g} ± {sigma:.2g}" for value, sigma in found)
+
+
+def mass_blocks(rows: Sequence[dict[str, Any]]) -> list[Block]:
+    """Estimates of the mass properties beside the simulated vehicle's."""
+    heads = ("estimate", "1σ", "simulated vehicle")
+    columns = [Column("what", kind="text"), *(Column(head, format=".5g") for head in heads)]
+    values = [
+        [row["what"], row["estimate"], row["sigma"], row["truth"], (row["estimate"] - row["truth"]) / row["sigma"]]
+        for row in rows
+    ]
+    table = Table([*columns, Column("error over 1σ", format=".1f")], values)
+    return [table, Text("J in kg m², of the vehicle with its trim masses at zero.")] if rows else []
+
+
+def write_all(folder: Path, statistics: dict[str, Any], iterations: Sequence[Iteration], command: str) -> Report:
+    """Write picture, JSON and report; their paths are added to the statistics. Returns the report."""
     picture = files.make_folder(folder) / "balance.png"
     files.write_image(picture, balance_figure(iterations, statistics["torque_bar_nm"]))
     statistics |= {"picture": str(picture), "report": str(folder / "report.html")}
     files.write_text(folder / "balance.json", files.to_json(statistics))
-    text = render_page(
-        "balance.html",
-        title=f"Balance of {statistics['scene']}",
-        command=command,
-        balance=statistics,
-        last=statistics["flights"][-1],
-        frames=sum(one["frames"] for one in statistics["flights"]),
-        tables=tables(statistics),
-        picture=embed(picture.read_bytes()),
-    )
-    files.write_text(folder / "report.html", text)
+    report = balance_report(statistics, picture.read_bytes(), command)
+    report.save(folder / "report.html")
+    return report

@@ -1,19 +1,12 @@
-"""Annotated frames, plots and one self-contained HTML page of a run."""
+"""Draw markers and captions on frames: truth, detections and identified sources."""
 
 from __future__ import annotations
-
-import base64
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.core.io.files import write_text
-from skysim.core.types import Floats, FrameRow, SourceTruth
-from skysim.results.plots import figure_png, stacked_axes
+from skysim.core.types import Floats, SourceTruth
 from skysim.results.stretch import to_8bit
 from skysim.sources.false_lights import light_name
 
@@ -135,103 +128,3 @@ def pixel_positions(xy_px: Floats | None, scale: int) -> list[tuple[int, int]]:
     if xy_px is None:
         return []
     return [(round(x), round(y)) for x, y in xy_px * scale + (scale - 1) / 2]
-
-
-def summary(rows: list[FrameRow]) -> dict[str, Any]:
-    """Frame counts, median and worst errors in arcseconds, and median solve time of a run.
-
-    Errors are over solved frames, wrong ones included; NaN if no frame was solved.
-    """
-    solved = [row for row in rows if row.status == "solved"]
-    cross = np.array([row.cross_arcsec for row in solved] or [np.nan])
-    roll = np.abs([row.roll_arcsec for row in solved] or [np.nan])
-    return {
-        "frames": len(rows),
-        "solved": len(solved),
-        "wrong": sum(row.wrong for row in solved),
-        "cross_arcsec_median": float(np.median(cross)),
-        "cross_arcsec_worst": float(np.max(cross)),
-        "roll_arcsec_median": float(np.median(roll)),
-        "roll_arcsec_worst": float(np.max(roll)),
-        "time_ms_median": float(np.median([row.time_ms for row in rows])),
-    }
-
-
-def write_page(
-    path: Path,
-    title: str,
-    command: str,
-    angles: tuple[str, str, str],
-    rows: list[FrameRow],
-    stages_ms: dict[str, float],
-    annotated: NDArray[np.uint8],
-    flight: bytes,
-    scene_3d: Sequence[Path],
-    plan: Sequence[tuple[str, Sequence[str]]] = (),
-    findings: Sequence[str] = (),
-) -> None:
-    """Write one HTML file with its images embedded: the scene and its warnings, statistics, plots, an annotated frame.
-
-    angles : names of the three angles of a row;  stages_ms : median time by stage
-    flight : telemetry plot, PNG, or empty;  scene_3d : image files of the laboratory
-    plan, findings : names and lines of the scene's table, and the check's warnings, see `simulation.checks`
-
-    A single frame has no plot against time.
-    """
-    text = render_page(
-        "run.html",
-        title=title,
-        command=command,
-        angles=angles,
-        rows=rows,
-        summary=summary(rows),
-        stages_ms=stages_ms,
-        picture=embed(cv2.imencode(".png", annotated)[1].tobytes()),
-        flight=embed(flight) if flight else "",
-        scene_3d=[embed(path.read_bytes(), path.suffix[1:]) for path in scene_3d],
-        figure=embed(error_figure(rows)) if len(rows) > 1 else "",
-        plan=plan,
-        findings=findings,
-    )
-    write_text(path, text)
-
-
-def render_page(template: str, **values: Any) -> str:
-    """Render one of the page templates of this package (`templates/`, all of which extend base.html)."""
-    from jinja2 import Environment, PackageLoader
-
-    loader = PackageLoader("skysim.results")
-    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    return environment.get_template(template).render(values)
-
-
-def embed(image: bytes, kind: str = "png") -> str:
-    return f"data:image/{kind};base64," + base64.b64encode(image).decode()
-
-
-def error_figure(rows: list[FrameRow]) -> bytes:
-    """Errors, detected and matched sources, and rate against time, as PNG. Red lines mark unsolved frames."""
-    fig, (errors, stars, rate) = stacked_axes([2.9, 1.45, 1.45])
-    solved = [row for row in rows if row.status == "solved"]
-    t = [row.t_s for row in solved]
-    cross, roll = ([max(abs(getattr(row, f"{name}_arcsec")), 1e-6) for row in solved] for name in ("cross", "roll"))
-    errors.plot(t, cross, ".-", label="cross-boresight")
-    errors.plot(t, roll, ".-", label="roll")
-    if solved and max(cross + roll) > 10 * min(cross + roll):
-        errors.set_yscale("log")
-    else:
-        errors.set_ylim(bottom=0)
-    for row in rows:
-        if row.status != "solved":
-            errors.axvline(row.t_s, color="tab:red", alpha=0.4)
-    errors.set_ylabel("error [arcsec]")
-    errors.legend()
-    t_all = [row.t_s for row in rows]
-    stars.plot(t_all, [row.detected for row in rows], label="detected")
-    stars.plot(t_all, [row.matched for row in rows], label="matched")
-    stars.set_ylabel("sources")
-    stars.set_ylim(bottom=0)
-    stars.legend()
-    rate.plot(t_all, [row.rate_deg_s for row in rows], color="tab:green")
-    rate.set_ylabel("rate [deg/s]")
-    return figure_png(fig, dpi=110)

@@ -15,7 +15,7 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import designs
-from skysim.experiments.study.analysis import axes
+from skysim.experiments.study.analysis import axes, search
 from skysim.experiments.study.analysis.sensitivity import Index
 from skysim.experiments.study.analysis.table import PointRow, cells, has_few_values, table
 from skysim.experiments.study.designs import Point
@@ -23,12 +23,15 @@ from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.plan import Curve, Heat, Study
-from skysim.experiments.study.report import figures, layout, page
+from skysim.experiments.study.report import figures, layout, study_report
+from skysim.experiments.study.report.overview import Overview
 from skysim.experiments.study.report.scales import color_scale
+from skysim.experiments.study.report.study_report import POINTS, Analysis
 from skysim.results.metrics import Summary
 from skysim.results.plots import INK
 
 COMMAND = "skysim study run 'a <b> & \"c\".yaml' --set=x=</code><script>alert(1)</script>"
+REPLAY = "skysim study replay FILE"
 TILT = {"key": "trial.tilt_deg", "values": [20, 0, 10]}
 DOME: dict[str, Any] = {"levels": {name: {} for name in ("sphere", "flat", "cube")}}
 RADIUS = {"key": "light.radius", "values": ["48 in", "24 in", "96 in"]}
@@ -72,24 +75,24 @@ def filled(
 
 def lines_of(path: Path, asked: Study) -> list[PointRow]:
     with store.open_store(path) as kept:
-        return table(kept, page.responses(asked))
+        return table(kept, study_report.responses(asked))
 
 
 class Html(HTMLParser):
-    """A page as text by element's id, rows of tables by id, images, and everything that names a source."""
+    """A page: texts of its elements by class or id, rows of tables and their sort keys by section, images, sources."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        self.ids: dict[str, str] = {}
+        self.said: dict[str, str] = {}
         self.tables: dict[str, list[list[str]]] = {}
-        self.rows: list[dict[str, str | None]] = []
+        self.marked: list[bool] = []
         self.keys: list[list[str]] = []
         self.images: list[str] = []
         self.sources: list[str] = []
         self.tags: list[str] = []
         self._inside: list[str] = []
-        self._table = ""
-        self._cell = False
+        self._title = self._section = ""
+        self._in_title = self._cell = False
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -98,48 +101,53 @@ class Html(HTMLParser):
         self.sources += [told[name] or "" for name in ("src", "href") if name in told]
         if tag == "img":
             self.images.append(told["src"] or "")
-        if tag in ("b", "code", "div", "table", "pre"):
-            self._inside.append(told.get("id") or "")
+        if tag in ("p", "code", "div", "pre"):
+            self._inside.append((told.get("id") or told.get("class") or tag).strip())
+        if tag in ("h2", "summary"):
+            self._in_title, self._title = True, ""
         if tag == "table":
-            self._table = told.get("id") or "?"
-            self.tables[self._table] = []
+            self.tables.setdefault(self._section, [])
         if tag == "tr":
-            self.tables[self._table].append([])
-            if self._table == "points":
-                self.rows.append(told)
+            self.tables[self._section].append([])
+            if self._section == POINTS:
+                self.marked.append(False)
                 self.keys.append([])
         if tag in ("td", "th"):
             self._cell = True
-            self.tables[self._table][-1].append("")
-            if tag == "td" and self._table == "points":
-                self.keys[-1].append(told["data-v"] or "")
+            self.tables[self._section][-1].append("")
+        if tag == "td" and self._section == POINTS:
+            self.keys[-1].append(told["data-key"] or "")
+            self.marked[-1] |= "marked" in (told["class"] or "")
 
     def handle_endtag(self, tag: str) -> None:
-        if tag in ("b", "code", "div", "table", "pre"):
+        if tag in ("p", "code", "div", "pre"):
             self._inside.pop()
+        if tag in ("h2", "summary"):
+            self._in_title, self._section = False, self._title
         if tag in ("td", "th"):
             self._cell = False
 
     def handle_data(self, data: str) -> None:
         for name in self._inside:
-            if name:
-                self.ids[name] = self.ids.get(name, "") + data
+            self.said[name] = self.said.get(name, "") + data
+        if self._in_title:
+            self._title += data
         if self._cell:
-            self.tables[self._table][-1][-1] += data
+            self.tables[self._section][-1][-1] += data
 
 
 def written(path: Path, asked: Study, **more: Any) -> tuple[str, Html]:
     with store.open_store(path) as kept:
-        lines = table(kept, page.responses(asked))
-        page.write_page(path.with_suffix(".html"), kept, asked, COMMAND, lines, **more)
-    text = path.with_suffix(".html").read_text(encoding="utf-8")
+        about = Overview([("scene", "afit_simsat"), ("trials", "20 at each point; seed 11")], [], False)
+        found = Analysis(table(kept, study_report.responses(asked)), about, **more)
+        text = study_report.compose(asked, kept, found, lambda verb: REPLAY if verb == "replay" else COMMAND).html()
     return text, Html(text)
 
 
 @pytest.fixture
 def bare(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages without figures, which take the time."""
-    monkeypatch.setattr(page, "figure_images", lambda *_: [])
+    monkeypatch.setattr(study_report, "study_figures", lambda *_: [])
 
 
 # The page.
@@ -152,19 +160,20 @@ def test_every_fact_is_the_stores(tmp_path: Path) -> None:
     _, html = written(path, asked)
     with store.open_store(path) as kept:
         counts, heads, rows = kept.counts(), *cells(table(kept, asked.responses))
-    assert html.ids["done"] == f"{counts['done']} / {9 * 20}"
-    assert (html.ids["failed"], html.ids["wrong"]) == (str(counts["failed"]), str(counts["wrong"])) == ("3", "0")
-    assert (html.ids["scene"], html.ids["seed"], html.ids["code"]) == ("afit_simsat", "11", "cafe0123")
-    assert html.tables["points"] == [heads, *rows]
-    assert html.tables["runs"][1:] == [["pool", "2", "180", "4.0", "45.0"]]
-    assert html.ids["study"] == "title: Which <dome>?"
-    assert "unfinished" not in html.ids
+    said = f"{counts['done']} of {9 * 20} trials, {counts['failed']} failed, {counts['wrong']} wrong attitudes"
+    assert html.said["verdict bad"].startswith(said)
+    assert (counts["failed"], counts["wrong"]) == (3, 0)
+    assert dict(html.tables["Scene"])["code version"] == "cafe0123"
+    assert html.tables[POINTS] == [heads, *rows]
+    assert html.tables["Runs"][1:] == [["pool", "2", "180", "4.0", "45.0"]]
+    assert html.said["pre"] == "title: Which <dome>?"
+    assert "Not finished" not in html.said["verdict bad"]
 
 
 def test_the_command_is_escaped_and_nothing_comes_from_outside(tmp_path: Path) -> None:
     asked = study()
     text, html = written(filled(tmp_path / "s.sqlite", asked, failed=1), asked)
-    assert html.ids["command"] == COMMAND
+    assert html.said["command"] == COMMAND
     assert html.tags.count("script") == 1  # the page's own
     assert "<title>Which &lt;dome&gt;?</title>" in text
     assert not re.search(r"https?:|//[a-z]", re.sub(r"data:image/png;base64,[\w+/=]+", "", text))
@@ -177,8 +186,9 @@ def test_the_command_is_escaped_and_nothing_comes_from_outside(tmp_path: Path) -
 def test_a_half_finished_study_says_so(tmp_path: Path, done: int) -> None:
     asked = study()
     _, html = written(filled(tmp_path / "s.sqlite", asked, done=done), asked)
-    assert f"Not finished. {done} of 60 trials are in" in " ".join(html.ids["unfinished"].split())
-    assert html.tables["points"][3][2] == "-"  # a point without a trial
+    assert html.said["verdict warning"].startswith(f"{done} of 60 trials, ")
+    assert "Not finished" in html.said["verdict warning"]
+    assert html.tables[POINTS][3][2] == "-"  # a point without a trial
     assert html.keys[3][2] == ""  # sorted last
 
 
@@ -186,7 +196,7 @@ def test_a_half_finished_study_says_so(tmp_path: Path, done: int) -> None:
 def test_the_first_ten_failures_are_named_with_what_replays_them(tmp_path: Path) -> None:
     asked = study()
     _, html = written(filled(tmp_path / "s.sqlite", asked, failed=12), asked)
-    told = html.ids["failures"]
+    told = html.said["items bad"]
     assert re.findall(r"trial (\d+): ValueError: <b>(\d+)</b>", told) == [(str(n), str(n)) for n in range(10)]
     assert told.startswith("12 trials failed")
     assert "skysim study replay FILE 0" in told
@@ -206,7 +216,7 @@ def test_names_sort_in_the_studys_order_and_quantities_by_their_number(tmp_path:
     asked = study(factors={"dome": DOME, "radius": RADIUS})
     _, html = written(filled(tmp_path / "s.sqlite", asked), asked)
     by_dome, by_radius = ({row[n]: float(key[n]) for row, key in table} for n, table in (
-        (n, list(zip(html.tables["points"][1:], html.keys[1:], strict=True))) for n in (1, 2)
+        (n, list(zip(html.tables[POINTS][1:], html.keys[1:], strict=True))) for n in (1, 2)
     ))  # fmt: skip
     assert by_dome == {"sphere": 0, "flat": 1, "cube": 2}
     assert by_radius == {"48 in": 48, "24 in": 24, "96 in": 96}
@@ -244,21 +254,23 @@ def test_indices_and_a_search_have_theirs(tmp_path: Path) -> None:
     asked = study(factors=factors, design={"kind": "saltelli", "points": 4}, responses=["identified"])
     html = written(filled(tmp_path / "a.sqlite", asked), asked, indices=index)[1]
     assert len(html.images) == 2 + 1
-    assert html.tables["indices"][1] == ["cross_arcsec", "tilt", "0.4 (0.3..0.5)", "0.4 (0.3..0.5)"]
+    assert html.tables["Sobol indices"][1] == ["cross_arcsec", "tilt", "1", "0.4 (0.3..0.5)", "0.4 (0.3..0.5)"]
     objectives = [{"response": "cross_arcsec_median"}, {"response": "cost"}]
-    search = {"objectives": objectives, "constraints": [{"response": "stars_least", "at_least": 5}]}
-    asked = study(factors=factors, optimize=search | {"candidates": 4}, responses=["identified"])
+    wanted = {"objectives": objectives, "constraints": [{"response": "stars_least", "at_least": 5}]}
+    asked = study(factors=factors, optimize=wanted | {"candidates": 4}, responses=["identified"])
     tried = [designs.make_point({"tilt": (n, {"a": n})}) for n in range(3)]
     path = filled(tmp_path / "b.sqlite", asked, tried)
-    html = written(path, asked, front=[1], costs={0: 7.0, 1: 2.5})[1]
-    assert len(html.images) == 2 + 1
-    assert [row["class"] == "front" if "class" in row else False for row in html.rows[1:]] == [
-        False,
-        True,
-        False,
+    statistics = dict.fromkeys(("cross_arcsec_median", "stars_least"), part)
+    candidates = [
+        search.Candidate(n, {"tilt": n}, (1.0, cost), statistics, cost, True, False, "")
+        for n, cost in enumerate((7.0, 2.5))
     ]
-    assert [row[-1] for row in html.tables["points"]] == ["cost", "7", "2.5", "-"]
-    assert "unfinished" in html.ids  # three of four candidates
+    html = written(path, asked, result=search.SearchResult(candidates, candidates[1:], False))[1]
+    assert len(html.images) == 2 + 1
+    assert html.marked[1:] == [False, True, False]
+    assert [row[-1] for row in html.tables[POINTS]] == ["cost", "7", "2.5", "–"]
+    assert html.tables["Front"][1:] == [["1", "1", "0.4 (0.3..0.5)", "2.5", "0.4 (0.3..0.5)"]]
+    assert "Not finished" in html.said["verdict warning"]  # three of four candidates
 
 
 # What is shown.

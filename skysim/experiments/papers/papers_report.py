@@ -1,0 +1,122 @@
+"""The report of reproduced experiments: each published number beside ours, with a verdict."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+
+from skysim.experiments.papers.compare import (
+    VERDICTS,
+    Comparison,
+    Reproduction,
+    Verdict,
+    format_summary,
+    format_with_source,
+)
+from skysim.results import report
+from skysim.results.plots import png
+from skysim.results.report import Cell, Column, Figure, Items, Report, Section, Table, Text, Tone
+
+KINDS = (*VERDICTS, "derived", "open")
+TONES: dict[Verdict, Tone] = {"agrees": "good", "explained": "warning", "disagrees": "bad"}
+INTRODUCTION = (
+    "All experiments with published numbers, repeated with our simulator and estimator: the published number, ours with"
+    " its 95 % interval, and a verdict. Seed {seed}{quick}. The published numbers with their sources and tolerances are"
+    " in `data/published`. No parameter is tuned to a number unless it is listed under Fitted."
+)
+MEANINGS = (
+    "agrees: our interval overlaps the published number with its tolerance.",
+    "explained: it overlaps only with causes that the row names and that were simulated too. A fitted cause is listed"
+    " under Fitted; it shows only that the number can arise in this way.",
+    "disagrees: neither.",
+    "derived: the number is not printed, but follows from printed ones.",
+    "open: our interval is wider than the tolerance or contains the bound; more trials might change the verdict.",
+)
+
+
+def papers_report(reproductions: Sequence[Reproduction], ids: Sequence[str], quick: bool, seed: int) -> Report:
+    """The report of some experiments. ids, quick, seed : as the command names them"""
+    papers = dict.fromkeys(one.published.paper for one in reproductions)
+    blocks = [
+        verdict(reproductions),
+        Text(INTRODUCTION.format(seed=seed, quick=", quick: wider intervals" if quick else "")),
+        Items(MEANINGS),
+        Section("Experiments", [contents(reproductions)]),
+        *(Section(paper, [section(one) for one in reproductions if one.published.paper == paper]) for paper in papers),
+    ]
+    options = ["--quick"] * quick + (["--seed", str(seed)] if seed != 1 else [])
+    return Report("The papers, reproduced", blocks, shlex.join(["skysim", "reproduce", *ids, *options]))
+
+
+def total_counts(reproductions: Sequence[Reproduction]) -> dict[str, int]:
+    """Number of rows of each kind in KINDS, over all experiments."""
+    return {kind: sum(one.counts[kind] for one in reproductions) for kind in KINDS}
+
+
+def verdict(reproductions: Sequence[Reproduction]) -> report.Verdict:
+    """How many published numbers agree with ours."""
+    counts = total_counts(reproductions)
+    text = "Of {} published numbers {agrees} agree, {explained} are explained and {disagrees} disagree".format(
+        sum(counts[kind] for kind in VERDICTS), **counts
+    )
+    tone: Tone = "bad" if counts["disagrees"] else "good"
+    return report.Verdict(f"{text}; {counts['derived']} are derived, {counts['open']} verdicts are open.", tone)
+
+
+def contents(reproductions: Sequence[Reproduction]) -> Table:
+    """Counts and seconds of each experiment, with links, and their sums."""
+    columns = [Column("experiment", kind="text"), Column("", kind="text"), *map(Column, KINDS)]
+    rows = [
+        [
+            Cell(one.id, link=f"#{one.id}"),
+            one.published.title,
+            *(Cell(str(count), "bad" if kind == "disagrees" and count else "") for kind, count in one.counts.items()),
+            one.seconds,
+        ]
+        for one in reproductions
+    ]
+    total = ["all", "", *total_counts(reproductions).values(), sum(one.seconds for one in reproductions)]
+    return Table([*columns, Column("time", "s", ".0f")], [*rows, total])
+
+
+def section(reproduction: Reproduction, drawn: bool = True) -> Section:
+    """An experiment: what its paper leaves open, its table and, if `drawn`, its figures."""
+    published = reproduction.published
+    remarks = [
+        ("What the paper gets wrong", published.wrong),
+        ("Assumed, as the paper gives no value", "; ".join(published.assumed)),
+        ("Fitted", "; ".join(published.fitted)),
+    ]
+    figures = [
+        Figure(png(one.draw, one.size_in), one.caption, name=f"{reproduction.id}_{n}")
+        for n, one in enumerate(reproduction.drawings if drawn else (), 1)
+    ]
+    blocks = [
+        Text(f"{published.title}. {published.source}."),
+        Items([f"{heading}: {text}" for heading, text in remarks if text]),
+        *figures,
+        comparison_table(reproduction.comparisons),
+    ]
+    return Section(reproduction.id, blocks, id=reproduction.id)
+
+
+def comparison_table(comparisons: Sequence[Comparison]) -> Table:
+    """The published numbers beside ours."""
+    columns = [
+        Column("what", kind="text"),
+        Column("published"),
+        Column("ours (95 %)"),
+        Column("verdict", kind="text"),
+        Column("note", kind="aside"),
+    ]
+    rows = [
+        [
+            one.row.quantity,
+            format_with_source(one.row),
+            format_summary(one.result.ours),
+            Cell(one.verdict, TONES[one.verdict]),
+            one.note,
+        ]
+        for one in comparisons
+    ]
+    return Table(columns, rows)

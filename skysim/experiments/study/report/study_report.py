@@ -1,0 +1,348 @@
+"""The report of a study, finished or not: its answers, figures and tables, made from its plan and its store."""
+
+from __future__ import annotations
+
+import itertools
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from skysim.core.paths import STUDIES
+from skysim.core.types import Floats
+from skysim.experiments.study.analysis import answer, search, sensitivity
+from skysim.experiments.study.analysis import table as tables
+from skysim.experiments.study.analysis.axes import axis, is_sampled, same, shown_points
+from skysim.experiments.study.analysis.search import SearchResult
+from skysim.experiments.study.analysis.sensitivity import Index
+from skysim.experiments.study.analysis.table import PointRow, format_response, format_summary
+from skysim.experiments.study.analysis.worst import ColumnsOf
+from skysim.experiments.study.execution.store import Store
+from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
+from skysim.experiments.study.report import figures, layout, maps
+from skysim.experiments.study.report.maps import DirectionMap
+from skysim.experiments.study.report.overview import Overview, overview
+from skysim.results.report import (
+    Block,
+    Cell,
+    Code,
+    Column,
+    Facts,
+    Figure,
+    Items,
+    Report,
+    Section,
+    Table,
+    Text,
+    Tone,
+    Verdict,
+)
+from skysim.results.report.blocks import Kind
+
+POINTS = "Points"  # titles of sections
+STUDY_FILE = "The study file"
+LISTED = 10  # maximum number of failures listed
+ROWS = 5000  # maximum number of rows in the table of points
+OPEN_ROWS = 72  # rows above which that table is folded
+SOBOL = (
+    "Sobol indices of {}: the share of its variance that would go were a factor known, and that would stay were all"
+    " others known; intervals of 95 %."
+)
+
+
+class Analysis(NamedTuple):
+    """What is known of a study's trials.
+
+    lines    : of all points, with the responses of `responses` and those of the answers
+    about    : scene table and findings of its checks
+    headline : answers in words;  ranges : of each response, in words
+    indices  : Sobol indices, of design saltelli;  result : candidates and front, of a search
+    """
+
+    lines: Sequence[PointRow]
+    about: Overview
+    headline: Sequence[str] = ()
+    ranges: Sequence[str] = ()
+    indices: Sequence[Index] = ()
+    result: SearchResult | None = None
+
+    @property
+    def answers(self) -> list[str]:
+        """All answers."""
+        return [*self.headline, *self.ranges]
+
+
+def study_report(plan: Plan, store: Store, study: str = "", out: Path | None = None) -> Report:
+    """The report of a study. study, out : as `commands` takes them
+
+    Raises InputError if `where` of a figure names an unknown factor or level.
+    """
+    command = commands(plan, store, study, out)
+    return compose(plan.study, store, analyze(plan, store, command), command)
+
+
+def commands(plan: Plan, store: Store, study: str = "", out: Path | None = None) -> Callable[[str], str]:
+    """The function from a verb to the shell command that applies it to a study, with its overrides if it runs it.
+
+    study, out : what the command names; by default the study's name or path, and the store's folder
+    """
+    if not study:
+        study = plan.name if plan.path.parent == STUDIES else str(plan.path)
+        out = store.path.parent
+    return partial(shell_command, study, out, store.overrides())
+
+
+def shell_command(study: str, out: Path | None, overrides: Mapping[str, str], verb: str) -> str:
+    """The shell command that applies `verb` to a study."""
+    changed = [f"--set={key}={value}" for key, value in overrides.items()] if verb in ("run", "optimize") else []
+    return shlex.join(["skysim", "study", verb, study, *(["--out", str(out)] if out else []), *changed])
+
+
+def analyze(plan: Plan, store: Store, command: Callable[[str], str]) -> Analysis:
+    """The analysis of the trials in a store. command : see `commands`"""
+    study, about = plan.study, overview(plan)
+    lines = tables.table(store, list(dict.fromkeys([*responses(study), *answer.RESPONSES])))
+    headline = answer.headline(study, lines, about.may_be_ambiguous, command("worst"))
+    headline += answer.one_unit(about.fixed) if headline else []
+    indices = sensitivity.indices(plan, store) if study.design.kind == "saltelli" and not study.optimize else []
+    result = search.collect_result(plan, store) if study.optimize else None
+    return Analysis(lines, about, headline, answer.ranges(study, lines), indices, result)
+
+
+def responses(study: Study) -> list[str]:
+    """The study's responses and those used by its figures, thresholds, objectives and constraints, without `cost`."""
+    searched = study.optimize.responses if study.optimize else []
+    names = dict.fromkeys([*study.responses, *(one.response for one in (*study.figures, *study.thresholds)), *searched])
+    return [name for name in names if name != "cost"]
+
+
+def compose(
+    study: Study,
+    store: Store,
+    found: Analysis,
+    command: Callable[[str], str],
+    also: Mapping[str, Floats] | None = None,
+) -> Report:
+    """The report of an analyzed study. command : see `commands`;  also : see `figures.pareto_png`"""
+    lines = tables.select_responses(found.lines, responses(study))
+    costs = {one.number: one.cost for one in found.result.candidates} if found.result else None
+    front = [one.number for one in found.result.front] if found.result else []
+    drawn = [
+        *search_figures(lines, study, front, costs, also),
+        *sobol_figures(found.indices),
+        *study_figures(lines, study, store.point_columns, command("replay")),
+    ]
+    shown = {one.response for one in layout.figures(study, lines)}
+    left = [name for name in study.responses if name not in shown]
+    blocks = [
+        Text(question(store.meta("study")), on_terminal=False),
+        verdict(study, store),
+        failures(store, command("replay")),
+        Items(found.headline, "Answer"),
+        Section(
+            "Figures", [*drawn, Text(f"In the table alone: {', '.join(left)}." if left else "")], on_terminal=False
+        ),
+        Section("Scene", [scene_facts(store, found.about)], on_terminal=False),
+        Section("Checks of the scene", checks(found.about)),
+        Section("Ranges of the responses", [Items(found.ranges)], on_terminal=False),
+        Section("Sobol indices", index_table(found.indices)),
+        Section("Front", front_table(study, found.result)),
+        points_section(lines, study, front, costs),
+        runs_section(store),
+        Section(STUDY_FILE, [Code(store.meta("study"), "yaml")], folded=True, on_terminal=False),
+    ]
+    return Report(study.title, blocks, command("optimize" if study.optimize else "run"))
+
+
+# What it says.
+
+
+def question(text: str) -> str:
+    """The comment that a study file begins with."""
+    lines = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
+    return " ".join(line.removeprefix("#").strip() for line in lines)
+
+
+def verdict(study: Study, store: Store) -> Verdict:
+    """How many trials are done, failed, and ended in a wrong attitude."""
+    counts = store.counts()
+    trials = study.trial_count(len(store.points()))
+    text = (
+        f"{counts['done']} of {trials} trials, {counts['failed']} failed, {counts['wrong']} wrong attitudes (over 10′)"
+    )
+    finished = 0 < trials <= counts["done"]
+    tone: Tone = "good" if finished else "warning"
+    text += "." if finished else ". Not finished: what follows is of the trials that are in."
+    return Verdict(text, "bad" if counts["failed"] else tone)
+
+
+def failures(store: Store, replay: str) -> Items:
+    """The first failed trials, and the command that repeats one."""
+    count, listed = store.counts()["failed"], store.failures()[:LISTED]
+    lines = [f"trial {trial}: {error}" for trial, error in listed]
+    if lines:
+        lines.append(f"`{replay} {listed[0][0]}` does one again and keeps its frames.")
+    trials = "1 trial failed and counts" if count == 1 else f"{count} trials failed and count"
+    first = ", the first of them" if count > len(listed) else ""
+    return Items(lines, f"{trials} in no figure but `failed`{first}:", "bad", on_terminal=False)
+
+
+def scene_facts(store: Store, about: Overview) -> Facts:
+    """Scene and trials as a table, and the version of the code."""
+    return Facts([*((name, [text]) for name, text in about.rows), ("code version", [store.meta("code")])])
+
+
+def checks(about: Overview) -> list[Block]:
+    """What the checks of the scene found."""
+    return [Items(about.findings, tone="warning")] if about.findings else [Text("Nothing to warn of.")]
+
+
+# Tables.
+
+
+def points_section(
+    lines: Sequence[PointRow], study: Study, front: Sequence[int], costs: Mapping[int, float] | None
+) -> Section:
+    """The table of all points. Named levels sort in the order of the study file; those of a front are marked."""
+    heads, texts = tables.cells(lines)
+    axes = {name: axis(study, lines, name) for name in (lines[0].levels if lines else ())}
+    kinds: list[Kind] = ["number", *("number" if one.numeric else "text" for one in axes.values())]
+    kinds += ["number"] * len(heads[len(kinds) :])
+    columns = [Column(head, kind=kind) for head, kind in zip(heads, kinds, strict=False)]
+    rows: list[list[Any]] = []
+    for line, row_texts in zip(lines[:ROWS], texts[:ROWS], strict=True):
+        keys = [line.point, *(axes[name].coordinate(one) for name, one in line.levels.items())]
+        keys += [one.value for one in line.responses.values()]
+        tone: Tone = "marked" if line.point in front else ""
+        row = [Cell(text, key=key) for text, key in zip(row_texts, keys, strict=True)]
+        rows.append([Cell(str(line.point), tone, line.point), *row[1:]])
+    if costs is not None:
+        columns.append(Column("cost", format=".4g"))
+        rows = [[*row, costs.get(line.point)] for row, line in zip(rows, lines, strict=False)]
+    more = f"And {len(lines) - ROWS} points more: `skysim study export` writes them all." if len(lines) > ROWS else ""
+    note = "In brackets intervals of 95 %." + (" Tinted: the front." if front else "")
+    table = Table(columns, rows, from_the_last(len(axes) + 1, len(columns)))
+    return Section(POINTS, [table, Text(f"{note} {more}")], folded=len(lines) > OPEN_ROWS)
+
+
+def index_table(indices: Sequence[Index]) -> list[Block]:
+    """The Sobol indices, the largest total of each error first."""
+    columns = [Column("error", kind="text"), Column("factor", kind="text"), Column("alone, rms", "″", ".3g")]
+    columns += [Column("first order"), Column("total")]
+    rows = [
+        [one.response, one.factor, one.rms_arcsec, with_key(one.first), with_key(one.total)]
+        for one in sorted(indices, key=lambda one: (one.response, -one.total.value))
+    ]
+    return [Table(columns, rows)] if rows else []
+
+
+def with_key(summary: Any) -> Cell:
+    """A statistic with its interval, which sorts by its value."""
+    return Cell(format_summary(summary), key=summary.value)
+
+
+def front_table(study: Study, result: SearchResult | None) -> list[Block]:
+    """The front of a search."""
+    if result is None:
+        return []
+    feasible = sum(one.feasible for one in result.candidates)
+    text = f"{len(result.candidates)} candidates, {feasible} of them feasible" + ("; the front:" if feasible else ".")
+    heads, rows = search.front_cells(study, result)
+    table = Table([Column(head) for head in heads], rows, from_the_last(len(study.factors) + 1, len(heads)))
+    return [Text(text), *([table] if rows else [])]
+
+
+def from_the_last(kept: int, count: int) -> list[tuple[int]]:
+    """The columns that a narrow terminal leaves out: the last first, none of the first `kept`."""
+    return [(column,) for column in range(count - 1, kept - 1, -1)]
+
+
+def runs_section(store: Store) -> Section:
+    """The runs that filled the store."""
+    columns = [Column("engine", kind="text"), Column("workers"), Column("trials")]
+    columns += [Column("time", "s", ".1f"), Column("trials/s", format=".1f")]
+    rows = [
+        [run[name] for name in ("engine", "workers", "trials", "seconds")]
+        + [run["trials"] / run["seconds"] if run["seconds"] else None]
+        for run in store.runs()
+    ]
+    untimed = store.counts()["done"] - sum(run["trials"] for run in store.runs())
+    note = f"{untimed} trials are of runs that were killed." if untimed > 0 else ""
+    return Section("Runs", [Table(columns, rows), Text(note)])
+
+
+# Figures.
+
+
+def study_figures(lines: Sequence[PointRow], study: Study, columns_of: ColumnsOf, replay: str) -> list[Block]:
+    """The study's figures: maps with their worst trials, others with their numbers. columns_of : trials of a point"""
+    blocks: list[Block] = []
+    for one in layout.figures(study, lines):
+        if isinstance(one, Map):
+            panels = maps.direction_maps(lines, one, study, columns_of)
+            blocks += [Figure(maps.map_png(panels, one), maps.caption(panels, one, study, lines))]
+            blocks += worst_table(panels, replay)
+            continue
+        blocks.append(Figure(figures.figure_png(lines, one, study), layout.caption(one, study, lines)))
+        if not is_sampled(study):
+            blocks.append(Section("The figure's numbers", [pivot_table(one, lines, study)], folded=True))
+    return blocks
+
+
+def worst_table(panels: Sequence[DirectionMap], replay: str) -> list[Block]:
+    """The worst trials of a map's panels with the commands that repeat them."""
+    columns = [Column("worst", kind="text"), Column("lights", format=".0f"), Column("what happened", kind="text")]
+    rows = [
+        [f"{panel.label}: " * bool(panel.label) + one.direction, one.lights, one.event, f"`{replay} {one.trial}`"]
+        for panel in panels
+        for one in panel.worst
+    ]
+    return [Table([*columns, Column("repeat it", kind="text")], rows)] if rows else []
+
+
+def pivot_table(figure: Curve | Heat, lines: Sequence[PointRow], study: Study) -> Table:
+    """A figure's numbers: its x across, the other factor down."""
+    across = axis(study, lines, figure.x)
+    other = figure.by if isinstance(figure, Curve) else figure.y
+    chosen = shown_points(lines, figure, study)
+    down = axis(study, lines, other) if other else None
+
+    def text(x: Any, level: Any) -> str:
+        for line in chosen:
+            if same(line.levels[figure.x], x) and (other is None or same(line.levels[other], level)):
+                return format_response(line, figure.response)
+        return ""
+
+    levels = down.levels if down else [None]
+    rows = [[down.tick_label(one) if down else "", *(text(x, one) for x in across.levels)] for one in levels]
+    heads = [Column(across.tick_label(x)) for x in across.levels]
+    return Table([Column(f"{figure.response}: {across.label}", kind="text"), *heads], rows)
+
+
+def sobol_figures(indices: Sequence[Index]) -> list[Figure]:
+    """Sobol indices, one image per response."""
+    named = dict.fromkeys(one.response for one in indices)
+    return [Figure(figures.indices_png(indices, name), SOBOL.format(name), name=name) for name in named]
+
+
+def search_figures(
+    lines: Sequence[PointRow],
+    study: Study,
+    front: Sequence[int],
+    costs: Mapping[int, float] | None,
+    also: Mapping[str, Floats] | None,
+) -> list[Figure]:
+    """Plots of an optimization: every candidate and, with two objectives, the Pareto front."""
+    if study.optimize is None or not lines:
+        return []
+    panels, points = layout.panels(lines, study.optimize, costs), [line.point for line in lines]
+    named, marked = [one.response for one in study.optimize.objectives], ", ".join(map(str, front))
+    best = f"none beats {marked} in all objectives" if front else "no candidate is marked yet"
+    text = f"Every candidate; {best}. Dashed: bounds."
+    shown = [Figure(figures.search_png(panels, points, front), text, name="candidates")]
+    if len(named) == 2:
+        one, other = (panels[name] for name in named)
+        text = f"{named[1]} against {named[0]}: the Pareto front of {len(front)} among {len(lines)} candidates."
+        shown.insert(0, Figure(figures.pareto_png(one, other, points, front, also), text, name="pareto"))
+    return shown

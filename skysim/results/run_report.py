@@ -1,0 +1,182 @@
+"""The report of a run: what was solved and how well, pictures, the scene, and every frame."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.types import FrameRow
+from skysim.results.plots import figure_png, stacked_axes
+from skysim.results.report import Cell, Column, Facts, Figure, Items, Report, Section, Table, Text, Tone, Verdict
+
+MOTION = {  # sentences of the motion's statistics, by the statistic that a scene must have
+    "pointing_deg_worst": "pointing: worst {pointing_deg_worst:.3g}°, at the end {pointing_deg_end:.2g}°; "
+    "maximum commanded torque {torque_nm_worst:.3g} N m",
+    "momentum_nms_worst": "maximum stored momentum {momentum_nms_worst:.3g} N m s",
+    "wheel_rpm_worst": "maximum wheel speed {wheel_rpm_worst:.0f} rpm",
+    "manipulability_least": "minimum CMG manipulability {manipulability_least:.2g}",
+    "imu_deg_worst": "IMU alone: error {imu_deg_end:.3g}° at the end; gyros saturated for {gyro_saturated_s:.2g} s",
+    "filter_deg_worst": "filter: worst {filter_deg_worst:.3g}°, at the end {filter_arcsec_end:.3g}″, "
+    "bias error {filter_bias_deg_h_end:.2g}°/h",
+}
+
+
+def run_report(
+    title: str,
+    command: str,
+    angles: tuple[str, str, str],
+    rows: Sequence[FrameRow],
+    *,
+    stages_ms: Mapping[str, float],
+    annotated: NDArray[np.uint8],
+    motion: Mapping[str, float],
+    motion_figure: bytes,
+    views: Sequence[Path],
+    facts: Sequence[tuple[str, Sequence[str]]],
+    findings: Sequence[str],
+) -> Report:
+    """The report of a run.
+
+    angles    : names of the three angles of a row;  stages_ms : median time by stage
+    annotated : the last solved frame with its markers, BGR
+    motion    : statistics of the telemetry;  motion_figure : its plot, PNG, or empty
+    views     : image files of the laboratory in 3-D
+    facts, findings : names and lines of the scene's table, and the check's warnings
+
+    A single frame has no plot against time.
+    """
+    frame = Figure(cv2.imencode(".png", annotated)[1].tobytes(), FRAME_CAPTION)
+    laboratory = [Figure(path.read_bytes(), "the laboratory in 3-D", path.suffix[1:]) for path in views]
+    errors = [Figure(error_figure(rows), ERROR_CAPTION)] if len(rows) > 1 else []
+    moved = [Figure(motion_figure, MOTION_CAPTION)] if motion_figure else []
+    warned = f"The check of the plan warns: {len(findings)}, see below." if findings else ""
+    stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in stages_ms.items())
+    blocks = [
+        verdict(rows),
+        Text(warned, "bad", on_terminal=False),
+        Section("The last solved frame", [frame]),
+        Section("The laboratory", laboratory),
+        Section("Errors", errors),
+        Section("Motion", [*moved, Items(motion_lines(motion))]),
+        Section("Scene", [Facts(facts)], on_terminal=False),
+        Section("Check of the plan", [Items(findings, tone="warning")], on_terminal=False),
+        Section("Frames", [frame_table(angles, rows), Text(f"Median ms a frame: {stages}")]),
+    ]
+    return Report(title, blocks, command)
+
+
+FRAME_CAPTION = "Blue ticks: truth. Red squares: detected. Green circles: identified."
+ERROR_CAPTION = "Errors, lights and rate against time. Red lines mark frames that were not solved."
+MOTION_CAPTION = "Attitude, estimates and actuators against time."
+
+
+def summary(rows: Sequence[FrameRow]) -> dict[str, Any]:
+    """Frame counts, median and worst errors in arcseconds, and median solve time of a run.
+
+    Errors are over solved frames, wrong ones included; NaN if no frame was solved.
+    """
+    solved = [row for row in rows if row.status == "solved"]
+    cross = np.array([row.cross_arcsec for row in solved] or [np.nan])
+    roll = np.abs([row.roll_arcsec for row in solved] or [np.nan])
+    return {
+        "frames": len(rows),
+        "solved": len(solved),
+        "wrong": sum(row.wrong for row in solved),
+        "cross_arcsec_median": float(np.median(cross)),
+        "cross_arcsec_worst": float(np.max(cross)),
+        "roll_arcsec_median": float(np.median(roll)),
+        "roll_arcsec_worst": float(np.max(roll)),
+        "time_ms_median": float(np.median([row.time_ms for row in rows])),
+    }
+
+
+def verdict(rows: Sequence[FrameRow]) -> Verdict:
+    """How many frames were solved, how many of them wrongly, and the errors."""
+    run = summary(rows)
+    tone: Tone = "good" if run["solved"] == run["frames"] else "warning"
+    text = f"{run['solved']} of {run['frames']} frames solved, {run['wrong']} wrong"
+    if run["solved"]:
+        text += (
+            f"; cross-boresight median {run['cross_arcsec_median']:.3g}″ worst {run['cross_arcsec_worst']:.3g}″,"
+            f" roll median {run['roll_arcsec_median']:.3g}″ worst {run['roll_arcsec_worst']:.3g}″"
+        )
+    text += f"; image to attitude in {run['time_ms_median']:.1f} ms (median)"
+    return Verdict(text, "bad" if run["wrong"] or not run["solved"] else tone)
+
+
+def motion_lines(motion: Mapping[str, float]) -> list[str]:
+    """The statistics of a motion in words; those that a scene does not have are skipped."""
+    lines = [text.format(**motion) for key, text in MOTION.items() if key in motion]
+    mounts = re.findall(r"mounting_(\w+)_arcsec_end", " ".join(motion))
+    errors = ", ".join(f"{name} {motion[f'mounting_{name}_arcsec_end']:.3g}″" for name in mounts)
+    return [*lines, *([f"mounting error at the end: {errors}"] if mounts else [])]
+
+
+def frame_table(angles: tuple[str, str, str], rows: Sequence[FrameRow]) -> Table:
+    """One row per frame: truth, estimate, errors, lights and time. angles : names of the three"""
+    columns = [
+        Column("frame"),
+        Column("t", "s", ".3f"),
+        Column("exp", "ms", ".5g"),
+        Column("rate", "°/s", ".2f"),
+        *(Column(f"true {name}", "°", ".5f") for name in angles),
+        *(Column(name, "°", ".5f") for name in angles),
+        Column("cross", "″", ".3f"),
+        Column("roll", "″", "+.3f"),
+        Column("detected"),
+        Column("used"),
+        Column("time", "ms", ".1f"),
+        Column("status", kind="text"),
+    ]
+    lines = [
+        [
+            row.frame,
+            row.t_s,
+            1e3 * row.exposure_s,
+            row.rate_deg_s,
+            *row.truth_deg,
+            *(row.estimate_deg or (None, None, None)),
+            row.cross_arcsec,
+            row.roll_arcsec,
+            row.detected,
+            row.matched,
+            row.time_ms,
+            Cell("WRONG", "bad") if row.wrong else row.status,
+        ]
+        for row in rows
+    ]
+    return Table(columns, lines, optional=((7, 8, 9), (2,), (14,), (3,), (12,), (4, 5, 6)))
+
+
+def error_figure(rows: Sequence[FrameRow]) -> bytes:
+    """Errors, detected and matched sources, and rate against time, as PNG. Red lines mark unsolved frames."""
+    fig, (errors, stars, rate) = stacked_axes([2.9, 1.45, 1.45])
+    solved = [row for row in rows if row.status == "solved"]
+    t = [row.t_s for row in solved]
+    cross, roll = ([max(abs(getattr(row, f"{name}_arcsec")), 1e-6) for row in solved] for name in ("cross", "roll"))
+    errors.plot(t, cross, ".-", label="cross-boresight")
+    errors.plot(t, roll, ".-", label="roll")
+    if solved and max(cross + roll) > 10 * min(cross + roll):
+        errors.set_yscale("log")
+    else:
+        errors.set_ylim(bottom=0)
+    for row in rows:
+        if row.status != "solved":
+            errors.axvline(row.t_s, color="tab:red", alpha=0.4)
+    errors.set_ylabel("error [arcsec]")
+    errors.legend()
+    t_all = [row.t_s for row in rows]
+    stars.plot(t_all, [row.detected for row in rows], label="detected")
+    stars.plot(t_all, [row.matched for row in rows], label="matched")
+    stars.set_ylabel("sources")
+    stars.set_ylim(bottom=0)
+    stars.legend()
+    rate.plot(t_all, [row.rate_deg_s for row in rows], color="tab:green")
+    rate.set_ylabel("rate [deg/s]")
+    return figure_png(fig, dpi=110)
