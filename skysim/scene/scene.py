@@ -23,6 +23,7 @@ from skysim.core.time import check_year
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, Glow, Light, StarsConfig
+from skysim.scene.sections.lights import FurtherLight
 from skysim.scene.sections.motion import MotionConfig, PointingConfig
 from skysim.scene.sections.orbit import Orbit
 from skysim.scene.sections.thermal import Coefficient, ThermalConfig
@@ -108,6 +109,7 @@ class Scene(ConfigModel):
     motion: MotionConfig
     light: Annotated[Light, Field(discriminator="kind")]
     background: tuple[Glow, ...] = ()
+    lights: tuple[FurtherLight, ...] = ()
     camera: CameraConfig
     exposure: ExposureConfig
     thermal: ThermalConfig | None = None
