@@ -16,10 +16,10 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from skysim.core.constants import DAY_S
 from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import fault_of
-from skysim.core.quantities.tolerance import TimeError
-from skysim.core.quantities.units import ConfigModel, Length, Number, Spin, Time
 from skysim.core.random_streams import HEAD_SEED, derived_seed
 from skysim.core.time import check_year
+from skysim.core.tolerance import TimeError
+from skysim.core.units import ConfigModel, Length, Number, Spin, Time
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, Glow, Light, StarsConfig
