@@ -19,7 +19,7 @@ from estimator.core.types import RateEstimate
 from estimator.trackers.pipeline import Clock, Report
 from skysim.camera.render import Window
 from skysim.core.errors import InputError
-from skysim.core.plugins.messages import finite_array
+from skysim.core.plugins import finite_array
 from skysim.core.types import Floats, Frame, Telemetry, Trajectory, Truth
 from skysim.dynamics import imu
 from skysim.scene.scene import Scene
@@ -127,7 +127,7 @@ class Flight:
         self, lab: Lab, parts: UserParts = NO_PARTS, *, endless: bool = False, keeps_history: bool = True
     ) -> None:
         if endless and keeps_history:
-            raise InputError("endless: the history would have no end; allowed: keeps_history=False")
+            raise InputError("endless", "the history would have no end", "keeps_history=False")
         self.lab = lab
         self.parts = parts
         self.duration_s = math.inf if endless else lab.duration_s
@@ -186,20 +186,20 @@ class Flight:
         """
         self.refuse_in_shots("step")
         if self.is_over:
-            raise InputError(f"step: the motion has ended at {self.now_s:g} s; allowed: more frames, or endless")
+            raise InputError("step", f"the motion has ended at {self.now_s:g} s", "more frames, or endless")
         if torque_nm is not None and self.lab.scene.motion.is_prescribed:
-            raise InputError("step: a prescribed motion takes no torque; allowed: another motion.control.law")
+            raise InputError("step", "a prescribed motion takes no torque", "another motion.control.law")
         try:
             torque = None if torque_nm is None else finite_array(torque_nm, "torque_nm", (3,))
         except ValueError as error:
-            raise InputError(f"step: {error}") from None
+            raise InputError("step", error) from None
         self.motion.advance(self.motion.period_steps, torque)
         return list(self.capture_due(self.filter_schedules))
 
     def refuse_in_shots(self, name: str) -> None:
         """Raise InputError inside a loop over `shots`."""
         if self.is_in_shots:
-            raise InputError(f"{name}: inside a loop over shots, which steps by itself; allowed: observe, or after it")
+            raise InputError(name, "inside a loop over shots, which steps by itself", "observe, or after it")
 
     def simulate_motion(self, progress: Progress | None = None) -> Self:
         """Simulate the rest of the motion. Only the frames that a filter needs are rendered.
@@ -240,9 +240,9 @@ class Flight:
         """
         recorder = self.motion.recorder
         if recorder is None:
-            raise InputError("telemetry: this flight keeps no history; allowed: keeps_history=True")
+            raise InputError("telemetry", "this flight keeps no history", "keeps_history=True")
         if not self.now_s:
-            raise InputError("telemetry: the motion has not begun; allowed: after a step")
+            raise InputError("telemetry", "the motion has not begun", "after a step")
         reference = self.motion.reference if self.lab.scene.motion.control else None
         return recorder.telemetry(reference, self.lab.cameras)
 
@@ -338,7 +338,7 @@ class Flight:
         camera = schedule.camera
         simulation = self.motion.simulation
         if simulation.first_step and simulation.first_step * simulation.step_s > window.open_s:
-            raise InputError(f"shots: the flight has forgotten frame {index}; allowed: keeps_history=True")
+            raise InputError("shots", f"the flight has forgotten frame {index}", "keeps_history=True")
         clock = Clock()
         trajectory = self.trajectory() if self.is_over else self.motion.trajectory(window.open_s)
         frame, truth = render_frame(camera, trajectory.since(window.open_s), index, clock, window)
@@ -386,10 +386,10 @@ class Flight:
         scene = schedule.camera.scene
         exposure_s = schedule.exposures_s.get(index)
         if exposure_s is None and scene.tracker.exposure_control:
-            raise InputError(f"render: frame {index} has no exposure time yet; allowed: after it came from shots")
+            raise InputError("render", f"frame {index} has no exposure time yet", "after it came from shots")
         window = timing.exposure_window(scene, index, exposure_s)
         if not (0 <= index < schedule.frames and window.close_s(scene.camera.height_px) <= self.now_s):
-            raise InputError(f"render: frame {index} is not exposed at {self.now_s:g} s; allowed: one that is")
+            raise InputError("render", f"frame {index} is not exposed at {self.now_s:g} s", "one that is")
         return render_frame(schedule.camera, self.trajectory(), index, None, window)
 
     def observe(self, camera: int = 0, *, solves: bool = True) -> Shot:

@@ -147,7 +147,7 @@ class Lab:
         """The LEDs of the dome as `led_list` returns them. Raises InputError without a dome."""
         scene = self.scene
         if not isinstance(scene.light, DomeConfig):
-            raise InputError(f"light.kind: {scene.light.kind} has no list of LEDs; allowed: dome")
+            raise InputError("light.kind", f"{scene.light.kind} has no list of LEDs", "dome")
         return led_list(scene.light, self.camera.band, scene.name)
 
 
@@ -229,7 +229,7 @@ def build_head(
         known = None if head.camera else main.known
         lights = build_lights(Plan(scene, band, vehicle, main.viewpoint, shown, known, mount))
     except InputError as error:
-        raise InputError(f"heads.{n}.{error}") from None
+        raise error.under(f"heads.{n}") from None
     return replace(
         main,
         name=head.name,

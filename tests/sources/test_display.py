@@ -443,10 +443,13 @@ def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None
         ),
         (
             {"light.led.drive": "{kind: pwm}"},
-            "light: led.drive: pwm cannot drive an lcd; allowed: direct",
+            "light.led.drive: pwm cannot drive an lcd; allowed: direct",
         ),
         ({"light.led.drive.duty": "0"}, "light.led.drive.duty: 0 is not allowed"),
-        ({"light.layout.block": "2000"}, "block 2000 is wider than the display; allowed: up to 1050 pixels"),
+        (
+            {"light.layout.block": "2000"},
+            "light.layout.block: 2000 is wider than the display; allowed: up to 1050 pixels",
+        ),
         ({"light.layout.gray_levels": "1"}, "light.layout.gray_levels: 1 is not allowed"),
         (
             {"light.layout.points.kind": "patch_boards"},

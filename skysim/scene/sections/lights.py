@@ -12,8 +12,8 @@ from typing import Annotated, Any, get_args
 from pydantic import AfterValidator, ConfigDict, ModelWrapValidatorHandler, SerializeAsAny, model_validator
 
 from skysim.core.errors import unknown_name
-from skysim.core.plugins.kind import PluginKind
-from skysim.core.quantities.units import ConfigModel
+from skysim.core.plugins import PluginKind
+from skysim.core.units import ConfigModel
 
 PLUGINS = PluginKind("light", "skysim.lights", "lights.kind", ())
 CONFIGS: dict[str, type[LightConfig]] = {}  # of the kinds that were added

@@ -91,7 +91,7 @@ def ambiguity_map(lab: Lab) -> tuple[Ambiguity, float]:
     context = context_of(lab)
     samples = samples_of(context, attitudes.of_frames(lab), None)
     if reason := lookalike.why_not_compared(context, samples):
-        raise InputError(reason)
+        raise InputError("", reason)
     return lookalike.compared(context, samples, LEAST_ALIKE, MAP_WORK)
 
 

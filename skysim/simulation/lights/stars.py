@@ -50,7 +50,7 @@ def stars_of(config: StarsConfig, plan: Plan) -> KnownLight:
     assert catalog is not None
     if config.variability_seed is not None:
         if not catalog.scatter_mag.any():
-            raise InputError(f"light.variability_seed: {config.catalog} has no variable stars; allowed: gaia_v8.0")
+            raise InputError("light.variability_seed", f"{config.catalog} has no variable stars", "gaia_v8.0")
         catalog = stars.varied(catalog, config.variability_seed)
     velocity_m_s: Floats | tuple[float, ...] = stars.AT_REST
     if config.bodies or config.satellites or config.air or viewpoint.orbit:
