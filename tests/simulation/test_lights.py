@@ -13,11 +13,11 @@ from typing import Annotated, Literal
 import numpy as np
 import pytest
 from pydantic import Field
-from skysim.core.units import Intensity, Length, Time
 
 from skysim.core.errors import InputError
 from skysim.core.paths import ROOT
 from skysim.core.types import Sources
+from skysim.core.units import Intensity, Length, Time
 from skysim.scene import loader
 from skysim.scene.sections import lights as schema
 from skysim.scene.sections.lights import LightConfig
