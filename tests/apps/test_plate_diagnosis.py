@@ -188,11 +188,11 @@ ANGLES = ("ra_deg", "dec_deg", "roll_deg")
 @pytest.mark.parametrize(
     ("fov_deg", "limit_mag", "says"),
     [
-        (5.0, 6.7, "--catalog gaia_v8.0"),
-        (3.5, 6.7, "--catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`"),
-        (5.0, 8.0, "--catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`"),  # that one was taken
-        (3.5, 8.0, "--catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`"),
-        (1.9, 6.7, "--catalog gaia_v10.0, after `skysim catalog build --source gaia --limit 10`"),
+        (5.0, 6.7, "the catalog gaia_v8.0"),
+        (3.5, 6.7, "the catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`"),
+        (5.0, 8.0, "the catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`"),  # that one was taken
+        (3.5, 8.0, "the catalog gaia_v9.0, after `skysim catalog build --source gaia --limit 9`"),
+        (1.9, 6.7, "the catalog gaia_v10.0, after `skysim catalog build --source gaia --limit 10`"),
         (1.0, 6.7, "a wider picture: the deepest catalog, to V 10, has too few as well"),
     ],
 )
