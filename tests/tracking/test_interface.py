@@ -235,7 +235,7 @@ def test_a_program_that_will_not_begin_says_why(text: str, told: str) -> None:
 
 @pytest.mark.parametrize("told", ["mine", "=x", "own=x", "Mine=x", "a b=x", "mine=", "mine='x", "mine=x {folder:bmp}"])
 def test_a_program_s_name_and_command_are_checked(told: str) -> None:
-    with pytest.raises(InputError, match="^programs"):
+    with pytest.raises(InputError, match=r"^programs"):
         process.program_commands([told])
 
 
