@@ -22,8 +22,8 @@ from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD, DEG_H_RAD_S, EARTH_RATE_RAD_S, PPM, STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
 from skysim.scene.sections.vehicle import AccelerometerConfig, GyroConfig, ImuConfig, SiteConfig
 

@@ -22,7 +22,7 @@ from skysim.core.errors import InputError, unknown_name
 from skysim.core.io import yaml_reader
 from skysim.core.io.yaml_reader import Files, check_version, explain, is_file, read_yaml, set_key, where_of
 from skysim.core.paths import DATA, SCENES
-from skysim.core.quantities.units import ConfigModel, quantity
+from skysim.core.units import ConfigModel, quantity
 from skysim.scene import unused
 from skysim.scene.opencv_calibration import read as read_calibration
 from skysim.scene.scene import HEAD_SECTIONS, NAME_ALIAS, Scene

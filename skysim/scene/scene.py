@@ -16,13 +16,14 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from skysim.core.constants import DAY_S
 from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import fault_of
-from skysim.core.quantities.tolerance import TimeError
-from skysim.core.quantities.units import ConfigModel, Length, Number, Spin, Time
 from skysim.core.random_streams import HEAD_SEED, derived_seed
 from skysim.core.time import check_year
+from skysim.core.tolerance import TimeError
+from skysim.core.units import ConfigModel, Length, Number, Spin, Time
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, Glow, Light, StarsConfig
+from skysim.scene.sections.lights import FurtherLight
 from skysim.scene.sections.motion import MotionConfig, PointingConfig
 from skysim.scene.sections.orbit import Orbit
 from skysim.scene.sections.thermal import Coefficient, ThermalConfig
@@ -108,6 +109,7 @@ class Scene(ConfigModel):
     motion: MotionConfig
     light: Annotated[Light, Field(discriminator="kind")]
     background: tuple[Glow, ...] = ()
+    lights: tuple[FurtherLight, ...] = ()
     camera: CameraConfig
     exposure: ExposureConfig
     thermal: ThermalConfig | None = None

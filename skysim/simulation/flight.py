@@ -19,7 +19,7 @@ from estimator.core.types import RateEstimate
 from estimator.trackers.pipeline import Clock, Report
 from skysim.camera.render import Window
 from skysim.core.errors import InputError
-from skysim.core.plugins.messages import finite_array
+from skysim.core.plugins import finite_array
 from skysim.core.types import Floats, Frame, Telemetry, Trajectory, Truth
 from skysim.dynamics import imu
 from skysim.scene.scene import Scene

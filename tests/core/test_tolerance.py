@@ -12,8 +12,8 @@ from pydantic import ValidationError
 from scipy import stats
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.tolerance import LengthError, NumberError, Tolerance, scaled_errors
-from skysim.core.quantities.units import ConfigModel
+from skysim.core.tolerance import LengthError, NumberError, Tolerance, scaled_errors
+from skysim.core.units import ConfigModel
 from skysim.dynamics import imu
 from skysim.scene import loader
 from skysim.scene.sections import vehicle

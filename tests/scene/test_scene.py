@@ -17,8 +17,8 @@ from skysim.camera.optics import VIGNETTING
 from skysim.camera.psf.otf import PSFS
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.quantities.tolerance import ErrorSchema, ToleranceConfig
-from skysim.core.quantities.units import SI_SUFFIX, ConfigModel
+from skysim.core.tolerance import ErrorSchema, ToleranceConfig
+from skysim.core.units import SI_SUFFIX, ConfigModel
 from skysim.dynamics.guidance import LEGS
 from skysim.dynamics.jitter import SPECTRA
 from skysim.dynamics.multibody.actuators.cmgs import STEERING

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skysim.core.errors import InputError, printable
-from skysim.core.plugins.host import describe_error
-from skysim.core.plugins.program import MAX_STATUS_CHARS, Program, ProgramError, host_command
+from skysim.core.plugins import MAX_STATUS_CHARS, Program, ProgramError, describe_error, host_command
 from skysim.core.types import Floats
 from skysim.dynamics.controllers.interface import (
     CONTROLLERS,

@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 
 from skysim.core.errors import InputError
-from skysim.core.io.guard.process import run_guarded
+from skysim.core.io.guarded import run_guarded
 from skysim.core.paths import SCENES
 from skysim.dynamics.multibody.mjcf_sandbox import check_confined
 

@@ -17,8 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError, Where
-from skysim.core.io.ccsds import Segment, check_version, keyword_value, one_of
-from skysim.core.io.text import Line, excerpt, seconds_since, to_numbers
+from skysim.core.io.text import Line, Segment, check_version, excerpt, keyword_value, one_of, seconds_since, to_numbers
 from skysim.core.time import SCALES
 from skysim.core.types import Floats
 from skysim.dynamics.profiles.frames import REFERENCES, frame_of, icrs_from

@@ -9,9 +9,9 @@ import numpy as np
 from estimator.calibration.mass_properties.record import Lab, Prior, inertia_six
 from skysim.core.constants import RPM_RAD_S
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import quantities_within
 from skysim.core.random_streams import BALANCE, random_stream
 from skysim.core.types import Floats
+from skysim.core.units import quantities_within
 from skysim.dynamics import imu
 from skysim.dynamics.multibody import VehicleModel
 from skysim.scene.scene import Scene

@@ -17,8 +17,8 @@ from estimator.calibration.mass_properties.record import MOMENT, BearingRecord, 
 from estimator.calibration.mass_properties.recursive import filter_mass
 from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import quantity
 from skysim.core.types import Floats
+from skysim.core.units import quantity
 from skysim.dynamics import multibody
 from skysim.dynamics.multibody import VehicleModel
 from skysim.experiments.balance import flight

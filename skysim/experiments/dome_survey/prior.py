@@ -15,8 +15,8 @@ from estimator.calibration.survey_plan import SurveyModel
 from estimator.core.camera import Camera
 from estimator.identification.leds.codes import LedCode
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import quantities_within
 from skysim.core.types import Floats, Sources
+from skysim.core.units import quantities_within
 from skysim.experiments.configs import with_config
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig

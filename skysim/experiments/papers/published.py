@@ -12,8 +12,8 @@ from pydantic import Field, ValidationError, model_validator
 from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import explain, read_yaml
 from skysim.core.paths import DATA
-from skysim.core.quantities.units import ConfigModel, NotNegative, Number
 from skysim.core.types import Floats
+from skysim.core.units import ConfigModel, NotNegative, Number
 
 FOLDER = DATA / "published"
 

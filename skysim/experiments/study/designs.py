@@ -15,8 +15,8 @@ import scipy
 from pydantic import Field
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import ConfigModel
 from skysim.core.types import Floats
+from skysim.core.units import ConfigModel
 from skysim.experiments.study.factors import Factor, Settings, Value
 
 

@@ -16,7 +16,7 @@ import scipy
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import ConfigModel
+from skysim.core.units import ConfigModel
 
 Value = Any  # value of a key: any YAML value
 Settings = dict[str, Value]  # dotted keys of the scene, or of `trial.`, to values

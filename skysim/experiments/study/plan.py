@@ -17,7 +17,7 @@ from skysim.core.errors import InputError
 from skysim.core.io import yaml_reader
 from skysim.core.io.yaml_reader import explain, is_file, set_key
 from skysim.core.paths import STUDIES
-from skysim.core.quantities.units import ConfigModel, Fraction, NotNegative, Number, Time, Triple
+from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Time, Triple
 from skysim.experiments.study.designs import Design, Point, points
 from skysim.experiments.study.factors import Factor, Settings, Value
 from skysim.results.files.builder.prices import Prices, find_prices, read_prices

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.io import files, images
-from skysim.core.io.images.live import silent_stderr
+from skysim.core.io.decoding import silent_stderr
 from skysim.results import stretch
 from skysim.results.files import ccsds_aem
 from skysim.results.files import frames as frame_files

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.io import files, images
+from skysim.core.io import files
+from skysim.core.io.fits import read_fits
 from skysim.core.types import Floats
 from skysim.sources import stars
 
@@ -65,7 +66,7 @@ class Recording:
 
     def image(self, stem: Path) -> NDArray[Any]:
         """A frame's digital numbers: (H, W) uint16, or float64 from a noise-free camera. Raises InputError."""
-        image = images.read_fits(stem.with_suffix(".fits"))
+        image = read_fits(stem.with_suffix(".fits"))
         if image.ndim != 2 or not image.size:
             raise InputError(f"{stem}.fits", f"an image of shape {image.shape}", "(height, width)")
         return image

@@ -20,7 +20,7 @@ def quantity_text(si_unit: str, what: str, example: str) -> Callable[[str], str]
     """A parser that checks a quantity and returns its text."""
 
     def parse(text: str) -> str:
-        from skysim.core.quantities.units import quantity
+        from skysim.core.units import quantity
 
         try:
             quantity(si_unit, what, example)(text)

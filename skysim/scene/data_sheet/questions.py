@@ -64,7 +64,7 @@ def full_well(values: Values) -> Assumed:
     """Electrons, from the range of the converter if the gain is known, otherwise from the area of a pixel."""
     if "gain" in values:
         return Assumed(rounded(values["gain"] * range_dn(values)), "where the converter's range ends")
-    from skysim.core.quantities.units import in_si
+    from skysim.core.units import in_si
 
     area_um2 = (1e6 * in_si(values["pitch"], "m")) ** 2
     return Assumed(rounded(WELL_E_UM2 * area_um2), f"{WELL_E_UM2:g} e- a square micrometer, as in the IMX264")

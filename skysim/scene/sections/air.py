@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from skysim.core.constants import FWHM_PER_SIGMA
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import Ascending, ConfigModel, Fraction, Length, Number, check_table
+from skysim.core.units import Ascending, ConfigModel, Fraction, Length, Number, check_table
 
 NEGLIGIBLE_PX = 0.02  # a blur of this sigma makes an image of 0.7 px wider by 0.0003 px
 Altitude = Annotated[Number, Field(ge=0, lt=90)]

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag,
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import DATA
-from skysim.core.quantities.units import (
+from skysim.core.units import (
     Ascending,
     ConfigModel,
     Fraction,

@@ -10,8 +10,8 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.tolerance import LengthError, NumberError
-from skysim.core.quantities.units import ConfigModel, Length, Number
+from skysim.core.tolerance import LengthError, NumberError
+from skysim.core.units import ConfigModel, Length, Number
 
 HOLES = 9  # of a patch board: 3x3
 Level = Annotated[Number, Field(gt=0, le=1)]

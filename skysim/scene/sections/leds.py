@@ -9,8 +9,8 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator,
 
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
-from skysim.core.quantities.tolerance import LengthError, NumberError, Tolerance
-from skysim.core.quantities.units import (
+from skysim.core.tolerance import LengthError, NumberError, Tolerance
+from skysim.core.units import (
     Ascending,
     ConfigModel,
     Intensity,

@@ -10,8 +10,8 @@ from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, field_va
 
 from skysim.core.constants import SUN_V_MAG
 from skysim.core.errors import InputError
-from skysim.core.quantities.tolerance import LengthError
-from skysim.core.quantities.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
+from skysim.core.tolerance import LengthError
+from skysim.core.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
 from skysim.scene.sections.air import AirConfig
 from skysim.scene.sections.layouts import Layout, PixelsConfig
 from skysim.scene.sections.leds import LedConfig

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag,
 
 from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import existing_file
-from skysim.core.quantities.units import ConfigModel, Momentum, NotNegative, Number, Positive, Spin, Time
+from skysim.core.units import ConfigModel, Momentum, NotNegative, Number, Positive, Spin, Time
 from skysim.scene.sections.vehicle import ActuatorsName
 
 Duration = Annotated[Time, Field(gt=0)]

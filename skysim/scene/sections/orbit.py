@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import existing_file
-from skysim.core.quantities.units import ConfigModel, Fraction, Length, Number
+from skysim.core.units import ConfigModel, Fraction, Length, Number
 
 ElementsFile = Annotated[str, AfterValidator(existing_file)]
 Magnitude = Annotated[Number, Field(ge=-30, le=30)]

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import Ascending, ConfigModel, Length, Number, Time, check_table
+from skysim.core.units import Ascending, ConfigModel, Length, Number, Time, check_table
 
 Temperature = Annotated[Number, Field(ge=-150, le=150)]
 Coefficient = Annotated[Number, Field(ge=-10_000, le=10_000)]

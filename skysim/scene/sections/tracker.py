@@ -8,8 +8,8 @@ from pydantic import AfterValidator, Field, model_validator
 
 from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import existing_file
-from skysim.core.quantities.tolerance import LengthError, NumberError
-from skysim.core.quantities.units import ConfigModel, Length, NotNegative, Number, Positive, Spin, Time
+from skysim.core.tolerance import LengthError, NumberError
+from skysim.core.units import ConfigModel, Length, NotNegative, Number, Positive, Spin, Time
 
 
 class TotalStationConfig(ConfigModel):

@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, field_validator, model_validator
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.tolerance import NumberError
-from skysim.core.quantities.units import (
+from skysim.core.tolerance import NumberError
+from skysim.core.units import (
     Angles,
     ConfigModel,
     Damping,

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from skysim.core.errors import InputError
-from skysim.core.plugins.program import FOLDER, Program, ProgramError
+from skysim.core.plugins import FOLDER, Program, ProgramError
 from skysim.dynamics.controllers.interface import CONTROLLERS
 from skysim.tracking.external import interface
 from skysim.tracking.external.interface import TRACKERS, Answer, Picture, Setup

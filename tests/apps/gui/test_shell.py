@@ -15,7 +15,7 @@ from skysim.apps.cli.option_names import OPTIONS
 from skysim.apps.gui.page.actions import Command, matching
 from skysim.apps.gui.page.tab import PANELS
 from skysim.apps.gui.shared import style
-from skysim.apps.gui.shared.wording import LABELS, for_page
+from skysim.apps.gui.shared.texts import LABELS, for_page
 from skysim.apps.gui.views import overlay
 from skysim.apps.gui.worker.study_process import MAX_STUDIES, StudyProcess
 from skysim.apps.gui.worker.workbench import Workbench

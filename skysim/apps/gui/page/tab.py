@@ -30,7 +30,7 @@ from skysim.apps.gui.panels.settings import ScenePanel, TrackerPanel
 from skysim.apps.gui.shared import forms, keys, style
 from skysim.apps.gui.shared.live import Contents
 from skysim.apps.gui.shared.state import View
-from skysim.apps.gui.shared.wording import for_page
+from skysim.apps.gui.shared.texts import for_page
 from skysim.apps.gui.views.sensor import Sensor
 from skysim.apps.gui.views.served import FRAMES
 from skysim.apps.gui.views.space import Scene3D

@@ -14,8 +14,8 @@ from pydantic import ValidationError
 
 from skysim.apps.gui.shared import forms, keys
 from skysim.apps.gui.shared.context import PageContext
-from skysim.apps.gui.shared.style import CURVE_COLORS, TOOLTIP, chart_color, format_number
-from skysim.apps.gui.shared.wording import for_page
+from skysim.apps.gui.shared.style import CURVE_COLORS, TOOLTIP, chart_color
+from skysim.apps.gui.shared.texts import for_page, format_number
 from skysim.apps.gui.worker.study_process import (
     PAGE_STUDY,
     RESPONSES,

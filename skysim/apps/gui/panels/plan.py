@@ -19,7 +19,7 @@ from skysim.apps.gui.panels.run import RunPanel
 from skysim.apps.gui.shared import forms
 from skysim.apps.gui.shared.context import PageContext
 from skysim.apps.gui.shared.style import color_scale
-from skysim.apps.gui.shared.wording import for_page
+from skysim.apps.gui.shared.texts import for_page
 from skysim.apps.gui.views.space import Scene3D
 from skysim.core.errors import InputError
 from skysim.core.types import Floats

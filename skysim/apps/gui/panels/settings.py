@@ -11,7 +11,7 @@ from nicegui import run, ui
 from skysim.apps.gui.panels.monte_carlo import MonteCarloPanel
 from skysim.apps.gui.shared import forms, keys
 from skysim.apps.gui.shared.context import PageContext
-from skysim.apps.gui.shared.wording import for_page
+from skysim.apps.gui.shared.texts import for_page
 from skysim.core.errors import InputError
 
 SENSOR = "sensor, F6"

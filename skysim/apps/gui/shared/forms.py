@@ -16,7 +16,7 @@ from pydantic import BaseModel, ValidationError
 from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import read_yaml, set_key
 from skysim.core.paths import SCENES
-from skysim.core.quantities.units import SI_SUFFIX, si_unit
+from skysim.core.units import SI_SUFFIX, si_unit
 from skysim.scene import unused
 from skysim.scene.loader import file_names, find, load, read, with_overrides
 from skysim.scene.scene import NAME_ALIAS, Scene

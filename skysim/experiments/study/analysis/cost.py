@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.quantities.units import in_si
+from skysim.core.units import in_si
 from skysim.experiments.study.designs import Point
 from skysim.experiments.study.factors import Factor, Levels, Range, Value, split_quantity
 from skysim.experiments.study.plan import Cost, Plan, resolve_point

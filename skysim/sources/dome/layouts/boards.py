@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import HOLES, PatchBoardsConfig
 from skysim.scene.sections.leds import LedConfig

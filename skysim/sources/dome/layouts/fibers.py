@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import AimingConfig, FibersConfig
 from skysim.sources.dome.shell.surface import Surface, perpendicular

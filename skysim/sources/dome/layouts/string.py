@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import StringConfig
 from skysim.scene.sections.leds import LedConfig

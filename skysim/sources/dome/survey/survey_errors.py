@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
 from skysim.scene.sections.tracker import SurveyErrorsConfig
 from skysim.sources.dome.shell.surface import Surface

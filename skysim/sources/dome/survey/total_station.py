@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import ARCSEC_RAD, PPM
 from skysim.core.errors import InputError
-from skysim.core.quantities.tolerance import scaled_errors
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
 from skysim.scene.sections.tracker import TotalStationConfig
 

@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.io.images import limits, tiff
-from skysim.core.io.images.limits import check_pixels
-from skysim.core.io.images.live import silent_stderr
+from skysim.core.io import decoding, tiff
+from skysim.core.io.decoding import check_pixels, silent_stderr
 
 MAX_DEFLATE_RATIO = 1032  # greatest compression ratio of deflate (zlib's technical details)
 PNG_MAGIC, JPEG_MAGIC, BMP_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"BM"
@@ -72,7 +71,7 @@ def png_size(data: bytes) -> Sizes:
     width, height, bits, color = struct.unpack_from(">IIBB", data, 16)
     end = [chunk_end for _, _, chunk_end in png_chunks(data)][-1] + 4  # behind the chunk's checksum
     complete = end <= len(data) and height * (1 + width * bits // 8) <= MAX_DEFLATE_RATIO * len(data)
-    if complete or width * height > limits.MAX_PIXELS:  # the caller reports an excessive size
+    if complete or width * height > decoding.MAX_PIXELS:  # the caller reports an excessive size
         yield (width, height), PNG_SAMPLES.get(color, 4) * max(bits // 8, 1)
 
 

@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.io.guard.process import run_guarded
-from skysim.core.io.images import limits
-from skysim.core.io.images.limits import check_pixels
+from skysim.core.io import decoding
+from skysim.core.io.decoding import check_pixels
+from skysim.core.io.guarded import run_guarded
 
 SUFFIXES = tuple(f"{suffix}{packed}" for packed in ("", ".gz", ".fz") for suffix in (".fits", ".fit", ".fts"))
 MAGIC = b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack
@@ -121,8 +121,8 @@ def unpack(path: Path, file: IO[bytes]) -> None:
         with gzip.open(path) as packed:
             while block := packed.read(GZIP_BLOCK):
                 size += len(block)
-                if size > limits.MAX_BYTES:
-                    raise InputError(path, f"more than {limits.MAX_BYTES} bytes when unpacked", "no more")
+                if size > decoding.MAX_BYTES:
+                    raise InputError(path, f"more than {decoding.MAX_BYTES} bytes when unpacked", "no more")
                 file.write(block)
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise InputError(path, f"not a complete gzip file: {error}") from None
@@ -165,7 +165,7 @@ def decode_tiles(path: Path, file: BinaryIO, number: int) -> NDArray:
     """The pixels of a compressed image, the HDU of this number. Raises InputError with one line."""
     with tempfile.TemporaryDirectory(prefix="skysim-") as folder:
         out = Path(folder) / "pixels.npy"
-        script = Path(__file__).parents[1] / "guard/fits_tiles.py"
+        script = Path(__file__).with_name("fits_tiles.py")
         arguments = file.name, str(number), str(out)
         if fault := run_guarded(script, *arguments, cpu_s=TILES_CPU_S, memory_bytes=TILES_BYTES):
             raise InputError(path, f"not a complete FITS file: {fault}")

@@ -1,9 +1,15 @@
-"""Limits on the size of an image, checked against its header before it is decoded."""
+"""What the readers of images share: limits on the size by the header, and C libraries that print nothing."""
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from math import prod
 from pathlib import Path
+
+import cv2
 
 from skysim.core.errors import InputError
 
@@ -25,3 +31,28 @@ def check_bytes(path: Path) -> None:
     size = path.stat().st_size
     if size > MAX_BYTES:
         raise InputError(path, f"{size} bytes", f"up to {MAX_BYTES}")
+
+
+@contextmanager
+def silent_opencv() -> Iterator[None]:
+    """Suppress OpenCV's own messages, for example about a missing camera."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+@contextmanager
+def silent_stderr() -> Iterator[None]:
+    """Suppress output of C libraries: libpng and OpenCV write their messages directly to file descriptor 2."""
+    sys.stderr.flush()
+    saved, devnull = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(devnull, 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(devnull)

@@ -22,8 +22,8 @@ from pydantic import BeforeValidator, Field, GetCoreSchemaHandler, model_validat
 from pydantic_core import CoreSchema, core_schema
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import ConfigModel, Length, Number, Time
 from skysim.core.types import Floats
+from skysim.core.units import ConfigModel, Length, Number, Time
 
 SIGMAS_OF_TOLERANCE = 3.0  # of a truncated normal distribution whose sigma is not given: 99.73 % (GUM 4.3.9, note 2)
 
