@@ -27,8 +27,10 @@ from skysim.scene import loader
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lights.dome import LedDome
 from skysim.simulation.timing import exposure_window
 from skysim.sources.dome.led import lit_moments_s
+from skysim.sources.dome.timing.codes import LedCodes
 from skysim.tracking.onboard_model import calibration
 from skysim.tracking.settings import assumed_settings
 
@@ -141,12 +143,20 @@ def window_noise_e2(lab: Lab) -> float:
     return pixels * (1 + pixels * sky_share) * (detector.read_noise_e**2 + detector.gain_e_dn**2 / 12)
 
 
+def codes_of(lab: Lab) -> LedCodes:
+    """The codes of a dome's LEDs in this run."""
+    dome = lab.camera.known
+    assert isinstance(dome, LedDome)
+    codes = dome.timing(lab.camera.run_seed).codes
+    assert codes is not None
+    return codes
+
+
 def read_lights(lab: Lab, frames: int) -> tuple[Floats, NDArray[np.bool_], Floats]:
     """(F, N) light of each LED in each frame, NaN where it is not detected; the bit in the middle of the exposure; and
     the expected electrons of a 1."""
     camera, settings = calibration(lab.scene.camera), assumed_settings(lab.scene)
-    assert lab.camera.codes is not None
-    codes, rows = lab.camera.codes, []
+    codes, rows = codes_of(lab), []
     for number in range(frames):
         frame, truth = render_at_rest(lab.camera, lab.start, number)
         centroids = detect_and_centroid(frame.image_dn, camera, settings, Clock())
@@ -174,8 +184,7 @@ def theory(lab: Lab, full_e: Floats, noise_e2: float, changes: float) -> float:
     changes  : part of the successive bits that differ
     """
     assert isinstance(lab.scene.light, DomeConfig)
-    assert lab.camera.codes is not None
-    exposure_s, code = lab.scene.exposure.time_s, lab.camera.codes.config
+    exposure_s, code = lab.scene.exposure.time_s, codes_of(lab).config
     period_s, on_s = float(lab.camera.sources.period_s[0]), float(lab.camera.sources.on_s[0])
     phase_s = (np.arange(400) + 0.5) / 400 * period_s
     lit_s = np.array([lit_moments_s(0.0, exposure_s, period_s, start_s, on_s)[0] for start_s in phase_s])

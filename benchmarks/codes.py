@@ -28,6 +28,7 @@ from skysim.results import metrics
 from skysim.scene import loader
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.lights.dome import LedDome
 from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.sources.dome.led import irradiance_e_s_m2
 from skysim.tracking import factory
@@ -122,14 +123,17 @@ class Bench:
         sources, scene, camera = lab.camera.sources, lab.scene, self.tracker.camera
         xy_px = project(body_from_lab, sources.place[:, :3], self.tracker.lever, camera)
         seen = np.flatnonzero(camera.contains(np.nan_to_num(xy_px, nan=-1e9), BORDER_PX))
-        assert lab.camera.codes
+        dome = lab.camera.known
+        assert isinstance(dome, LedDome)
+        codes = dome.timing(lab.camera.run_seed).codes
+        assert codes is not None
         middle_s = frame / scene.exposure.rate_hz
-        shown = lab.camera.codes.shown(sources, middle_s - scene.exposure.time_s / 2, scene.exposure.time_s, frame)
+        shown = codes.shown(sources, middle_s - scene.exposure.time_s / 2, scene.exposure.time_s, frame)
         offset_m = sources.place[seen, :3] - body_from_lab.inv().apply(self.tracker.lever.camera_body_m)
         distance_m = np.linalg.norm(offset_m, axis=1)
         cos_out = -np.sum(offset_m * sources.normal[seen], axis=1) / distance_m
         cos_in = self.tracker.camera.rays(xy_px[seen])[:, 2]
-        light = irradiance_e_s_m2(shown.strength[seen], lab.camera.emitter, cos_out, cos_in, distance_m)
+        light = irradiance_e_s_m2(shown.strength[seen], dome.emitter, cos_out, cos_in, distance_m)
         light_e = light * lab.camera.optics.collecting_m2 * scene.exposure.time_s
         light_e = light_e * (1 + self.noise.light * rng.standard_normal(len(seen)))
         light_e += np.sqrt(np.maximum(light_e, 0)) * rng.standard_normal(len(seen))

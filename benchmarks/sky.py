@@ -123,7 +123,7 @@ def frame_time() -> dict[str, Any]:
     boresight = whole.camera.mount.cam_from_body.inv().apply([0, 0, 1.0])
     direction = whole.start.apply(boresight)
     near = whole.camera.sources.place[:, :3] @ direction > math.cos(math.radians(10))
-    part = whole.with_camera(sources=whole.camera.sources.take(near))
+    part = whole.with_sources(whole.camera.sources.take(near))
     seconds: list[list[float]] = [[], []]
     for _ in range(40):
         for side, lab in enumerate((whole, part)):

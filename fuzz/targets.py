@@ -20,9 +20,9 @@ from skysim.apps.cli import terminal
 from skysim.apps.cli.commands import validate
 from skysim.apps.stream import packet
 from skysim.camera.psf import otf
+from skysim.core import units
 from skysim.core.errors import InputError
 from skysim.core.io import images, yaml_reader
-from skysim.core.quantities import units
 from skysim.dynamics.controllers.interface import torque_of_reply
 from skysim.dynamics.multibody import mjcf
 from skysim.dynamics.profiles.load import read_profile
@@ -166,7 +166,7 @@ def answers(data: bytes) -> None:
     """An external tracker's answer: parsed, checked, and printed without control characters."""
     try:
         tree = json.loads(data)
-    except (ValueError, RecursionError):  # as in core.plugins.program
+    except (ValueError, RecursionError):  # as in core.plugins
         return
     statuses: list[str] = []
     if rejects(lambda: statuses.append(interface.check_answer(interface.Answer.of_tree(tree)).status), ValueError):
@@ -197,7 +197,7 @@ def torques(data: bytes) -> None:
     """A controller's answer to a control period."""
     try:
         reply = json.loads(data)
-    except (ValueError, RecursionError):  # as in core.plugins.program
+    except (ValueError, RecursionError):  # as in core.plugins
         return
     rejects(lambda: torque_of_reply(reply, 0, 1.0), ValueError)
 

@@ -25,8 +25,7 @@ from fuzz.__main__ import NAMES, TOKENS, mutate, seeds
 from fuzz.targets import TARGETS, rejects
 from skysim.camera.psf.otf import read_cells
 from skysim.core.errors import InputError
-from skysim.core.io import images, yaml_reader
-from skysim.core.io.images import encoded, limits
+from skysim.core.io import decoding, encoded, images, yaml_reader
 from skysim.scene import loader
 from skysim.sources import photometry
 from skysim.sources.dome.layouts import listed
@@ -195,7 +194,7 @@ def test_sizes_are_read_as_opencv_writes_them(suffix: str, tmp_path: Path) -> No
 
 def test_every_sample_of_a_tiff_s_pixels_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Four doubles a pixel are sixteen times what two bytes are."""
-    monkeypatch.setattr(limits, "MAX_PIXELS", 30 * 41)
+    monkeypatch.setattr(decoding, "MAX_PIXELS", 30 * 41)
     path, gray = tmp_path / "x.tiff", np.arange(30 * 41.0).reshape(30, 41)
     cv2.imwrite(str(path), gray)
     assert np.array_equal(images.read_image(path), gray)

@@ -20,9 +20,11 @@ from skysim.dynamics import multibody
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.orbit import ExclusionConfig
-from skysim.simulation.exposure import stray_light_e_s
+from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.flight import simulate_motion
-from skysim.simulation.lab import bodies_during, build_lab
+from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lights.lens import stray_e_s
+from skysim.simulation.lights.light import Exposure, beam_of
 from skysim.sources import stars as star_sources
 from skysim.sources.air import scintillation, starlight
 from skysim.sources.air.refraction import Refraction, Weather
@@ -285,8 +287,9 @@ def bodies(path: Path) -> None:
     for ax, (name, time, settings, title) in zip(all_axes, views, strict=True):
         small = {"camera.focal_length": "200 mm", "camera.width_px": "240", "camera.height_px": "240"}
         settings |= small | {"light.bodies": "{}", "start_time": time, "motion.rate_deg_s": "[0, 0, 0]"}
-        camera = build_lab(loader.load("shefex2", settings)).camera
-        shown = next(b for b in bodies_during(camera, 0.0) if b.name == name)
+        lab = build_lab(loader.load("shefex2", settings))
+        beam = beam_of(lab.camera.lights, exposure_at(lab, 0.0))
+        shown = next(body for body in beam.discs if body.name == name)
         start = f"{{ra_deg: {shown.truth().ra_deg}, dec_deg: {shown.truth().dec_deg}}}"
         scene = loader.load("shefex2", settings | {"motion.start": start, "exposure.frames": "1"})
         image = simulate_motion(scene).render(0)[0].image_dn.astype(float)
@@ -374,7 +377,7 @@ def orbit(path: Path) -> None:
     boresight, t_s = cam_from_lab.inv().apply([0.0, 0.0, 1.0]), np.arange(0, 2 * 5677, 20.0)
     seen = sample(camera.orbit, lab.scene.start_time, t_s, Pointing("inertial", boresight), boresight[None], 0.1)
     limits = ExclusionConfig(sun_deg=60, earth_deg=25, moon_deg=20)
-    stray = [stray_light_e_s(camera, bodies_during(camera, t), cam_from_lab, t) for t in t_s.tolist()]
+    stray = [stray_e_s(camera.lights, exposure_at(lab, t)) for t in t_s.tolist()]
     fig, (angles, light) = plt.subplots(2, 1, figsize=(8.5, 5.4), sharex=True, layout="constrained")
     outside = seen.outside(limits)
     usable = outside["Sun"] & outside["Earth"] & outside["Moon"]
@@ -385,7 +388,7 @@ def orbit(path: Path) -> None:
         label = "the Earth's limb" if name == "earth" else f"the {name.capitalize()}"
         angles.plot(minutes, getattr(seen, f"{name}_deg"), color=color, label=label)
         angles.axhline(getattr(limits, f"{name}_deg"), color=color, linestyle=":", linewidth=1)
-        light.semilogy(minutes, [one.get(name, np.nan) for one in stray], color=color)
+        light.semilogy(minutes, [one.get(f"the {name.capitalize()}", np.nan) for one in stray], color=color)
     angles.set(ylabel="from the boresight (deg)", ylim=(-80, 180))
     angles.legend(frameon=False, ncols=3, loc="upper right")
     light.set(ylabel="stray light (e⁻/s a pixel)", xlabel="minutes", xlim=(0, minutes[-1]))
@@ -419,6 +422,11 @@ def reflections(path: Path) -> None:
         ax.set(xticks=[], yticks=[], title=title, xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     both[1].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
     save(fig, path)
+
+
+def exposure_at(lab: Lab, t_s: float) -> Exposure:
+    """An exposure of the main camera with the vehicle at rest at its start."""
+    return expected_exposure(lab.camera, lab.start, np.zeros(3), t_s)
 
 
 def save(fig: plt.Figure, path: Path) -> None:

@@ -25,8 +25,8 @@ from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers.dome_tracker import IDENTIFIERS as DOME_IDENTIFIERS
 from skysim.apps.gui.shared.forms import file_value, yaml_line
 from skysim.core.paths import ROOT
-from skysim.core.quantities.tolerance import ErrorSchema
-from skysim.core.quantities.units import ConfigModel, si_unit
+from skysim.core.tolerance import ErrorSchema
+from skysim.core.units import ConfigModel, si_unit
 from skysim.experiments.study.plan import Study
 from skysim.scene.loader import PRESETS
 from skysim.scene.scene import NAME_ALIAS, Scene

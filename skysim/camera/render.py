@@ -173,8 +173,9 @@ def sample_times(open_s: float, close_s: float, trajectory: Trajectory) -> Float
     count = max(int(last - first) + 1, MIN_POSES) | 1
     if count > MAX_POSES:
         raise InputError(
-            f"exposure.time: {close_s - open_s:g} s holds {count} samples of the attitude; allowed: {MAX_POSES},"
-            " a shorter exposure or slower jitter"
+            "exposure.time",
+            f"{close_s - open_s:g} s holds {count} samples of the attitude",
+            f"{MAX_POSES}, a shorter exposure or slower jitter",
         )
     return np.linspace(open_s, close_s, count)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -61,27 +61,26 @@ def turned(config: ThermalConfig, t_s: float) -> Rotation:
     return Rotation.from_rotvec(np.array(config.mount_arcsec_k) * (ARCSEC_RAD * difference_k))
 
 
-class Hardware(NamedTuple):
-    """Light sources, camera mount and lens."""
+def leds_at(config: ThermalConfig, leds: Sources, t_s: float) -> Sources:
+    """The LEDs where they are at a time since the scene's start, from where they were surveyed.
 
-    sources: Sources
-    mount: Mount
-    optics: Optics
-
-
-def at_time(config: ThermalConfig, hardware: Hardware, t_s: float) -> Hardware:
-    """The hardware as it is at a time since the scene's start, from what it was at survey and calibration.
-
-    With the temperature's difference dT an LED at x is at a + (1 + alpha dT)(x - a) + creep, a the anchor on the axis;
-    the camera is turned by beta dT about its own axes; the image is 1 + gamma dT times as large.
+    With the temperature's difference dT an LED at x is at a + (1 + alpha dT)(x - a) + creep, a the anchor on the axis.
     """
     difference_k = temperature_c(config, t_s) - config.reference_c
-    sources, mount, optics = hardware
-    if (sources.place[:, 3] > 0).any():
-        anchor_m = np.array([0.0, 0.0, config.anchor_height_m])
-        place = sources.place.copy()
-        place[:, :3] += PPM * config.dome_ppm_k * difference_k * (place[:, :3] - anchor_m) + config.creep_m
-        sources = replace(sources, place=place)
+    anchor_m = np.array([0.0, 0.0, config.anchor_height_m])
+    place = leds.place.copy()
+    moved_m = PPM * config.dome_ppm_k * difference_k * (place[:, :3] - anchor_m) + config.creep_m
+    place[:, :3] += place[:, 3:] * moved_m  # stars stay
+    return replace(leds, place=place)
+
+
+def camera_at(config: ThermalConfig, mount: Mount, optics: Optics, t_s: float) -> tuple[Mount, Optics]:
+    """Mount and lens as they are at a time since the scene's start, from what they were at the calibration.
+
+    With the temperature's difference dT the camera is turned by beta dT about its own axes, and the image is
+    1 + gamma dT times as large.
+    """
+    difference_k = temperature_c(config, t_s) - config.reference_c
     mount = replace(mount, cam_from_body=turned(config, t_s) * mount.cam_from_body)
     scale = 1 + PPM * config.lens_ppm_k * difference_k
-    return Hardware(sources, mount, ScaledOptics.of(optics, scale) if config.lens_ppm_k else optics)
+    return mount, ScaledOptics.of(optics, scale) if config.lens_ppm_k else optics

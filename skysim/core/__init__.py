@@ -1,4 +1,6 @@
-"""Array types, errors, units, paths, compiled loops, and safe file access. Imports nothing else of skysim."""
+"""Array types, constants, time scales, errors, units, paths, compiled loops, plug-ins, and safe file access. Imports
+nothing else of skysim.
+"""
 
 import lazy_loader
 

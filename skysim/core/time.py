@@ -13,6 +13,7 @@ from functools import lru_cache
 import numpy as np
 
 from skysim.core.constants import DAY_S
+from skysim.core.errors import InputError
 from skysim.core.types import Floats
 
 J2000 = datetime.datetime(2000, 1, 1, 12)  # the calendar date of J2000.0, in the scale that is counted from it
@@ -32,7 +33,7 @@ def in_utc(moment: datetime.datetime) -> datetime.datetime:
 def check_year(value: datetime.datetime) -> datetime.datetime:
     """UTC without a zone. The Earth's ephemeris and linear proper motion are valid for about a century."""
     if not 1900 <= value.year <= 2100:
-        raise ValueError(f"{value.isoformat()} is outside 1900 to 2100")
+        raise InputError("", f"{value.isoformat()} is outside 1900 to 2100")
     return in_utc(value)
 
 

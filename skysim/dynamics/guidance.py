@@ -195,9 +195,10 @@ def spin_up(element: SpinUpConfig, start: LegStart) -> Leg:
     count = max(MIN_KNOTS, math.ceil(fastest * duration_s / KNOT_RAD)) if axis_moves else 1
     if count > MAX_KNOTS:
         raise InputError(
-            f"motion.maneuver: a spin_up of {duration_s:g} s at up to {math.degrees(fastest):g} deg/s whose axis moves "
-            f"rotates by {math.degrees(fastest * duration_s):.3g} deg; "
-            f"allowed: {math.degrees(MAX_KNOTS * KNOT_RAD):.3g} deg"
+            "motion.maneuver",
+            f"a spin_up of {duration_s:g} s at up to {math.degrees(fastest):g} deg/s whose axis moves"
+            f" rotates by {math.degrees(fastest * duration_s):.3g} deg",
+            f"{math.degrees(MAX_KNOTS * KNOT_RAD):.3g} deg",
         )
     return RateChangeLeg(
         integrate_knots(start.lab_from_ref_wxyz, count, duration_s, start_rate, change),
@@ -249,9 +250,10 @@ def profile(element: ProfileConfig, start: LegStart) -> Leg:
     step_s = float(spline.t_s[1]) - first_s
     if first_s - begin_s > step_s + 1e-9 or last_s <= begin_s:
         raise InputError(
-            f"motion.maneuver: {spline.source}: attitudes from {first_s - begin_s:.6g} s to {last_s - begin_s:.6g} s"
-            f" after the maneuver's beginning; allowed: from {step_s:.3g} s (a step) at most, to a time after it; or"
-            " begin: first_sample"
+            "motion.maneuver",
+            f"{spline.source}: attitudes from {first_s - begin_s:.6g} s to {last_s - begin_s:.6g} s after the"
+            " maneuver's beginning",
+            f"from {step_s:.3g} s (a step) at most, to a time after it; or begin: first_sample",
         )
     lab_from_ref, rate_rad_s, _ = spline.state_at(begin_s)
     jump = quaternion.multiply(quaternion.inverse(start.lab_from_ref_wxyz), lab_from_ref)
@@ -259,8 +261,9 @@ def profile(element: ProfileConfig, start: LegStart) -> Leg:
     jump_deg_s = math.degrees(float(np.linalg.norm(rate_rad_s - start.rate_rad_s)))
     if jump_deg > MAX_JUMP_DEG or jump_deg_s > MAX_JUMP_DEG_S:
         raise InputError(
-            f"motion.maneuver: {spline.source}: begins {jump_deg:.3g} deg and {jump_deg_s:.3g} deg/s away from the"
-            f" motion before it; allowed: {MAX_JUMP_DEG:g} deg and {MAX_JUMP_DEG_S:g} deg/s, or motion.start: profile"
+            "motion.maneuver",
+            f"{spline.source}: begins {jump_deg:.3g} deg and {jump_deg_s:.3g} deg/s away from the motion before it",
+            f"{MAX_JUMP_DEG:g} deg and {MAX_JUMP_DEG_S:g} deg/s, or motion.start: profile",
         )
     return ProfileLeg(spline, begin_s, last_s - begin_s)
 
@@ -306,7 +309,7 @@ class Reference:
 
     def attitudes(self, t_s: Floats) -> Rotation:
         """lab_from_ref at (N,) times."""
-        return Rotation.from_quat(np.array([self.state_at(float(t))[0] for t in t_s]), scalar_first=True)
+        return Rotation.from_quat(np.array([self.state_at(float(t))[0] for t in t_s]).reshape(-1, 4), scalar_first=True)
 
 
 def plan(

@@ -22,8 +22,8 @@ from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD, DEG_H_RAD_S, EARTH_RATE_RAD_S, PPM, STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
 from skysim.scene.sections.vehicle import AccelerometerConfig, GyroConfig, ImuConfig, SiteConfig
 
@@ -95,14 +95,15 @@ def ideal_increments(
     Raises InputError for fewer than two knots or an interval outside them.
     """
     if len(t_s) < 2:
-        raise InputError(f"imu: {len(t_s)} samples of the motion; allowed: two or more")
+        raise InputError("imu", f"{len(t_s)} samples of the motion", "two or more")
     first_s, last_s = np.min(ends_s, initial=np.inf) - step_s, np.max(ends_s, initial=-np.inf)
     if len(ends_s) and not (
         t_s[0] - TIME_TOLERANCE_S <= first_s and last_s <= t_s[-1] + TIME_TOLERANCE_S
     ):  # also rejects NaN
         raise InputError(
-            f"imu: samples from {first_s:.6f} to {last_s:.6f} s; allowed: within the motion,"
-            f" {t_s[0]:.6f} to {t_s[-1]:.6f} s"
+            "imu",
+            f"samples from {first_s:.6f} to {last_s:.6f} s",
+            f"within the motion, {t_s[0]:.6f} to {t_s[-1]:.6f} s",
         )
     position = np.asarray(position_body_m, dtype=float)
     knots = inertial_knots(

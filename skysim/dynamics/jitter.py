@@ -193,8 +193,10 @@ class Vibration:
                 key=lambda component: component.highest_hz * np.diff(t_s)[component.active(t_s)].sum(),
             )
             raise InputError(
-                f"{densest.name}: {densest.highest_hz:g} Hz over {np.diff(t_s)[densest.active(t_s)].sum():g} s needs "
-                f"{needed:,} attitude samples; allowed: {MAX_SAMPLES:,}, {SAMPLES_PER_PERIOD} a period"
+                densest.name,
+                f"{densest.highest_hz:g} Hz over {np.diff(t_s)[densest.active(t_s)].sum():g} s needs {needed:,}"
+                " attitude samples",
+                f"{MAX_SAMPLES:,}, {SAMPLES_PER_PERIOD} a period",
             )
         return count.astype(np.int64)
 

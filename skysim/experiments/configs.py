@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, TypeVar
 
-from skysim.core.quantities.units import ConfigModel
+from skysim.core.units import ConfigModel
 
 Config = TypeVar("Config", bound=ConfigModel)
 

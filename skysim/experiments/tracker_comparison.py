@@ -52,7 +52,7 @@ def build_trackers(lab: Lab, names: Sequence[str], programs: Mapping[str, str]) 
     """Set up the trackers by name, all with the scene's tracker options and onboard model. Raises InputError."""
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
-        raise InputError(f"--tracker {repeated[0]}: given twice; allowed: once")
+        raise InputError("trackers", f"{repeated[0]} is given twice", "once")
     scenes = {name: with_config(lab.scene, "tracker", name=name) for name in names}
     return {name: build_tracker(lab.with_scene(scene).camera, programs) for name, scene in scenes.items()}
 

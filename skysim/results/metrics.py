@@ -20,7 +20,7 @@ import scipy
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 
@@ -402,9 +402,10 @@ def response(name: str, where: str = "response") -> Response:
     quantity, statistic = split_name(name)
     if quantity not in QUANTITIES or statistic not in STATISTICS:
         raise InputError(
-            f"{where}: {unknown_name('response', name, PROPORTIONS)}, coverage, coverage_N,"
-            f" {', '.join(DEFAULT_STATISTICS)}, or one of"
-            f" {', '.join(QUANTITIES)} with _{', _'.join(STATISTICS)}"
+            where,
+            f"unknown response {name!r}",
+            f"{', '.join(PROPORTIONS)}, coverage, coverage_N, {', '.join(DEFAULT_STATISTICS)}, or one of"
+            f" {', '.join(QUANTITIES)} with _{', _'.join(STATISTICS)}",
         )
 
     def summarize(columns: Columns) -> Summary:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import functools
-import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,9 +20,9 @@ from pydantic import ValidationError
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.io import yaml_reader
-from skysim.core.io.yaml_reader import Files, check_version, explain, is_file, location_of, read_yaml, set_key
+from skysim.core.io.yaml_reader import Files, check_version, explain, is_file, read_yaml, set_key, where_of
 from skysim.core.paths import DATA, SCENES
-from skysim.core.quantities.units import ConfigModel, quantity
+from skysim.core.units import ConfigModel, quantity
 from skysim.scene import unused
 from skysim.scene.opencv_calibration import read as read_calibration
 from skysim.scene.scene import HEAD_SECTIONS, NAME_ALIAS, Scene
@@ -41,24 +40,27 @@ def preset_path(name: str, where: str = "camera.preset") -> Path:
     """The file of a camera preset: a name in data/cameras, or a file. Raises InputError for an unknown name."""
     path = PRESETS / f"{name}.yaml" if name in list_cameras() else Path(name)
     if path.suffix not in (".yaml", ".yml") or not is_file(path):
-        raise InputError(f"{where}: {unknown_name('preset', name, list_cameras())}, or a .yaml file with a camera")
+        problem, names = unknown_name("preset", name, list_cameras())
+        raise InputError(where, problem, f"{names}, or a .yaml file with a camera")
     return path
 
 
 def preset(name: str, where: str = "camera.preset") -> dict[str, Any]:
     """The `camera` section of data/cameras/NAME.yaml, or of a file. Raises InputError for an unknown name."""
     path = preset_path(name, where)
-    camera = resolve_files(path, read_yaml(path)[0]).get("camera")
+    try:
+        camera = resolve_files(path, read_yaml(path)[0]).get("camera")
+    except InputError as error:
+        raise error.within(where) from None
     if not isinstance(camera, dict) or "preset" in camera:
-        raise InputError(f"{where}: {path} is not a camera; allowed: a section camera without a preset")
+        raise InputError(where, f"{path} is not a camera", "a section camera without a preset")
     return camera
 
 
 def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
-    """The raw scene with its camera's preset and calibration applied.
+    """The raw scene with its camera's preset and calibration applied. Raises InputError.
 
-    The camera's own keys override the preset's; the calibration's values are added to both. Raises InputError; its
-    message begins with the key.
+    The camera's own keys override the preset's; the calibration's values are added to both.
     """
     camera = tree.get("camera")
     if not isinstance(camera, dict) or not {"preset", "calibration"} & set(camera):
@@ -70,17 +72,14 @@ def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
     for key in CALIBRATED_KEYS:
         if own.pop(key, None) is not None:
             raise InputError(
-                f"camera.{key}: conflicts with camera.calibration; allowed: one of the two (null removes a base's)"
+                f"camera.{key}", "conflicts with camera.calibration", "one of the two (null removes a base's)"
             )
     merged = merge(base, own)
     return tree | {"camera": merged | calibrated_keys(Path(str(camera["calibration"])), merged)}
 
 
 def with_heads(tree: dict[str, Any]) -> dict[str, Any]:
-    """The raw scene with the sections of each head as its own keys over those of the main camera.
-
-    Raises InputError; its message begins with the key.
-    """
+    """The raw scene with the sections of each head as its own keys over those of the main camera. Raises InputError."""
     heads = tree.get("heads")
     if not isinstance(heads, list):
         return tree
@@ -96,7 +95,7 @@ def completed_head(tree: dict[str, Any], head: Any, n: int) -> Any:
     try:
         return head | with_preset(over_base(main, own))
     except InputError as error:
-        raise InputError(f"heads.{n}.{error}") from None
+        raise error.under(f"heads.{n}") from None
 
 
 CALIBRATED_KEYS = ("width_px", "height_px", "focal_length", "principal_point_px", "distortion")
@@ -110,18 +109,20 @@ def calibrated_keys(path: Path, camera: dict[str, Any]) -> dict[str, Any]:
     """
     try:
         calibration = read_calibration(path)
+    except InputError as error:
+        raise error.within("camera.calibration") from None
+    try:
         pixel_m = quantity("m", "length", '"5.5 um"')(camera.get("pixel"))
         focus_m = focus_distance(camera.get("focus", "infinity"))
     except InputError as error:
-        raise InputError(f"camera.calibration: {error}") from None
-    except ValueError as error:
-        raise InputError(f"camera.pixel: {error}; camera.calibration requires it, and focus") from None
+        allowed = f"{error.allowed}; camera.calibration requires it, and focus"
+        raise InputError("camera.pixel", error.problem, allowed) from None
     calibrated_px = calibration.width_px, calibration.height_px
     size_px = camera.get("width_px", calibrated_px[0]), camera.get("height_px", calibrated_px[1])
     if size_px != calibrated_px:
         raise InputError(
-            f"camera.calibration: {path}: for frames of {calibrated_px[0]}x{calibrated_px[1]}; the preset's are"
-            f" {size_px[0]}x{size_px[1]}"
+            "camera.calibration",
+            f"{path}: for frames of {calibrated_px[0]}x{calibrated_px[1]}; the preset's are {size_px[0]}x{size_px[1]}",
         )
     # Thin lens: a calibration measures the image distance v, and 1/f = 1/v + 1/u, as in CameraConfig.image_distance_m.
     focal_m = 1 / (1 / (calibration.focal_px * pixel_m) + 1 / focus_m)
@@ -216,7 +217,7 @@ def validate(layers: list[Layer], overrides: Mapping[str, str]) -> Scene:
         raw = apply_preset(tree, files, overrides)
         return Scene.model_validate(raw | {NAME_ALIAS: layers[0].path.stem})
     except ValidationError as error:
-        raise InputError(explain(error, Scene, tree, files, overrides)) from None
+        raise explain(error, Scene, tree, files, overrides) from None
 
 
 def with_overrides(tree: dict[str, Any], overrides: Mapping[str, str]) -> dict[str, Any]:
@@ -246,17 +247,12 @@ def list_scenes() -> list[str]:
     return sorted(path.stem for path in SCENES.glob("*.yaml"))
 
 
-def with_location(message: str, name: str, overrides: Mapping[str, str]) -> str:
-    """A message that begins with a scene's key, with file and line appended; any other message unchanged."""
-    key = message.partition(":")[0]
-    # Unchanged: messages that do not begin with a key of the scene, or that already end with a location.
-    if (
-        not re.fullmatch(r"[a-z_]+(\.\w+)*", key)
-        or key.partition(".")[0] not in Scene.model_fields
-        or re.search(r"\((--set|.*, line \d+)\)$", message)
-    ):
-        return message
-    return f"{message} {location_of(key.split('.'), read(find(name))[1], overrides)}"
+def located(error: InputError, name: str, overrides: Mapping[str, str]) -> InputError:
+    """An error about a key that was only checked after loading, with file and line; any other error unchanged."""
+    section, *_ = keys = error.key.split(".")
+    if error.where or section not in Scene.model_fields:
+        return error
+    return error.at(where_of(keys, read(find(name))[1], overrides))
 
 
 class Layer(NamedTuple):
@@ -279,13 +275,13 @@ def read_layers(path: Path, derived: tuple[Path, ...] = ()) -> list[Layer]:
     if "base" not in tree:
         return [Layer(path, text, tree)]
     base = tree.pop("base")
-    location = location_of(["base"], [(path, text)], {})
+    where = where_of(["base"], [(path, text)], {})
     try:
         base_path = find(str(path.parent / base) if is_file(path.parent / str(base)) else str(base))
     except InputError as error:
-        raise InputError(f"base: {error} {location}") from None
+        raise error.within("base").at(where) from None
     if base_path.resolve() in (*derived, path.resolve()):
-        raise InputError(f"base: {base} leads back to this scene {location}")
+        raise InputError("base", f"{base} leads back to this scene", where=where)
     return [Layer(path, text, tree), *read_layers(base_path, (*derived, path.resolve()))]
 
 
@@ -311,8 +307,7 @@ def apply_preset(tree: dict[str, Any], files: Files, overrides: Mapping[str, str
     try:
         return with_preset(with_heads(tree))
     except InputError as error:
-        key = str(error).partition(":")[0]
-        raise InputError(f"{error} {location_of(key.split('.'), files, overrides)}") from None
+        raise error.at(where_of(error.key.split("."), files, overrides)) from None
 
 
 # Keys whose value may be a file in the scene's folder; * is every item of a list.
@@ -389,7 +384,7 @@ def load_camera(
     try:
         return CameraFileConfig.model_validate(camera_tree(path, tree, files, overrides or {})).camera
     except ValidationError as error:
-        raise InputError(explain(error, CameraFileConfig, tree, files, overrides or {})) from None
+        raise explain(error, CameraFileConfig, tree, files, overrides or {}) from None
 
 
 def camera_tree(path: Path, tree: dict[str, Any], files: Files, overrides: Mapping[str, str]) -> dict[str, Any]:

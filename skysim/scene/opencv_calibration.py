@@ -86,22 +86,21 @@ def read(path: Path) -> Calibration:
     tree = parse_file(path)
     for key, allowed in (("fisheye_model", (0, False)), ("distortion_model", ("plumb_bob",))):
         if key in tree and tree[key] not in allowed:
-            raise InputError(f"{path}: {key}: {excerpt(repr(tree[key]))}; allowed: {', '.join(map(str, allowed))}")
+            raise InputError(path, f"{key}: {excerpt(repr(tree[key]))}", ", ".join(map(str, allowed)))
     width, height = (image_side(path, tree, key) for key in ("image_width", "image_height"))
     fx, skew, cx, zero, fy, cy, *last = matrix(path, tree, "camera_matrix", ((3, 3),))
     if min(fx, fy) <= 0 or skew or zero or last != [0, 0, 1]:
-        raise InputError(f"{path}: camera_matrix: allowed: [fx, 0, cx, 0, fy, cy, 0, 0, 1], fx and fy above 0")
+        raise InputError(path, "camera_matrix: another form", "[fx, 0, cx, 0, fy, cy, 0, 0, 1], fx and fy above 0")
     if abs(fx / fy - 1) > MAX_ASPECT_ERROR:
         raise InputError(
-            f"{path}: camera_matrix: fx {fx:g} and fy {fy:g} differ by {100 * abs(fx / fy - 1):.2g} %; allowed:"
-            f" square pixels, to {100 * MAX_ASPECT_ERROR:g} % (calibrate with CALIB_FIX_ASPECT_RATIO)"
+            path,
+            f"camera_matrix: fx {fx:g} and fy {fy:g} differ by {100 * abs(fx / fy - 1):.2g} %",
+            f"square pixels, to {100 * MAX_ASPECT_ERROR:g} % (calibrate with CALIB_FIX_ASPECT_RATIO)",
         )
     shapes = tuple(shape for n in (4, 5, 8, 12, 14) for shape in ((1, n), (n, 1)))
     coefficients = matrix(path, tree, "distortion_coefficients", shapes)
     if any(coefficients[5:]):
-        raise InputError(
-            f"{path}: distortion_coefficients: {len(coefficients)} terms; allowed: {', '.join(COEFFICIENTS)}"
-        )
+        raise InputError(path, f"distortion_coefficients: {len(coefficients)} terms", ", ".join(COEFFICIENTS))
     k1, k2, p1, p2, k3 = [*coefficients, 0.0][:5]
     return Calibration(width, height, math.sqrt(fx * fy), (cx, cy), (k1, k2, p1, p2, k3))
 
@@ -111,18 +110,19 @@ def parse_file(path: Path) -> dict[str, Any]:
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise InputError(f"{path}: more than {MAX_BYTES >> 20} MiB; allowed: a calibration of OpenCV")
+    except OSError as error:
+        raise InputError(path, f"cannot be read: {error.strerror}") from None
+    if len(data) > MAX_BYTES:
+        raise InputError(path, f"more than {MAX_BYTES >> 20} MiB", "a calibration of OpenCV")
+    try:
         text = data.decode("utf-8")
         first, _, rest = text.partition("\n")
         _, tree = parse_yaml(rest if first.startswith("%YAML") else text, Loader)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     except (yaml.YAMLError, ValueError, RecursionError, TypeError, OverflowError) as error:
         problem = " ".join(str(getattr(error, "problem", None) or error).split())[:120]
-        raise InputError(f"{path}: not OpenCV's YAML: {problem}") from None
+        raise InputError(path, f"not OpenCV's YAML: {problem}") from None
     if not isinstance(tree, dict):
-        raise InputError(f"{path}: allowed: a calibration of OpenCV, a mapping of keys to values")
+        raise InputError(path, "", "a calibration of OpenCV, a mapping of keys to values")
     return tree
 
 
@@ -130,9 +130,8 @@ def image_side(path: Path, tree: dict[str, Any], key: str) -> int:
     """The width or height of the image, px. Raises InputError."""
     value = tree.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_SIDE_PX:
-        raise InputError(
-            f"{path}: {key}: {excerpt(repr(value))} is not allowed; it should be a whole number from 1 to {MAX_SIDE_PX}"
-        )
+        problem = f"{key}: {excerpt(repr(value))} is not allowed"
+        raise InputError(path, problem, f"a whole number from 1 to {MAX_SIDE_PX}")
     return value
 
 
@@ -140,16 +139,17 @@ def matrix(path: Path, tree: dict[str, Any], key: str, shapes: tuple[tuple[int, 
     """The numbers of a matrix, row by row. Raises InputError."""
     node = tree.get(key)
     if not isinstance(node, dict):
-        raise InputError(f"{path}: {key}: missing; allowed: a matrix with rows, cols and data")
+        raise InputError(path, f"{key}: missing", "a matrix with rows, cols and data")
     shape, data = (node.get("rows"), node.get("cols")), node.get("data")
     if shape not in shapes:
         raise InputError(
-            f"{path}: {key}: {excerpt(shape[0])} rows and {excerpt(shape[1])} cols; allowed:"
-            f" {', '.join(f'{rows}x{cols}' for rows, cols in shapes)}"
+            path,
+            f"{key}: {excerpt(shape[0])} rows and {excerpt(shape[1])} cols",
+            ", ".join(f"{rows}x{cols}" for rows, cols in shapes),
         )
     count = shape[0] * shape[1]
     if not isinstance(data, list) or len(data) != count or not all(is_number(value) for value in data):
-        raise InputError(f"{path}: {key}: data: allowed: {count} finite numbers")
+        raise InputError(path, f"{key}: other data", f"{count} finite numbers")
     return [float(value) for value in data]
 
 

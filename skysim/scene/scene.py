@@ -14,13 +14,16 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from skysim.core.constants import DAY_S
-from skysim.core.quantities.tolerance import TimeError
-from skysim.core.quantities.units import ConfigModel, Length, Number, Spin, Time
+from skysim.core.errors import InputError
+from skysim.core.io.yaml_reader import fault_of
 from skysim.core.random_streams import HEAD_SEED, derived_seed
 from skysim.core.time import check_year
+from skysim.core.tolerance import TimeError
+from skysim.core.units import ConfigModel, Length, Number, Spin, Time
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, Glow, Light, StarsConfig
+from skysim.scene.sections.lights import FurtherLight
 from skysim.scene.sections.motion import MotionConfig, PointingConfig
 from skysim.scene.sections.orbit import Orbit
 from skysim.scene.sections.thermal import Coefficient, ThermalConfig
@@ -54,12 +57,13 @@ class ExposureConfig(ConfigModel):
     def check_period(self) -> ExposureConfig:
         if self.time_s + self.trigger_jitter_s > 1 / self.rate_hz:
             jitter = f" plus trigger_jitter {self.trigger_jitter_s:g} s" if self.trigger_jitter_s else ""
-            raise ValueError(f"time {self.time_s} s{jitter} is longer than the frame period {1 / self.rate_hz} s")
+            raise InputError("time", f"{self.time_s} s{jitter} is longer than the frame period {1 / self.rate_hz} s")
         duration_s = self.first_s + self.frames / self.rate_hz
         if self.frames > MAX_FRAMES or duration_s > MAX_DURATION_S:
-            raise ValueError(
-                f"{self.frames} frames over {duration_s:g} s; allowed: up to {MAX_FRAMES}, over a day"
-                f" ({MAX_DURATION_S:g} s)"
+            raise InputError(
+                "",
+                f"{self.frames} frames over {duration_s:g} s",
+                f"up to {MAX_FRAMES}, over a day ({MAX_DURATION_S:g} s)",
             )
         return self
 
@@ -105,6 +109,7 @@ class Scene(ConfigModel):
     motion: MotionConfig
     light: Annotated[Light, Field(discriminator="kind")]
     background: tuple[Glow, ...] = ()
+    lights: tuple[FurtherLight, ...] = ()
     camera: CameraConfig
     exposure: ExposureConfig
     thermal: ThermalConfig | None = None
@@ -123,17 +128,17 @@ class Scene(ConfigModel):
         lens_only = SurveyErrorsConfig().model_copy(update=lens if tracker.survey.focal_length_sigma_m else {})
         if not isinstance(self.light, DomeConfig) and (tracker.survey != lens_only or tracker.map):
             key = "map" if tracker.map else "survey"
-            raise ValueError(f"tracker.{key}: light of kind {self.light.kind} has no LEDs to survey; allowed: dome")
+            raise InputError(f"tracker.{key}", f"light of kind {self.light.kind} has no LEDs to survey", "dome")
         if self.motion.start != "profile" and sky != isinstance(self.motion.start, PointingConfig):
             keys = "ra_deg, dec_deg, roll_deg" if sky else "roll_deg, pitch_deg, yaw_deg"
-            raise ValueError(f"motion.start: light of kind {self.light.kind} requires {keys}")
+            raise InputError("motion.start", f"light of kind {self.light.kind} requires {keys}")
         if not sky and any(glow.kind == "faint_stars" for glow in self.background):
-            raise ValueError(f"background: faint_stars requires light of kind stars, not {self.light.kind}")
+            raise InputError("background", f"faint_stars requires light of kind stars, not {self.light.kind}")
         read_s = getattr(self.camera.shutter, "row_time_s", 0.0) * (self.camera.height_px - 1)
         if read_s > 1 / self.exposure.rate_hz:
-            raise ValueError(
-                f"camera.shutter: readout takes {read_s:g} s, longer than the frame period"
-                f" {1 / self.exposure.rate_hz:g} s"
+            raise InputError(
+                "camera.shutter",
+                f"readout takes {read_s:g} s, longer than the frame period {1 / self.exposure.rate_hz:g} s",
             )
         return self
 
@@ -148,7 +153,7 @@ class Scene(ConfigModel):
         camera_m, chip = points.camera_m or self.vehicle.camera_m, (self.camera.width_px, self.camera.height_px)
         if camera_m is None:
             key = f"light.layout.{'points.' if nested else ''}camera"
-            raise ValueError(f"{key}: missing; allowed: that, or vehicle.camera")
+            raise InputError(key, "missing", "that, or vehicle.camera")
         field_deg = tuple(math.degrees(2 * math.atan(side_px / 2 / self.camera.focal_px)) for side_px in chip)
         points = points.model_copy(update={"camera_m": camera_m, "field_deg": points.field_deg or field_deg})
         layout = layout.model_copy(update={"points": points}) if nested and layout else points
@@ -159,11 +164,12 @@ class Scene(ConfigModel):
         """Check that the decoder has a code, and the code a shutter whose rows show the same bits."""
         code = self.light.led.code if isinstance(self.light, DomeConfig) else None
         if self.tracker.decoder and code is None:
-            raise ValueError("tracker.decoder: requires light.led.code")
+            raise InputError("tracker.decoder", "requires light.led.code")
         if code and code.bit_time_s != "frame" and self.camera.shutter.kind == "rolling":
-            raise ValueError(
-                "light.led.code.bit_time: the rows of a rolling shutter show different bits; allowed: frame, or another"
-                " camera.shutter"
+            raise InputError(
+                "light.led.code.bit_time",
+                "the rows of a rolling shutter show different bits",
+                "frame, or another camera.shutter",
             )
         return self
 
@@ -174,17 +180,17 @@ class Scene(ConfigModel):
         sections = {"orbit": self.orbit, **{f"light.{key}": getattr(self.light, key, None) for key in EPHEMERIS_KEYS}}
         for key, section in sections.items():
             if section and not first <= self.start_time.year <= last:
-                raise ValueError(f"{key}: start_time {self.start_time} is outside {first} to {last}")
+                raise InputError(key, f"start_time {self.start_time} is outside {first} to {last}")
         return self
 
     @model_validator(mode="after")
     def check_orbit(self) -> Scene:
         """Check that an orbit is under the stars, and that satellites have a place from which they are seen."""
         if self.orbit and not isinstance(self.light, StarsConfig):
-            raise ValueError(f"orbit: light of kind {self.light.kind} is in a laboratory; allowed: stars")
+            raise InputError("orbit", f"light of kind {self.light.kind} is in a laboratory", "stars")
         satellites = getattr(self.light, "satellites", None)
         if satellites and satellites.file and not self.orbit and self.site.longitude_deg is None:
-            raise ValueError("light.satellites.file: requires the section orbit, or a site.longitude_deg")
+            raise InputError("light.satellites.file", "requires the section orbit, or a site.longitude_deg")
         return self
 
     @model_validator(mode="after")
@@ -192,13 +198,13 @@ class Scene(ConfigModel):
         """Check that the air has a site, and that the ephemeris of the Sun and the Moon that light it holds."""
         air, (first, last) = getattr(self.light, "air", None), BODIES_YEARS
         if air and self.orbit:
-            raise ValueError("light.air: the camera is in an orbit, above the air; allowed: light.air or orbit")
+            raise InputError("light.air", "the camera is in an orbit, above the air", "light.air or orbit")
         if air and self.site.longitude_deg is None:
-            raise ValueError("light.air: requires site.longitude_deg")
+            raise InputError("light.air", "requires site.longitude_deg")
         if air and air.glow and not first <= self.start_time.year <= last:
-            raise ValueError(f"light.air.glow: start_time {self.start_time} is outside {first} to {last}")
+            raise InputError("light.air.glow", f"start_time {self.start_time} is outside {first} to {last}")
         if air and air.glow and any(glow.kind in ("sky", "moon") for glow in self.background):
-            raise ValueError("light.air.glow: conflicts with a background of kind sky or moon; allowed: one of the two")
+            raise InputError("light.air.glow", "conflicts with a background of kind sky or moon", "one of the two")
         return self
 
     @model_validator(mode="after")
@@ -208,14 +214,15 @@ class Scene(ConfigModel):
         if control is None:
             return self
         if control.longest_s + self.exposure.trigger_jitter_s > period_s:
-            raise ValueError(
-                f"tracker.exposure_control.longest: {control.longest_s:g} s is longer than the frame period"
-                f" {period_s:g} s"
+            raise InputError(
+                "tracker.exposure_control.longest",
+                f"{control.longest_s:g} s is longer than the frame period {period_s:g} s",
             )
         if not control.shortest_s <= self.exposure.time_s <= control.longest_s:
-            raise ValueError(
-                f"tracker.exposure_control: exposure.time {self.exposure.time_s:g} s, of the first frame, is outside"
-                f" {control.shortest_s:g} s to {control.longest_s:g} s"
+            raise InputError(
+                "tracker.exposure_control",
+                f"exposure.time {self.exposure.time_s:g} s, of the first frame, is outside {control.shortest_s:g} s"
+                f" to {control.longest_s:g} s",
             )
         return self
 
@@ -225,20 +232,20 @@ class Scene(ConfigModel):
         control = self.motion.control
         imu = self.vehicle.imu
         if self.filter and not imu:
-            raise ValueError("filter: requires the section vehicle.imu")
+            raise InputError("filter", "requires the section vehicle.imu")
         if self.tracker.gyro and not imu:
-            raise ValueError("tracker.gyro: requires the section vehicle.imu")
+            raise InputError("tracker.gyro", "requires the section vehicle.imu")
         if control is None:
             return self
         commanded = getattr(self.vehicle, control.actuators, None)
         if commanded is None and control.actuators != "ideal":
-            raise ValueError(f"motion.control.actuators: requires the section vehicle.{control.actuators}")
+            raise InputError("motion.control.actuators", f"requires the section vehicle.{control.actuators}")
         stores_momentum = commanded is not None and commanded.stores_momentum
         if control.desaturation and not (self.vehicle.fans and stores_momentum):
-            raise ValueError("motion.control.desaturation: requires vehicle.fans, and actuators wheels or cmgs")
+            raise InputError("motion.control.desaturation", "requires vehicle.fans, and actuators wheels or cmgs")
         if {"truth": False, "imu": not imu, "filter": not self.filter}[control.feedback]:
             section = "vehicle.imu" if control.feedback == "imu" else "filter"
-            raise ValueError(f"motion.control.feedback: {control.feedback} requires the section {section}")
+            raise InputError("motion.control.feedback", f"{control.feedback} requires the section {section}")
         return self
 
     @model_validator(mode="after")
@@ -246,24 +253,24 @@ class Scene(ConfigModel):
         """Check that a control period is a whole number of milliseconds and of IMU samples, and samples every sine."""
         rate_hz = self.control_rate_hz
         if abs(1000 / rate_hz - round(1000 / rate_hz)) > 1e-9:
-            raise ValueError(
-                f"motion.control.rate_hz: {rate_hz:g} Hz has a period that is not a whole number of milliseconds"
+            raise InputError(
+                "motion.control.rate_hz", f"{rate_hz:g} Hz has a period that is not a whole number of milliseconds"
             )
         imu = self.vehicle.imu
         if imu and self.filter and self.filter.bias_time_s < 10 / imu.rate_hz:
-            raise ValueError(f"filter.bias_time: shorter than ten samples of the IMU, {10 / imu.rate_hz:g} s")
+            raise InputError("filter.bias_time", f"shorter than ten samples of the IMU, {10 / imu.rate_hz:g} s")
         sines_hz = [leg.frequency_hz for leg in self.motion.maneuver if leg.kind == "sine"]
         chirps_hz = [max(leg.from_hz, leg.to_hz) for leg in self.motion.maneuver if leg.kind == "chirp"]
         fastest_hz = max((*sines_hz, *chirps_hz), default=0)
         if 2 * fastest_hz >= rate_hz:
             kind = "sine" if fastest_hz in sines_hz else "chirp"
-            raise ValueError(
-                f"motion.maneuver: a {kind} of {fastest_hz:g} Hz requires a motion.control.rate_hz above"
-                f" {2 * fastest_hz:g}"
+            raise InputError(
+                "motion.maneuver",
+                f"a {kind} of {fastest_hz:g} Hz requires a motion.control.rate_hz above {2 * fastest_hz:g}",
             )
         if imu and abs(imu.rate_hz / rate_hz - round(imu.rate_hz / rate_hz)) > 1e-9:
-            raise ValueError(
-                f"vehicle.imu.rate_hz: {imu.rate_hz:g} Hz is not a multiple of motion.control.rate_hz {rate_hz:g} Hz"
+            raise InputError(
+                "vehicle.imu.rate_hz", f"{imu.rate_hz:g} Hz is not a multiple of motion.control.rate_hz {rate_hz:g} Hz"
             )
         return self
 
@@ -273,17 +280,18 @@ class Scene(ConfigModel):
         names = [head.name for head in self.heads]
         for n, head in enumerate(self.heads):
             if head.name in ("main", *names[:n]):
-                raise ValueError(f"heads.{n}.name: {head.name} is the name of another camera")
+                raise InputError(f"heads.{n}.name", f"{head.name} is the name of another camera")
             if any(head.mount_arcsec_k) and not self.thermal:
-                raise ValueError(f"heads.{n}.mount_arcsec_k: requires the section thermal")
+                raise InputError(f"heads.{n}.mount_arcsec_k", "requires the section thermal")
             own = self.of_head(n)
             try:
                 Scene.model_validate(
                     {field.alias or key: getattr(own, key) for key, field in Scene.model_fields.items()}
                 )
             except ValidationError as error:
-                message = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
-                raise ValueError(f"heads.{n}.{message}") from None
+                first = error.errors()[0]
+                section = ".".join(map(str, ("heads", n, *first["loc"])))
+                raise fault_of(first, Scene).under(section) from None
         return self
 
     def of_head(self, n: int) -> Scene:

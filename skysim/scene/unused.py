@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
-from skysim.core.errors import InputError
-from skysim.core.io.yaml_reader import Files, location_of, parse_yaml
-from skysim.core.quantities.units import ConfigModel
+from skysim.core.errors import OVERRIDES, InputError
+from skysim.core.io.yaml_reader import Files, parse_yaml, where_of
+from skysim.core.units import ConfigModel
 from skysim.scene.scene import HEAD_SECTIONS, Scene
 from skysim.scene.sections.air import NEGLIGIBLE_PX
 from skysim.scene.sections.camera import DetectorConfig
@@ -478,7 +478,7 @@ def check(
     for key in set_keys(own):
         broken = find(RULES, [key], scene)
         if broken and (not overrides or useless_in_file(key, without_overrides)):
-            raise InputError(f"{message(*broken)} {location_of(key.split('.'), files, {})}")
+            raise no_effect(*broken).at(where_of(key.split("."), files, {}))
     if not overrides:
         check_heads(scene, own, files)
 
@@ -488,9 +488,8 @@ def check_heads(scene: Scene, own: Mapping[str, Any], files: Files) -> None:
     for n, head in enumerate(own.get("heads") or ()):
         for key in set_keys({section: head[section] for section in HEAD_SECTIONS if section in head}):
             if broken := find(RULES, [key], scene.of_head(n)):
-                raise InputError(
-                    f"heads.{n}.{message(*broken)} {location_of(['heads', str(n), *key.split('.')], files, {})}"
-                )
+                error = no_effect(*broken).under(f"heads.{n}")
+                raise error.at(where_of(["heads", str(n), *key.split(".")], files, {}))
 
 
 def check_overrides(scenes: Sequence[Scene], overrides: Mapping[str, str]) -> None:
@@ -498,7 +497,7 @@ def check_overrides(scenes: Sequence[Scene], overrides: Mapping[str, str]) -> No
     for key in override_keys(overrides):
         broken = [find(RULES, [key], scene) for scene in scenes]
         if broken[0] and all(broken):
-            raise InputError(f"{message(*broken[0])} (--set)")
+            raise no_effect(*broken[0]).at(OVERRIDES)
 
 
 def useless_in_file(key: str, without_overrides: Callable[[], Scene]) -> bool:
@@ -509,9 +508,9 @@ def useless_in_file(key: str, without_overrides: Callable[[], Scene]) -> bool:
         return False
 
 
-def message(key: str, rule: Rule) -> str:
-    """One line: the key, why it has no effect, and what is allowed."""
-    return f"{key}: has no effect: {rule.reason}; allowed: {rule.allowed}, or no {key.rpartition('.')[2]}"
+def no_effect(key: str, rule: Rule) -> InputError:
+    """The error of a key that has no effect: why, and what is allowed."""
+    return InputError(key, f"has no effect: {rule.reason}", f"{rule.allowed}, or no {key.rpartition('.')[2]}")
 
 
 def find(rules: Iterable[Rule], keys: Iterable[str], model: ConfigModel, *subject: Any) -> tuple[str, Rule] | None:

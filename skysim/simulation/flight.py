@@ -13,13 +13,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import RateEstimate
 from estimator.trackers.pipeline import Clock, Report
 from skysim.camera.render import Window
 from skysim.core.errors import InputError
+from skysim.core.plugins import finite_array
 from skysim.core.types import Floats, Frame, Telemetry, Trajectory, Truth
 from skysim.dynamics import imu
 from skysim.scene.scene import Scene
@@ -88,14 +88,26 @@ class Schedule:
         self.exposures_s: dict[int, float] = {}
 
     @property
+    def is_over(self) -> bool:
+        """Whether all frames were exposed."""
+        return self.index >= self.frames
+
+    @property
     def window(self) -> Window:
         """Of the next frame."""
         return timing.exposure_window(self.camera.scene, self.index, self.exposure_control.exposure_s)
 
-    def due_s(self, window: Window) -> float:
+    @property
+    def close_s(self) -> float:
+        """When the exposure of the next frame ends."""
+        return self.window.close_s(self.camera.scene.camera.height_px)
+
+    @property
+    def due_s(self) -> float:
         """When the next frame is due: exposed, its solution ready, and the time come that it is tagged with."""
         scene = self.camera.scene
         rows = scene.camera.height_px
+        window = self.window
         tagged_s = window.middle_s(rows) + timing.time_tag_error_s(scene, self.index)
         return max(window.close_s(rows) + self.latency_s, tagged_s)
 
@@ -107,13 +119,15 @@ class Flight:
     endless       : frames continue without end, whatever the scene's number
     keeps_history : keep all past states, for telemetry and trajectory; else only those that the next frame needs
 
-    Raises InputError for a maneuver that the vehicle cannot follow. Close it, or use it as a context manager: an
-    external controller has a process.
+    Raises InputError for a maneuver that the vehicle cannot follow, and for an endless flight that is to keep its
+    history. Close it, or use it as a context manager: an external controller has a process.
     """
 
     def __init__(
         self, lab: Lab, parts: UserParts = NO_PARTS, *, endless: bool = False, keeps_history: bool = True
     ) -> None:
+        if endless and keeps_history:
+            raise InputError("endless", "the history would have no end", "keeps_history=False")
         self.lab = lab
         self.parts = parts
         self.duration_s = math.inf if endless else lab.duration_s
@@ -167,24 +181,32 @@ class Flight:
 
         torque_nm : (3,) in body axes that the scene's actuators are to give, in place of the controller's; the ideal
             actuator gives it where the scene has no controller
-        Raises InputError inside a loop over `shots`, at the end of the motion, and for a torque on a prescribed motion.
+        Raises InputError inside a loop over `shots`, at the end of the motion, for a torque on a prescribed motion, and
+        for one that is not of three finite numbers.
         """
-        if self.is_in_shots:
-            raise InputError("step: inside a loop over shots, which steps by itself; allowed: observe, or steps alone")
+        self.refuse_in_shots("step")
         if self.is_over:
-            raise InputError(f"step: the motion has ended at {self.now_s:g} s; allowed: more frames, or endless")
+            raise InputError("step", f"the motion has ended at {self.now_s:g} s", "more frames, or endless")
         if torque_nm is not None and self.lab.scene.motion.is_prescribed:
-            raise InputError("step: a prescribed motion takes no torque; allowed: another motion.control.law")
-        torque = None if torque_nm is None else np.asarray(torque_nm, dtype=np.float64).reshape(3)
+            raise InputError("step", "a prescribed motion takes no torque", "another motion.control.law")
+        try:
+            torque = None if torque_nm is None else finite_array(torque_nm, "torque_nm", (3,))
+        except ValueError as error:
+            raise InputError("step", error) from None
         self.motion.advance(self.motion.period_steps, torque)
-        return [shot for schedule in self.filter_schedules for shot in self.capture_due(schedule)]
+        return list(self.capture_due(self.filter_schedules))
+
+    def refuse_in_shots(self, name: str) -> None:
+        """Raise InputError inside a loop over `shots`."""
+        if self.is_in_shots:
+            raise InputError(name, "inside a loop over shots, which steps by itself", "observe, or after it")
 
     def simulate_motion(self, progress: Progress | None = None) -> Self:
         """Simulate the rest of the motion. Only the frames that a filter needs are rendered.
 
         progress : called as progress(t_s, duration_s) as the motion goes on
         """
-        for _ in self.events(self.filter_schedules, progress=progress):
+        for _ in self.events(self.filter_schedules, progress=progress, captures_late=False):
             pass
         return self
 
@@ -193,7 +215,7 @@ class Flight:
         motion = self.motion
         periods = 1
         if motion.is_free:
-            due_s = min((one.due_s(one.window) for one in schedules if one.index < one.frames), default=math.inf)
+            due_s = min((one.due_s for one in schedules if not one.is_over), default=math.inf)
             left_s = min(due_s, self.duration_s) - self.now_s
             periods = max(math.ceil(left_s / motion.flight_computer.period_s), 1)
         motion.advance(periods * motion.period_steps)
@@ -212,10 +234,15 @@ class Flight:
         return self.flown
 
     def telemetry(self) -> Telemetry:
-        """True and estimated states at the ticks of the flight computer. Raises InputError without history."""
+        """True and estimated states at the ticks of the flight computer.
+
+        Raises InputError without history, and before the first step.
+        """
         recorder = self.motion.recorder
         if recorder is None:
-            raise InputError("telemetry: this flight keeps no history; allowed: keeps_history=True")
+            raise InputError("telemetry", "this flight keeps no history", "keeps_history=True")
+        if not self.now_s:
+            raise InputError("telemetry", "the motion has not begun", "after a step")
         reference = self.motion.reference if self.lab.scene.motion.control else None
         return recorder.telemetry(reference, self.lab.cameras)
 
@@ -253,37 +280,40 @@ class Flight:
         solves: bool = False,
         selects: FrameSelector | None = None,
         progress: Progress | None = None,
+        captures_late: bool = True,
     ) -> Iterator[Shot | None]:
-        """The shots of some cameras as in `shots`, and None whenever the motion has gone on."""
+        """The shots of some cameras as in `shots`, and None whenever the motion has gone on.
+
+        captures_late : also those that are due only after the end of the motion
+        """
+        self.refuse_in_shots("shots")
         self.is_in_shots = True
         try:
             while not self.is_over:
                 self.advance(schedules)
-                for schedule in schedules:
-                    yield from self.capture_due(schedule, solves, selects)
+                yield from self.capture_due(schedules, solves, selects)
                 yield None
                 if progress:
                     progress(self.now_s, self.duration_s)
-            for schedule in schedules:
-                yield from self.capture_late(schedule, solves, selects)
+            if captures_late:
+                yield from self.capture_late(schedules, solves, selects)
         finally:
             self.is_in_shots = False
 
     def capture_due(
-        self, schedule: Schedule, solves: bool = False, selects: FrameSelector | None = None
+        self, schedules: Sequence[Schedule], solves: bool = False, selects: FrameSelector | None = None
     ) -> Iterator[Shot]:
-        """Yield the exposures of a camera that are due and not yet rendered; with a filter they update it."""
+        """Yield the exposures that are due and not yet rendered, in order; with a filter they update it."""
         has_filter = bool(self.filter_schedules)
-        while schedule.index < schedule.frames and schedule.due_s(schedule.window) <= self.now_s:
-            yield from self.capture_next(schedule, solves or has_filter, selects, updates_filter=has_filter)
+        while due := [one for one in schedules if not one.is_over and one.due_s <= self.now_s]:
+            yield from self.capture_next(earliest(due), solves or has_filter, selects, updates_filter=has_filter)
 
     def capture_late(
-        self, schedule: Schedule, solves: bool = False, selects: FrameSelector | None = None
+        self, schedules: Sequence[Schedule], solves: bool, selects: FrameSelector | None
     ) -> Iterator[Shot]:
         """Yield the exposures that were over at the end of the motion, but due only later; no filter gets them."""
-        rows = schedule.camera.scene.camera.height_px
-        while schedule.index < schedule.frames and schedule.window.close_s(rows) <= self.now_s:
-            yield from self.capture_next(schedule, solves, selects, updates_filter=False)
+        while late := [one for one in schedules if not one.is_over and one.close_s <= self.now_s]:
+            yield from self.capture_next(earliest(late), solves, selects, updates_filter=False)
 
     def capture_next(
         self, schedule: Schedule, solves: bool, selects: FrameSelector | None, updates_filter: bool
@@ -291,8 +321,8 @@ class Flight:
         """Yield the next exposure of a camera, unless it is not selected."""
         index = schedule.index
         window = schedule.window
+        close_s = schedule.close_s
         schedule.index += 1
-        close_s = window.close_s(schedule.camera.scene.camera.height_px)
         if selects and schedule.number == 0 and not selects(index, close_s):
             return
         schedule.exposures_s[index] = window.exposure_s
@@ -301,8 +331,14 @@ class Flight:
         yield shot
 
     def capture(self, schedule: Schedule, index: int, window: Window, solves: bool, updates_filter: bool) -> Shot:
-        """Render an exposure, solve it, and update the filter with the solution."""
+        """Render an exposure, solve it, and update the filter with the solution.
+
+        Raises InputError for an exposure that began before the states that the flight keeps.
+        """
         camera = schedule.camera
+        simulation = self.motion.simulation
+        if simulation.first_step and simulation.first_step * simulation.step_s > window.open_s:
+            raise InputError("shots", f"the flight has forgotten frame {index}", "keeps_history=True")
         clock = Clock()
         trajectory = self.trajectory() if self.is_over else self.motion.trajectory(window.open_s)
         frame, truth = render_frame(camera, trajectory.since(window.open_s), index, clock, window)
@@ -344,14 +380,16 @@ class Flight:
     def render(self, index: int, camera: int = 0) -> tuple[Frame, Truth]:
         """Render an exposure of the schedule from the motion so far; bit for bit that of `shots`.
 
-        Raises InputError for a frame that automatic exposure has not exposed yet.
+        Raises InputError for a frame that is not exposed yet.
         """
         schedule = self.schedules[camera]
         scene = schedule.camera.scene
         exposure_s = schedule.exposures_s.get(index)
         if exposure_s is None and scene.tracker.exposure_control:
-            raise InputError(f"render: frame {index} has no exposure time yet; allowed: after it came from shots")
+            raise InputError("render", f"frame {index} has no exposure time yet", "after it came from shots")
         window = timing.exposure_window(scene, index, exposure_s)
+        if not (0 <= index < schedule.frames and window.close_s(scene.camera.height_px) <= self.now_s):
+            raise InputError("render", f"frame {index} is not exposed at {self.now_s:g} s", "one that is")
         return render_frame(schedule.camera, self.trajectory(), index, None, window)
 
     def observe(self, camera: int = 0, *, solves: bool = True) -> Shot:
@@ -366,6 +404,11 @@ class Flight:
         index = FIRST_OBSERVATION + self.observations
         self.observations += 1
         return self.capture(schedule, index, window, solves, updates_filter=False)
+
+
+def earliest(schedules: Sequence[Schedule]) -> Schedule:
+    """The one whose next exposure is due first; of equal ones the first."""
+    return min(schedules, key=lambda schedule: schedule.due_s)
 
 
 def open_flight(

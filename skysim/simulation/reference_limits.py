@@ -55,8 +55,9 @@ def check_tilt(reference: guidance.Reference, vehicle: VehicleConfig, duration_s
     beyond = np.flatnonzero(tilt_deg > vehicle.tilt_stop_deg)
     if len(beyond):
         raise InputError(
-            f"motion.maneuver: tilt of {tilt_deg[beyond[0]]:.3g} deg at {t_s[beyond[0]]:.3g} s; allowed: up to"
-            f" vehicle.tilt_stop_deg {vehicle.tilt_stop_deg:g}"
+            "motion.maneuver",
+            f"tilt of {tilt_deg[beyond[0]]:.3g} deg at {t_s[beyond[0]]:.3g} s",
+            f"up to vehicle.tilt_stop_deg {vehicle.tilt_stop_deg:g}",
         )
 
 
@@ -84,8 +85,9 @@ def check_rate(key: str, t_s: Floats, rate_rad_s: Floats, vehicle: VehicleConfig
     n = int(fastest.argmax())
     if fastest[n] > math.radians(limit_deg_s) * (1 + ROUNDING):
         raise InputError(
-            f"{key}: {math.degrees(fastest[n]):.4g} deg/s about a body axis at {t_s[n]:.6g} s; allowed: up to"
-            f" vehicle.imu.gyro.rate_limit_deg_s {limit_deg_s:g}"
+            key,
+            f"{math.degrees(fastest[n]):.4g} deg/s about a body axis at {t_s[n]:.6g} s",
+            f"up to vehicle.imu.gyro.rate_limit_deg_s {limit_deg_s:g}",
         )
 
 
@@ -95,6 +97,8 @@ def check_torque(key: str, t_s: Floats, used: Floats, torque_nm: Floats, control
     if used[n] > 1 + ROUNDING:
         torque = ", ".join(f"{component:.3g}" for component in torque_nm[n])
         raise InputError(
-            f"{key}: needs a torque of ({torque}) N m at {t_s[n]:.6g} s, {used[n]:.3g} times what the actuators"
-            f" {control.actuators} can give; allowed: slower or smaller, or motion.control: prescribed"
+            key,
+            f"needs a torque of ({torque}) N m at {t_s[n]:.6g} s, {used[n]:.3g} times what the actuators"
+            f" {control.actuators} can give",
+            "slower or smaller, or motion.control: prescribed",
         )

@@ -7,8 +7,8 @@ from functools import lru_cache
 import numpy as np
 
 from skysim.camera.render import Window
-from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import CAMERA_TIMING, random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig
 

@@ -73,7 +73,7 @@ def with_controller(motion: MotionConfig, controller: Any) -> tuple[MotionConfig
     """The motion with a controller, and the factory of one that is not given by name."""
     config = motion.control or ControlConfig()
     if not (isinstance(controller, str) or callable(controller)):
-        raise InputError(f"controller: {type(controller).__name__}; allowed: a name, or a callable that takes a set-up")
+        raise InputError("controller", type(controller).__name__, "a name, or a callable that takes a set-up")
     law = controller if isinstance(controller, str) else name_of(controller)
     changed = motion.model_copy(update={"control": config.model_copy(update={"law": law})})
     return changed, None if isinstance(controller, str) else controller
@@ -82,7 +82,7 @@ def with_controller(motion: MotionConfig, controller: Any) -> tuple[MotionConfig
 def with_profile(motion: MotionConfig, profile: Any) -> MotionConfig:
     """The motion along a profile only, from its own start; prescribed if there is no controller."""
     if isinstance(profile, str | Path) and not is_file(Path(profile)):
-        raise InputError(f"profile: {profile} is not a file; allowed: a file, or a table")
+        raise InputError("profile", f"{profile} is not a file", "a file, or a table")
     file = str(profile) if isinstance(profile, str | Path) else GIVEN_TABLE
     element = ProfileConfig.model_construct(kind="profile", file=file)
     return motion.model_copy(
@@ -104,7 +104,7 @@ def with_tracker(scene: Scene, tracker: Any) -> tuple[Scene, factory.Estimator |
         estimator = FunctionTracker(name_of(tracker), tracker)
     elif not isinstance(tracker, str):
         what = f"the class {tracker.__name__}" if isinstance(tracker, type) else type(tracker).__name__
-        raise InputError(f"tracker: {what}; allowed: a name, a function of an image, a StarTracker or a DomeTracker")
+        raise InputError("tracker", what, "a name, a function of an image, a StarTracker or a DomeTracker")
     name = tracker if isinstance(tracker, str) else name_of(tracker)
     config = scene.tracker.model_copy(update={"name": name})
     return scene.model_copy(update={"tracker": config}), estimator

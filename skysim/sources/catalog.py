@@ -125,7 +125,7 @@ def package_file(package: str) -> str:
         module = import_module(package)
     except ImportError as error:
         name = package.replace("_", "-")
-        raise InputError(f"skysim catalog build: package {name} is not installed; install skysim[catalog]") from error
+        raise InputError("", f"package {name} is not installed", "after pip install 'skysim[catalog]'") from error
     return str(module.catalog_path())
 
 
@@ -185,13 +185,13 @@ def read_meta_and_lines(path: Path) -> tuple[dict[str, Any], list[str]]:
         raise catalog_error(path, "not the header of a skysim catalog")
     if not isinstance(epoch_jyear, int | float) or not EPOCHS_JYEAR[0] <= epoch_jyear <= EPOCHS_JYEAR[1]:
         allowed = "a Julian year of {} to {}".format(*EPOCHS_JYEAR)
-        raise catalog_error(path, f"epoch_jyear {excerpt(repr(epoch_jyear))}; allowed: {allowed}")
+        raise InputError(path, f"epoch_jyear {excerpt(repr(epoch_jyear))}", allowed)
     return meta, lines[header:]
 
 
 def catalog_error(path: Path, what: str) -> InputError:
-    """The InputError for a damaged catalog file, with the remedy."""
-    return InputError(f"{path}: {what}; build it with `skysim catalog build`")
+    """The InputError for a file that is no catalog."""
+    return InputError(path, what, "a star catalog (.ecsv) built by skysim")
 
 
 def info(name_or_path: str | Path) -> dict[str, Any]:
@@ -219,7 +219,7 @@ def read_for(key: str, name: str) -> Catalog:
     try:
         return read(path)
     except InputError as error:
-        raise InputError(f"{key}: {error}") from None
+        raise error.within(key) from None
 
 
 def require_catalog(key: str, name: str) -> Path:
@@ -227,5 +227,6 @@ def require_catalog(key: str, name: str) -> Path:
     path = catalog_path(name)
     if not is_file(path):
         allowed = sorted(file.stem for file in CATALOGS.glob("*_*.ecsv"))
-        raise InputError(f"{key}: {unknown_name('catalog', name, allowed)}; or an .ecsv file of skysim catalog build")
+        problem, names = unknown_name("catalog", name, allowed)
+        raise InputError(key, problem, f"{names}, or a built .ecsv file")
     return path

@@ -77,7 +77,7 @@ class Band:
 
         A curve with a peak is scaled to it.
 
-        Raises ValueError for an unknown name, InputError for a file that is not a curve.
+        Raises InputError for an unknown name, and for a file that is not a curve.
         """
         if isinstance(quantum_efficiency, str):
             path = curve_file(quantum_efficiency)
@@ -125,7 +125,7 @@ def _product(first: Band, second: Band) -> Band:
     """The product of two curves where both reach, sampled every nanometer and at the samples of both."""
     low_m, high_m = (choose(first.wavelength_m[end], second.wavelength_m[end]) for choose, end in ((max, 0), (min, -1)))
     if not low_m < high_m:
-        raise InputError("camera.transmission: lets nothing through where the chip has a response; allowed: an overlap")
+        raise InputError("camera.transmission", "lets nothing through where the chip has a response", "an overlap")
     grid = np.union1d(first.grid_m(), second.grid_m())
     grid = grid[(grid >= low_m) & (grid <= high_m)]
     return Band(grid, first.response_at(grid) * second.response_at(grid))
@@ -143,15 +143,14 @@ def _read_curve(path: Path, _changed_ns: int = 0, largest: float = 1.0) -> Band:
             raise ValueError("fewer than two rows")
         wavelength_nm, response = np.loadtxt(lines[1:], delimiter=",", ndmin=2).T
     except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: not a response curve ({error}); allowed: two columns, wavelength_nm and response"
-        ) from None
+        raise InputError(path, f"not a response curve ({error})", "two columns, wavelength_nm and response") from None
     rising = np.all(np.diff(wavelength_nm, prepend=0.0) > 0) and wavelength_nm[-1] <= LONGEST_NM
     within = np.all((response >= 0) & (response <= largest) & np.isfinite(response))
     if not (rising and within and np.any(response)):
         raise InputError(
-            f"{path}: not a response curve; allowed: ascending wavelength_nm to {LONGEST_NM:.0f}, response within 0 and"
-            f" {largest:g}, not always 0"
+            path,
+            "not a response curve",
+            f"ascending wavelength_nm to {LONGEST_NM:.0f}, response within 0 and {largest:g}, not always 0",
         )
     return Band(wavelength_nm * 1e-9, response)
 
@@ -375,15 +374,14 @@ def lumens_per_watt(spectrum: Spectrum, fwhm_m: float | None = None) -> float:
         power = measured(spectrum)
         seen = float(photopic.integral(power.response_at))
         if not seen:
-            raise InputError(
-                f"light.led.spectrum: {spectrum} is invisible and has no candelas; allowed: radiant_intensity"
-            )
+            raise InputError("light.led.spectrum", f"{spectrum} is invisible and has no candelas", "radiant_intensity")
         return LUMINOUS_EFFICACY_LM_W * seen / float(power.integral(np.ones_like))
     if not photopic.response_at(spectrum):
         allowed = "{:g} to {:g} nm".format(*(photopic.wavelength_m[[0, -1]] * 1e9))
         raise InputError(
-            f"light.led.spectrum: {spectrum * 1e9:g} nm is invisible and has no candelas; allowed: {allowed}, or"
-            " radiant_intensity"
+            "light.led.spectrum",
+            f"{spectrum * 1e9:g} nm is invisible and has no candelas",
+            f"{allowed}, or radiant_intensity",
         )
     if fwhm_m is None:
         return float(LUMINOUS_EFFICACY_LM_W * photopic.response_at(spectrum))

@@ -70,21 +70,21 @@ def read_dome_map(path: Path) -> DomeMap:
             warnings.simplefilter("ignore")
             table = Table.read(path, format="ascii.ecsv")
     except Exception as error:  # astropy's parsers raise many types of error
-        raise InputError(f"{path}: not an ECSV table: {' '.join(str(error).split())[:120]}") from None
+        raise InputError(path, f"not an ECSV table: {' '.join(str(error).split())[:120]}") from None
     missing = [name for name in MAP_COLUMNS if name not in table.colnames]
     if missing or not len(table):
         fault = f"no column {missing[0]}" if missing else "no LED"
-        raise InputError(f"{path}: {fault}; allowed: a map written by skysim survey")
+        raise InputError(path, fault, "a map written by a survey")
     try:
         numbers = np.column_stack([np.ma.filled(table[name].astype(float), np.nan) for name in MAP_COLUMNS])
     except (TypeError, ValueError):
-        raise InputError(f"{path}: allowed: numbers in the columns {', '.join(MAP_COLUMNS)}") from None
+        raise InputError(path, "", f"numbers in the columns {', '.join(MAP_COLUMNS)}") from None
     invalid = np.flatnonzero(~np.isfinite(numbers).all(axis=1) | (numbers[:, 4] <= 0))
     if len(invalid):
-        raise InputError(f"{path}: row {invalid[0] + 1}: allowed: finite numbers, and a sigma_m above 0")
+        raise InputError(path, f"row {invalid[0] + 1}", "finite numbers, and a sigma_m above 0")
     id_, count = np.unique(numbers[:, 0].astype(np.int64), return_counts=True)
     if count.max() > 1:
-        raise InputError(f"{path}: LED {id_[count > 1][0]} occurs {count.max()} times; allowed: once")
+        raise InputError(path, f"LED {id_[count > 1][0]} occurs {count.max()} times", "once")
     meta = {key: header_numbers(path, table.meta, key, count) for key, count in MAP_META.items()}
     fields: dict[str, Any] = {key: value[0] if len(value) == 1 else tuple(value) for key, value in meta.items()}
     fields["size_px"] = tuple(round(side) for side in meta["size_px"])

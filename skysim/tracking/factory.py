@@ -66,7 +66,7 @@ def build_tracker(scene: Scene, mount: Mount, sources: Sources, programs: Mappin
             decoder = DecoderSettings(**scene.tracker.decoder.model_dump())
             return CodedTracker(camera, leds, lever, settings, code, decoder)
         except ImageError as error:
-            raise InputError(f"light: the star tracker cannot use this dome: {error}") from None
+            raise InputError("light", f"the star tracker cannot use this dome: {error}") from None
     stars = catalog.brighter_than(onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag)
     orbit = assumed_orbit(scene)
     directions = catalog.apparent(stars, assumed_observer(scene, orbit))

@@ -105,12 +105,12 @@ def surveyed_dome(scene: Scene, path: str, leds: LedMap, lever: Lever) -> tuple[
     dome_map = dome_map_file.read_dome_map(Path(path))
     size_px = (scene.camera.width_px, scene.camera.height_px)
     if dome_map.size_px != size_px:
-        raise InputError(f"tracker.map: {path}: surveyed with a camera of {dome_map.size_px} px; allowed: {size_px} px")
+        raise InputError("tracker.map", f"{path}: surveyed with a camera of {dome_map.size_px} px", f"{size_px} px")
     order = np.argsort(leds.id)
     row = order[np.minimum(np.searchsorted(leds.id, dome_map.id, sorter=order), len(order) - 1)]
     unknown = dome_map.id[leds.id[row] != dome_map.id]
     if len(unknown):
-        raise InputError(f"tracker.map: {path}: unknown LED {unknown[0]}; allowed: the {len(order)} LEDs of this dome")
+        raise InputError("tracker.map", f"{path}: unknown LED {unknown[0]}", f"the {len(order)} LEDs of this dome")
     board = None if leds.board is None else leds.board[row]
     surveyed = replace(
         leds,
@@ -157,4 +157,4 @@ def onboard_catalog(key: str, name: str) -> catalog.StarCatalog:
     try:
         return catalog.read(require_catalog(key, name))
     except ImageError as error:
-        raise InputError(f"{key}: {error}") from None
+        raise InputError(key, error) from None

@@ -74,5 +74,5 @@ def require_algorithm(stage: str, name: str, algorithms: Mapping[str, object]) -
     Only the estimator has the list, and the scene package may not import it, so the name is checked here.
     """
     if name not in algorithms:
-        raise InputError(f"tracker.{stage}: {unknown_name(stage, name, algorithms)}")
+        raise InputError(f"tracker.{stage}", *unknown_name(stage, name, algorithms))
     return name

@@ -64,19 +64,17 @@ def recorded(area: str, cases: dict[str, Case]) -> dict[str, str]:
 
 
 def record(area: str, cases: dict[str, Case]) -> bool:
-    """Write the entries of some cases beside those of the others. Returns whether it did: not if a case failed."""
+    """Write the entries of some cases beside those of the others, but for those of cases that failed."""
     now, before = measured(area, cases), recorded(area, cases)
-    failed = [f"{key}: {value}" for key, value in now.items() if key.endswith(f" | {FAILED}")]
-    if failed:
-        print(f"{area}: not recorded", *failed, sep="\n  ", flush=True)
-        return False
+    failed = {key: value for key, value in now.items() if key.endswith(f" | {FAILED}")}
     others = {key: value for key, value in read(area)["entries"].items() if key not in before}
-    written = {"machine": machine(), "entries": dict(sorted((others | now).items()))}
+    entries = {key: value for key, value in (others | now).items() if key not in failed}
+    text = json.dumps({"machine": machine(), "entries": dict(sorted(entries.items()))}, indent=1, ensure_ascii=False)
     DIGESTS.mkdir(exist_ok=True)
-    text = json.dumps(written, indent=1, ensure_ascii=False)
     (DIGESTS / f"{area}.json").write_text(f"{text}\n", encoding="utf-8")
-    print(f"{area}: {len(now)} entries recorded", flush=True)
-    return True
+    lines = [f"  {key}: {value}" for key, value in failed.items()]
+    print(f"{area}: {len(now) - len(failed)} entries recorded", *lines, sep="\n", flush=True)
+    return not failed
 
 
 def compare(area: str, cases: dict[str, Case]) -> bool:

@@ -18,7 +18,6 @@ import skysim
 from tests.baseline import digest
 from tests.baseline.command import ROOT, forked, run, succeed
 from tests.baseline.digest import Entries
-from tests.baseline.python_cases import PYTHON_CASES
 
 Case = Callable[[Path], Entries]
 CASES = {path.stem: yaml.safe_load(path.read_text(encoding="utf-8")) for path in Path(__file__).parent.glob("cases/*")}
@@ -48,7 +47,7 @@ def scene_cases() -> dict[str, Case]:
         name: partial(run_scene, name, given["shipped"].get(name, given["frames"])) for name in shipped("scenes")
     }
     cases |= {name: partial(run_variant, name, keys) for name, keys in given["variants"].items()}
-    return cases | {f"python {name}": partial(run_python, action) for name, action in PYTHON_CASES.items()}
+    return cases | {f"python {name}": partial(run_python, text) for name, text in given["python"].items()}
 
 
 def run_variant(name: str, keys: dict[str, Any], folder: Path) -> Entries:
@@ -67,12 +66,22 @@ def run_scene(scene: str, frames: int | None, folder: Path) -> Entries:
     yield from prefixed("check", digest.values(json.loads(succeed(folder, "check", scene, "--json").out)))
 
 
-def run_python(action: Callable[[], object], folder: Path) -> Entries:
-    """The files that a function writes into its working directory."""
-    ran = forked(folder, action)
+def run_python(text: str, folder: Path) -> Entries:
+    """The files that statements write to the folder `out`."""
+    (folder / "out").mkdir()
+    ran = forked(folder, partial(execute, text))
     if ran.code:
         raise RuntimeError(ran.err)
     return result_files(folder / "out")
+
+
+def execute(text: str) -> None:
+    """Execute statements; a wrong input ends the process with the error's type and text."""
+    try:
+        exec(text, {"skysim": skysim, "np": np})
+    except skysim.InputError as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        sys.exit(2)
 
 
 def result_files(folder: Path) -> Entries:
@@ -119,27 +128,16 @@ def run_study(name: str, verb: str, keys: dict[str, Any], folder: Path) -> Entri
         yield f"point {point}", f"{len(rows)} rows {digest.sha(json.dumps(rows))}"
 
 
-def contract_cases() -> dict[str, Case]:
-    """The structure of what commands print with --json, session by session; and the schemas of files."""
-    cases: dict[str, Case] = {
-        name: partial(run_session, lines) for name, lines in CASES["contracts"]["sessions"].items()
-    }
-    return cases | {f"schema {kind}": partial(schema, kind) for kind in ("scene", "study")}
-
-
 def run_session(lines: list[str], folder: Path) -> Entries:
-    """Run commands one after another in one folder; those with --json yield the structure of what they print."""
+    """Run commands one after another in one folder: the structure of what they print with --json, else its digest."""
     write_files(folder, CASES["contracts"]["files"])
     for line in lines:
         ran = run(folder, *shlex.split(line))
         yield f"{line}: exit code", str(ran.code)
         if "--json" in line:
             yield from prefixed(f"{line}:", iter(digest.structure(json.loads(ran.out)).items()))
-
-
-def schema(kind: str, folder: Path) -> Entries:
-    """The bytes of a JSON Schema."""
-    yield "", digest.sha(succeed(folder, "validate", "--schema", kind).out)
+        else:
+            yield f"{line}: text", digest.sha(ran.out)
 
 
 def run_stream(scene: str, folder: Path) -> Entries:
@@ -189,24 +187,16 @@ def refused(line: str, folder: Path) -> Entries:
 
 
 def raised(text: str, folder: Path) -> Entries:
-    """Type and text of the error of a wrong Python expression."""
+    """Type and text of the error of a wrong Python statement."""
     write_files(folder, CASES["messages"]["files"])
-    ran = forked(folder, partial(evaluate, text))
+    ran = forked(folder, partial(execute, text))
     yield "", f"{ran.code}: {ran.err.strip()}"
-
-
-def evaluate(text: str) -> None:
-    """Evaluate an expression; a wrong input ends the process with the error's type and text."""
-    try:
-        eval(text, {"skysim": skysim, "np": np})
-    except ValueError as error:
-        sys.exit(f"{type(error).__name__}: {error}")
 
 
 AREAS: dict[str, Callable[[], dict[str, Case]]] = {
     "scenes": scene_cases,
     "studies": study_cases,
-    "contracts": contract_cases,
+    "contracts": lambda: {name: partial(run_session, lines) for name, lines in CASES["contracts"]["sessions"].items()},
     "streams": lambda: {scene: partial(run_stream, scene) for scene in ("shefex2", "afit_simsat", "simsat_bump")},
     "surveys": lambda: {name: partial(run_survey, words) for name, words in CASES["surveys"].items()},
     "messages": message_cases,

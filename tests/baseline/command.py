@@ -85,9 +85,7 @@ def exit_code(action: Callable[[], object]) -> int:
     try:
         action()
     except SystemExit as left:
-        code = left.code if isinstance(left.code, int) else int(left.code is not None)
-        if isinstance(left.code, str):
-            print(left.code, file=sys.stderr)
+        code = int(left.code or 0)
     except BaseException:
         traceback.print_exc()
         code = CRASHED

@@ -24,12 +24,6 @@ def test_messages_of_wrong_scenes_are_those_of_the_baseline() -> None:
     assert done.returncode == 0, done.stdout
 
 
-def test_a_name_that_is_no_area_is_refused() -> None:
-    done = compared("messages", "frames")
-    assert done.returncode == 2
-    assert "frames: allowed: scenes, studies" in done.stderr
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(
     bool(differences(json.loads((DIGESTS / "scenes.json").read_text(encoding="utf-8"))["machine"])),

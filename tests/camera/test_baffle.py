@@ -8,14 +8,16 @@ from scipy import integrate
 
 from skysim.camera.glow import baffle as stray
 from skysim.camera.glow import earth_glow
-from skysim.camera.glow.baffle import stray_of_bodies_e_s_m2, stray_of_earth_e_s_m2
+from skysim.camera.glow.baffle import earth_around, stray_around_e_s_m2, stray_of_bodies_e_s_m2
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.scene.sections.camera import BaffleConfig
 from skysim.scene.sections.orbit import EarthConfig
-from skysim.simulation.exposure import render_at_rest, stray_light_e_s
-from skysim.simulation.lab import Lab, bodies_during, build_lab
+from skysim.simulation.exposure import expected_exposure, render_at_rest
+from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lights.lens import stray_e_s
+from skysim.simulation.lights.light import beam_of
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 
 BAND = Band.from_efficiency(0.5)  # flat from 400 to 1000 nm
@@ -42,14 +44,13 @@ def in_space(ra_deg: float, dec_deg: float, **keys: str) -> Lab:
 
 
 def stray_of(lab: Lab, t_s: float = 0.0) -> dict[str, float]:
-    cam_from_lab = lab.camera.mount.cam_from_body * lab.start.inv()
-    return stray_light_e_s(lab.camera, bodies_during(lab.camera, t_s), cam_from_lab, t_s)
+    return stray_e_s(lab.camera.lights, expected_exposure(lab.camera, lab.start, np.zeros(3), t_s))
 
 
 def test_the_sun_s_light_is_its_irradiance_times_the_transmittance() -> None:
     """1361 W/m2 of a black body of 5772 K, counted in photons: Kopp & Lean 2011; V = -26.74 gives 4 % more."""
     lab = in_space(90.0, -20.0, light__bodies="{moon: false, planets: false}")
-    sun = bodies_during(lab.camera, 0.0)[0]
+    sun = beam_of(lab.camera.lights, expected_exposure(lab.camera, lab.start, np.zeros(3), 0.0)).discs[0]
     m = np.linalg.norm(np.cross(sun.place.direction, [0.0, np.cos(np.radians(20)), np.sin(np.radians(-20))]))
     angle_deg = np.degrees(np.arcsin(m))
     assert 40 < angle_deg < 50
@@ -60,7 +61,7 @@ def test_the_sun_s_light_is_its_irradiance_times_the_transmittance() -> None:
     electrons = integrate.simpson(power * wavelength_m / 1.98644586e-25 * response, x=wavelength_m)
     pst = 10 ** (-3 - 4 * (angle_deg - 20) / 30)
     expected = electrons * pst * lab.scene.camera.pixel_m**2
-    assert stray_of(lab)["sun"] == pytest.approx(expected, rel=0.05)
+    assert stray_of(lab)["the Sun"] == pytest.approx(expected, rel=0.05)
 
 
 @pytest.mark.parametrize("phase_deg", [0.0, 70.0, 130.0])
@@ -69,7 +70,7 @@ def test_a_far_earth_lights_the_chip_as_lambert_s_sphere(sphere: None, phase_deg
     phase, far = np.radians(phase_deg), 1000.0
     sun_m = 1.5e11 * np.array([np.sin(phase), 0.0, np.cos(phase)])
     place_m = np.array([0.0, 0.0, far * EARTH_RADIUS_M])
-    light = stray_of_earth_e_s_m2(EVEN, DARK_EARTH, place_m, sun_m, np.array([1.0, 0.0, 0.0]), BAND)
+    light = stray_around_e_s_m2(EVEN, *earth_around(DARK_EARTH, place_m, sun_m, BAND), np.array([1.0, 0.0, 0.0]))
     law = (np.sin(phase) + (np.pi - phase) * np.cos(phase)) / np.pi
     assert light == pytest.approx(IRRADIANCE * 1e-4 * 0.3 * 2 / 3 / far**2 * law, rel=0.004)
 
@@ -95,7 +96,7 @@ def test_a_near_earth_lights_the_chip_as_its_ground_does(sphere: None, sun_deg: 
     through = 10 ** np.interp(np.degrees(np.arccos(toward @ boresight / d_m)), STEEP.angle_deg, np.log10(STEEP.pst))
     radiance = 0.3 * IRRADIANCE / np.pi * np.maximum(normal @ sun_m / np.linalg.norm(sun_m), 0)
     expected = np.sum(radiance * emission * area_m2 / d_m**2 * through)
-    light = stray_of_earth_e_s_m2(STEEP, DARK_EARTH, place_m, sun_m, boresight, BAND)
+    light = stray_around_e_s_m2(STEEP, *earth_around(DARK_EARTH, place_m, sun_m, BAND), boresight)
     assert light == pytest.approx(expected, rel=0.006)
 
 
@@ -128,19 +129,19 @@ def test_the_light_follows_the_orbit_and_the_date() -> None:
     """The Sun's is none behind the Earth; the Earth's is strongest over the day side; both change with the season."""
     lab = in_space(90.0, 60.0, light__bodies="{}", orbit=ORBIT)
     around = [stray_of(lab, t_s) for t_s in range(0, 5670, 210)]
-    assert 0.55 < np.mean(["sun" in one for one in around]) < 1
-    earth = np.array([one["earth"] for one in around])
+    assert 0.55 < np.mean(["the Sun" in one for one in around]) < 1
+    earth = np.array([one["the Earth"] for one in around])
     assert earth.max() > 100 * earth.min()
     winter = in_space(90.0, 60.0, light__bodies="{}", start_time="2012-12-24T21:00:00")
     summer = in_space(90.0, 60.0, light__bodies="{}")
-    assert stray_of(summer)["sun"] > 100 * stray_of(winter)["sun"]
+    assert stray_of(summer)["the Sun"] > 100 * stray_of(winter)["the Sun"]
 
 
 def test_a_body_below_the_skyline_gives_no_light() -> None:
     site = {"site": "{latitude_deg: 53, longitude_deg: 9}", "light__air": "{}", "light__bodies": "{planets: false}"}
     lab = in_space(250.0, 60.0, **site, start_time="2012-06-24T23:00:00")
-    assert "sun" not in stray_of(lab)
-    assert stray_of(lab, 12 * 3600.0)["sun"] > 0
+    assert "the Sun" not in stray_of(lab)
+    assert stray_of(lab, 12 * 3600.0)["the Sun"] > 0
 
 
 def test_no_body_gives_no_light() -> None:

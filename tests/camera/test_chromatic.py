@@ -18,7 +18,9 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount, Sources, Trajectory
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
-from skysim.simulation.lab import bodies_during, build_lab
+from skysim.simulation.exposure import expected_exposure
+from skysim.simulation.lab import build_lab
+from skysim.simulation.lights.light import beam_of
 from skysim.sources.orbit.satellites import as_sources, moving_light
 from skysim.sources.photometry import (
     Band,
@@ -190,7 +192,8 @@ def test_bodies_and_satellites_have_their_colors() -> None:
     """Mars is redder than the Sun and Uranus bluer; a satellite is as the Sun."""
     lens = {"camera.chromatic": LENS, "light.bodies": "{}"}
     lab = build_lab(loader.load("shefex2", lens))
-    lights = {body.name: points_of(body, np.zeros((2, 2))).chromatic for body in bodies_during(lab.camera, 0.0)}
+    bodies = beam_of(lab.camera.lights, expected_exposure(lab.camera, lab.start, np.zeros(3), 0.0)).discs
+    lights = {body.name: points_of(body, np.zeros((2, 2))).chromatic for body in bodies}
     assert lights["mars"][1, 2] > lights["sun"][1, 2] + 0.02
     assert lights["uranus"][1, 2] < lights["sun"][1, 2] - 0.02
     path = np.array([0.0, 0, 1]), np.zeros((2, 3))

@@ -11,8 +11,7 @@ import pytest
 from astropy.io import fits
 
 from skysim.core.errors import InputError
-from skysim.core.io import images
-from skysim.core.io.guard import process as guarded
+from skysim.core.io import guarded, images
 
 PIXELS = np.random.default_rng(1).integers(0, 500, (60, 80)).astype(np.int16)
 

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from skysim.core.errors import InputError
-from skysim.core.io import images
-from skysim.core.io.images import encoded, limits, tiff
-from skysim.core.io.images import fits as fits_images
+from skysim.core.io import decoding, encoded, images, tiff
+from skysim.core.io import fits as fits_images
 
 RNG = np.random.default_rng(4)
 GRAY = np.kron(RNG.integers(0, 255, (5, 7), np.uint8), np.ones((8, 8), np.uint8))  # blocks, which JPEG keeps
@@ -212,7 +211,7 @@ def test_a_cube_of_one_plane_is_a_picture_and_of_many_is_refused_by_its_shape(tm
 
 def test_a_gzipped_file_is_unpacked_up_to_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A gigabyte of zeros is a megabyte; what is beyond the limit is not unpacked."""
-    monkeypatch.setattr(limits, "MAX_BYTES", 100_000)
+    monkeypatch.setattr(decoding, "MAX_BYTES", 100_000)
     monkeypatch.setattr(fits_images, "GZIP_BLOCK", 10_000)
     whole = fits_file(tmp_path / "x.fits", FRAME).read_bytes()
     path = tmp_path / "x.fits.gz"

@@ -12,8 +12,8 @@ from pydantic import ValidationError
 from scipy import stats
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.tolerance import LengthError, NumberError, Tolerance, scaled_errors
-from skysim.core.quantities.units import ConfigModel
+from skysim.core.tolerance import LengthError, NumberError, Tolerance, scaled_errors
+from skysim.core.units import ConfigModel
 from skysim.dynamics import imu
 from skysim.scene import loader
 from skysim.scene.sections import vehicle
@@ -135,7 +135,7 @@ def test_a_misspelled_tolerance_is_answered_with_key_and_line() -> None:
         loader.load("afit_simsat", {"tracker.survey.led_sigma": "{tolerence: 1 mm}"})
     assert str(caught.value) == (
         "tracker.survey.led_sigma.tolerence: unknown key; did you mean tolerance?;"
-        " allowed: distribution, tolerance, sigma (--set)"
+        " allowed: distribution, tolerance, sigma (overrides)"
     )
 
 

@@ -10,7 +10,7 @@ from astropy import units
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skysim.core.quantities.units import COMMON_UNITS, in_si
+from skysim.core.units import COMMON_UNITS, in_si
 
 PAIRS = [(si, unit) for si, table in COMMON_UNITS.items() for unit in table]
 INCH = units.def_unit("in", units.imperial.inch)

@@ -404,7 +404,7 @@ def test_actuators_that_a_file_lacks_are_answered_in_one_line(
 @pytest.mark.parametrize("name", ["torque_x", "wheel_a", "gimbal_1", "rotor_1", "fan_1"])
 def test_actuator_of_a_reserved_name_is_refused(tmp_path: Path, name: str) -> None:
     motor = f'<actuator><motor name="{name}" site="center" gear="0 0 0 1 0 0"/></actuator>'
-    with pytest.raises(InputError, match=rf"mine\.xml: actuator {name}: skysim adds an actuator of this name"):
+    with pytest.raises(InputError, match=rf"mine\.xml: actuator {name}: an actuator of this name is added"):
         built(tmp_path, BUS, motor)
 
 
@@ -519,8 +519,8 @@ def spoilt(folder: Path, right: str, wrong: str, **changes: object) -> multibody
 @pytest.mark.parametrize(
     ("right", "wrong", "says"),
     [
-        ('name="wheel_x" axis', 'name="wheelx" axis', "wheelx: allowed: wheel_x, or another word"),
-        ('name="fan_x_1"', 'name="fanx"', "fanx: allowed: fan_x, or another word"),
+        ('name="wheel_x" axis', 'name="wheelx" axis', "wheelx; allowed: wheel_x, or another word"),
+        ('name="fan_x_1"', 'name="fanx"', "fanx; allowed: fan_x, or another word"),
         (
             'name="wheel_x" axis',
             'range="0 90" name="wheel_x" axis',

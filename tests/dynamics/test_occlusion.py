@@ -14,11 +14,12 @@ from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Sources
 from skysim.dynamics import multibody
 from skysim.dynamics.multibody.integrator import Simulation
-from skysim.dynamics.multibody.occlusion import behind_wall
 from skysim.scene import loader
 from skysim.scene.sections import light
-from skysim.simulation.exposure import render_at_rest
+from skysim.simulation.exposure import expected_exposure, render_at_rest
 from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lights.light import Obstacle, find_light
+from skysim.simulation.lights.obstacles import DomeWall, Vehicle, behind_wall
 from skysim.sources.dome.shell import surface
 from skysim.sources.dome.shell.surface import Surface
 
@@ -66,6 +67,12 @@ def crosses(begin_m: Floats, end_m: Floats, middle_m: Floats) -> np.ndarray:
     return np.asarray((enters < leaves) & (leaves > 0) & (enters < 1))
 
 
+def obstacles_of(lab: Lab) -> multibody.Obstacles:
+    vehicle = find_light(lab.camera.lights, Vehicle)
+    assert vehicle is not None
+    return vehicle.obstacles
+
+
 def picture(lab: Lab) -> tuple[bytes, set[int], Any]:
     frame, truth = render_at_rest(lab.camera, lab.start)
     return frame.image_dn.tobytes(), set(truth.sources.id.tolist()), truth
@@ -88,9 +95,8 @@ def test_a_mast_on_the_vehicle_hides_just_the_leds_behind_it(start: str, tmp_pat
     assert len(picture(bare)[2].hidden) == 0
     assert len(everything & gone) >= 4
     assert len(seen) >= 10
-    assert lab.camera.obstacles is not None
     np.testing.assert_array_equal(
-        multibody.occluded(lab.camera.obstacles, truth.lab_from_body, lab.camera.sources.place), behind
+        multibody.occluded(obstacles_of(lab), truth.lab_from_body, lab.camera.sources.place), behind
     )
 
 
@@ -101,8 +107,7 @@ def test_a_beam_of_the_lab_stays_while_the_vehicle_turns(tmp_path: Path) -> None
     for start in ["{yaw_deg: 0}", "{roll_deg: 3, yaw_deg: 60}", "{roll_deg: 20}"]:
         lab = furnished(tmp_path, beam, motion__start=start)
         lab_from_body = lab.start
-        assert lab.camera.obstacles is not None
-        found = multibody.occluded(lab.camera.obstacles, lab_from_body, lab.camera.sources.place)
+        found = multibody.occluded(obstacles_of(lab), lab_from_body, lab.camera.sources.place)
         camera_m = lab_from_body.apply(lab.camera.mount.camera_body_m)
         behind = crosses(camera_m, lab.camera.sources.place[:, :3], MAST_M)
         np.testing.assert_array_equal(found, behind)
@@ -124,8 +129,11 @@ def test_where_nothing_is_in_the_way_the_frame_is_the_same_bit_for_bit(tmp_path:
 
 
 def test_it_is_on_unless_the_scene_says_otherwise() -> None:
-    assert build_lab(loader.load("afit_simsat")).camera.obstacles is not None
-    assert build_lab(loader.load("afit_simsat", {"light.occlusion": "false"})).camera.obstacles is None
+    hides = [
+        any(isinstance(light, Obstacle) for light in build_lab(loader.load("afit_simsat", keys)).camera.lights)
+        for keys in ({}, {"light.occlusion": "false"})
+    ]
+    assert hides == [True, False]
 
 
 LENS = '<geom type="cylinder" size="0.022 0.015" pos="0 0 0.065" mass="0.2" rgba="0.05 0.05 0.06 1"/>'
@@ -159,13 +167,12 @@ def test_stars_are_hidden_by_the_body_that_they_are_behind() -> None:
     """
     lab = build_lab(loader.load("shefex2"))
     center, axes = np.array([0.0, 0.0, -0.8]), np.array([0.25, 0.25, 0.6])
-    assert lab.camera.obstacles is not None
     turn = lab.start
     rays = turn.inv().apply(lab.camera.sources.place[:, :3]) / axes
     along = rays @ (center / axes)
     root = along**2 - np.sum(rays**2, axis=1) * (np.sum((center / axes) ** 2) - 1)
     behind = (root >= 0) & (along > 0)
-    np.testing.assert_array_equal(multibody.occluded(lab.camera.obstacles, turn, lab.camera.sources.place), behind)
+    np.testing.assert_array_equal(multibody.occluded(obstacles_of(lab), turn, lab.camera.sources.place), behind)
     assert 100 < behind.sum() < len(behind) / 4
 
 
@@ -185,7 +192,7 @@ def test_a_box_hides_what_is_beyond_its_face_and_within_its_edges() -> None:
     box = '<geom type="box" size="0.1 0.1 0.1" pos="0.1 0 2.2"/>'
     mjcf = f'<mujoco><worldbody>{box}<body name="bus" mocap="true"/></worldbody></mujoco>'
     model = mujoco.MjModel.from_xml_string(mjcf)
-    obstacles = multibody.Obstacles(model, mujoco.MjData(model), np.array([0.1, 0.0, 0.2]), None)
+    obstacles = multibody.Obstacles(model, mujoco.MjData(model), np.array([0.1, 0.0, 0.2]))
     # Depths beyond the pupil; the box is from 1.9 to 2.1 m.
     led_z_m = 0.2 + np.array([0.5, 1.9 - 1e-6, 1.9 + 1e-6, 3.0, 1e3, -1.9, -3.0])
     leds = [[0.1, 0.0, z, 1.0] for z in led_z_m]
@@ -207,22 +214,21 @@ def test_gimbals_stand_where_they_are_at_the_start() -> None:
     given = loader.load("simsat_cmg", {"vehicle.cmgs.start_deg": "[10, 25, -30, 70]"})
     vehicle = multibody.build(given.vehicle)
     flown = Simulation(vehicle, Rotation.identity(), np.zeros(3), 0.1).data
-    things = multibody.build_obstacles(vehicle, None)
+    things = multibody.build_obstacles(vehicle)
 
     def placed(data: Any) -> Floats:
         pose = np.hstack([data.geom_xpos, np.abs(data.geom_xmat)])
         return pose[np.lexsort(np.round(pose, 9).T)]
 
     np.testing.assert_allclose(placed(things.data), placed(flown), rtol=0, atol=1e-9)
-    level = multibody.build_obstacles(multibody.build(loader.load("simsat_cmg").vehicle), None)
+    level = multibody.build_obstacles(multibody.build(loader.load("simsat_cmg").vehicle))
     assert np.abs(placed(things.data) - placed(level.data)).max() > 0.1
 
 
 def test_no_source_is_no_question() -> None:
     lab = build_lab(loader.load("afit_simsat"))
-    assert lab.camera.obstacles is not None
     no_sources = lab.camera.sources.take(np.zeros(0, np.int64))
-    assert multibody.occluded(lab.camera.obstacles, Rotation.identity(), no_sources.place).shape == (0,)
+    assert multibody.occluded(obstacles_of(lab), Rotation.identity(), no_sources.place).shape == (0,)
 
 
 # --- the dome's wall ----------------------------------------------------------------------------------------
@@ -281,17 +287,21 @@ def test_a_wall_hides_what_its_scene_says(tmp_path: Path) -> None:
     drum = "{kind: cylinder, axis: z, apex: 3 m, radius: 0.4 m, length: 2.4 m}"
     layout = "{kind: listed, cap_deg: 40, positions: [[-0.4 m, 0 m, 0.8 m], [-0.4 m, 0 m, 2.8 m]]}"
     lab = furnished_drum(tmp_path, beside, drum, layout)
-    assert lab.camera.obstacles is not None
     # At the near wall, 1/9 of the way over, the sights are 0.36 m and 0.58 m high; the wall begins at 0.6 m.
-    level = multibody.occluded(lab.camera.obstacles, Rotation.identity(), lab.camera.sources.place)
-    np.testing.assert_array_equal(level, [False, False])
+    np.testing.assert_array_equal(hidden_by_wall(lab), [False, False])
     # Farther out, at 1 m, half of the way: 0.55 m and 1.55 m.
     far = SIMSAT.replace('name="star_camera" pos="0 0 0.081"', 'name="star_camera" pos="1.2 0 0.0"')
     lab = furnished_drum(tmp_path, far, drum, layout)
-    assert lab.camera.obstacles is not None
-    np.testing.assert_array_equal(
-        multibody.occluded(lab.camera.obstacles, Rotation.identity(), lab.camera.sources.place), [False, True]
-    )
+    np.testing.assert_array_equal(hidden_by_wall(lab), [False, True])
+
+
+def hidden_by_wall(lab: Lab) -> np.ndarray:
+    """(N,) which LEDs the dome's wall hides from a level camera."""
+    exposure = expected_exposure(lab.camera, Rotation.identity(), np.zeros(3), 0.0)
+    walls = [light.during(exposure).hides for light in lab.camera.lights if isinstance(light, DomeWall)]
+    (wall,) = walls
+    assert wall is not None
+    return wall.hides(lab.camera.sources.place)
 
 
 def furnished_drum(folder: Path, mjcf: str, drum: str, layout: str) -> Lab:

@@ -178,10 +178,10 @@ def test_what_a_flight_has_not_shown_is_named_with_what_would_do() -> None:
 @pytest.mark.parametrize(
     ("texts", "message"),
     [
-        (("10", "500 um", "0.1%", "0.03 deg", 1.0), "--inertia-sigma 10: allowed: 0.001 to 0.5"),
-        (("10%", "5 s", "0.1%", "0.03 deg", 1.0), "--offset-sigma: '5 s' is not a length"),
-        (("10%", "1 m", "0.1%", "0.03 deg", 1.0), "--offset-sigma 1 m: allowed: 1e-07 to 0.01 m"),
-        (("10%", "1 mm", "0.1%", "0.03 deg", -1.0), "--tacho-sigma -1: allowed: 0 to 1000 rpm"),
+        (("10", "500 um", "0.1%", "0.03 deg", 1.0), "balance.inertia_sigma: 10; allowed: 0.001 to 0.5"),
+        (("10%", "5 s", "0.1%", "0.03 deg", 1.0), "balance.offset_sigma: '5 s' is not a length"),
+        (("10%", "1 m", "0.1%", "0.03 deg", 1.0), "balance.offset_sigma: 1 m; allowed: 1e-07 to 0.01 m"),
+        (("10%", "1 mm", "0.1%", "0.03 deg", -1.0), "balance.tacho_sigma: -1; allowed: 0 to 1000 rpm"),
     ],
 )
 def test_wrong_uncertainties_are_refused(texts: tuple[str, str, str, str, float], message: str) -> None:
@@ -192,9 +192,9 @@ def test_wrong_uncertainties_are_refused(texts: tuple[str, str, str, str, float]
 
 def test_wrong_bars_are_refused() -> None:
     for torque, offset, message in (
-        ("5 m", None, "--torque: '5 m' is not a torque"),
-        ("0 N m", None, "--torque 0 N m: allowed: above 0"),
-        ("1e-5 N m", "1 s", "--offset-bar: '1 s' is not a length"),
+        ("5 m", None, "balance.torque: '5 m' is not a torque"),
+        ("0 N m", None, "balance.torque: 0 N m; allowed: above 0"),
+        ("1e-5 N m", "1 s", "balance.offset_bar: '1 s' is not a length"),
     ):
         with pytest.raises(InputError) as refused:
             procedure.parse_bars(torque, 1.0, offset)

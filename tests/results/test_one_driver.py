@@ -1,9 +1,10 @@
-"""The command line and Python run a scene by the same code: what they write is the same."""
+"""The command line and Python run a scene by the same code, which renders each frame once."""
 
 from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from astropy.table import Table
@@ -11,6 +12,7 @@ from typer.testing import CliRunner
 
 import skysim
 from skysim.apps.cli.main import app
+from skysim.simulation import exposure
 
 TIMES = ("time_ms",)  # of this run, not of the scene
 
@@ -38,3 +40,11 @@ def test_the_command_and_python_write_the_same_files(tmp_path: Path, name: str, 
     written = digests(tmp_path / "command")
     assert written == digests(tmp_path / "python")
     assert "frame_0001.fits" in written
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "cameras"), [("shefex2", 1), ("simsat_bump", 1), ("two_heads", 2)])
+def test_each_frame_of_each_camera_is_exposed_once_with_a_filter_or_without(name: str, cameras: int) -> None:
+    with mock.patch.object(exposure, "expose", wraps=exposure.expose) as exposed:
+        skysim.simulate(skysim.load_scene(name, {"exposure.frames": 2}))
+    assert exposed.call_count == 2 * cameras

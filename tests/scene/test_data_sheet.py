@@ -96,21 +96,21 @@ def test_a_lens_without_an_f_number_says_that_a_scene_must_give_it() -> None:
 @pytest.mark.parametrize(
     ("answers", "message"),
     [
-        ({"pixels": "1936"}, "--pixels: '1936': allowed: width x height, such as 1936x1216"),
-        ({"pixels": "99999x9"}, "--pixels: '99999x9': allowed: less than or equal to 20000"),
-        ({"pitch": "5.86"}, "--pitch: '5.86': allowed: a length with its unit, such as \"5.86 um\""),
-        ({"pitch": "5 m"}, "--pitch: '5 m': allowed: less than or equal to 0.01 m"),
-        ({"bits": "40"}, "--bits: '40': allowed: 1 to 16"),
-        ({"quantum_efficiency": "65"}, "--quantum-efficiency: '65': allowed: less than or equal to 1"),
-        ({"full_well": "1e999"}, "--full-well: '1e999': allowed: a number such as 10700"),
-        ({"full_well": "0"}, "--full-well: '0': allowed: greater than or equal to 1"),
-        ({"black_level": "5000"}, "--black-level: '5000': offset_dn 5000 is beyond the range of 12 bits"),
-        ({"gain": "0 DN/e-"}, "--gain: '0 DN/e-': allowed: greater than or equal to 0.000001"),
-        ({"shutter": "leaf"}, "--shutter: 'leaf': allowed: global, rolling, frame_transfer, interline"),
-        ({"row_time": "9 us"}, "--row-time: has no effect with a global shutter"),
-        ({"f_number": "2"}, "--f-number: has no effect without --focal-length"),
-        ({"read_noise": "nan"}, "--read-noise: 'nan': allowed: a number such as 3"),
-        ({"prnu": "-1 %"}, "--prnu: '-1 %': allowed: greater than or equal to 0"),
+        ({"pixels": "1936"}, "answers.pixels: '1936'; allowed: width x height, such as 1936x1216"),
+        ({"pixels": "99999x9"}, "answers.pixels: '99999x9'; allowed: less than or equal to 20000"),
+        ({"pitch": "5.86"}, "answers.pitch: '5.86'; allowed: a length with its unit, such as \"5.86 um\""),
+        ({"pitch": "5 m"}, "answers.pitch: '5 m'; allowed: less than or equal to 0.01 m"),
+        ({"bits": "40"}, "answers.bits: '40'; allowed: 1 to 16"),
+        ({"quantum_efficiency": "65"}, "answers.quantum_efficiency: '65'; allowed: less than or equal to 1"),
+        ({"full_well": "1e999"}, "answers.full_well: '1e999'; allowed: a number such as 10700"),
+        ({"full_well": "0"}, "answers.full_well: '0'; allowed: greater than or equal to 1"),
+        ({"black_level": "5000"}, "answers.black_level: '5000': 5000 is beyond the range of 12 bits"),
+        ({"gain": "0 DN/e-"}, "answers.gain: '0 DN/e-'; allowed: greater than or equal to 0.000001"),
+        ({"shutter": "leaf"}, "answers.shutter: 'leaf'; allowed: global, rolling, frame_transfer, interline"),
+        ({"row_time": "9 us"}, "answers.row_time: has no effect with a global shutter"),
+        ({"f_number": "2"}, "answers.f_number: has no effect without focal_length"),
+        ({"read_noise": "nan"}, "answers.read_noise: 'nan'; allowed: a number such as 3"),
+        ({"prnu": "-1 %"}, "answers.prnu: '-1 %'; allowed: greater than or equal to 0"),
     ],
 )
 def test_a_wrong_answer_is_refused_with_what_is_allowed(answers: dict[str, str], message: str) -> None:
@@ -121,5 +121,5 @@ def test_a_wrong_answer_is_refused_with_what_is_allowed(answers: dict[str, str],
 
 def test_size_and_pitch_are_required() -> None:
     assert set(REQUIRED) == set(PLACEHOLDERS)
-    with pytest.raises(InputError, match=r"^--pitch: missing; Pixel pitch"):
+    with pytest.raises(InputError, match=r"^answers\.pitch: missing; Pixel pitch"):
         fill({"pixels": "10x10"})

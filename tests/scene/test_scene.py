@@ -17,8 +17,8 @@ from skysim.camera.optics import VIGNETTING
 from skysim.camera.psf.otf import PSFS
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.quantities.tolerance import ErrorSchema, ToleranceConfig
-from skysim.core.quantities.units import SI_SUFFIX, ConfigModel
+from skysim.core.tolerance import ErrorSchema, ToleranceConfig
+from skysim.core.units import SI_SUFFIX, ConfigModel
 from skysim.dynamics.guidance import LEGS
 from skysim.dynamics.jitter import SPECTRA
 from skysim.dynamics.multibody.actuators.cmgs import STEERING
@@ -227,24 +227,24 @@ def test_an_override_may_add_a_section() -> None:
         (
             "exposure.time",
             "-1 ms",
-            "exposure.time: '-1 ms' is not allowed; it should be greater than or equal to 0.000001 (--set)",
+            "exposure.time: '-1 ms' is not allowed; allowed: greater than or equal to 0.000001 (overrides)",
         ),
         (
             "exposure.frames",
             "0",
-            "exposure.frames: 0 is not allowed; it should be greater than or equal to 1",
+            "exposure.frames: 0 is not allowed; allowed: greater than or equal to 1",
         ),
-        ("seed.x", "3", "--set seed.x: seed holds a value, not keys"),
-        ("seed", "[", "--set seed: '[' is not YAML"),
-        ("camera..bits", "3", "--set camera..bits=3: allowed: path.to.key=value"),
-        ("camera", "", "camera: None is not allowed; it should be a mapping of keys to values (--set)"),
+        ("seed.x", "3", "seed.x: seed holds a value, not keys (overrides)"),
+        ("seed", "[", "seed: '[' is not YAML (overrides)"),
+        ("camera..bits", "3", "overrides: camera..bits=3; allowed: path.to.key=value"),
+        ("camera", "", "camera: None is not allowed; allowed: a mapping of keys to values (overrides)"),
         ("exposure.time", "a\nb", "is not a time; allowed: a time such as"),
     ],
 )
 def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: str, says: str) -> None:
     message = complaint(SHEFEX, {key: value})
     assert says in message
-    assert "--set" in message
+    assert "overrides" in message
     assert str(SHEFEX) not in message
 
 
@@ -258,7 +258,7 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         (
             "falloff: inverse_square",
             "falloff: cubic",
-            "light.led.falloff: 'cubic' is not allowed; it should be 'inverse_square'",
+            "light.led.falloff: 'cubic' is not allowed; allowed: 'inverse_square'",
         ),
         (
             "  kind: dome",
@@ -268,12 +268,12 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         (
             "kind: ellipsoid",
             "kind: torus",
-            "light.surface.kind: 'torus' is not allowed; it should be 'sphere', ",
+            "light.surface.kind: 'torus' is not allowed; allowed: 'sphere', ",
         ),
         (
             "control: pid",
             "control: l q r",
-            "motion.control: 'l q r' is not allowed; it should match pattern",
+            "motion.control: 'l q r' is not allowed; allowed: text that matches the pattern",
         ),
         (
             'apex: "48 in"',
@@ -298,7 +298,7 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         (
             'apex: "48 in"',
             'apex: "-48 in"',
-            "light.surface.apex: '-48 in' is not allowed; it should be greater than",
+            "light.surface.apex: '-48 in' is not allowed; allowed: greater than",
         ),
         (
             '"38.88 in", "28.60 in"]',
@@ -308,7 +308,7 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         (
             'time: "10 ms"',
             'time: "-10 ms"',
-            "exposure.time: '-10 ms' is not allowed; it should be greater than or equal to 0.000001",
+            "exposure.time: '-10 ms' is not allowed; allowed: greater than or equal to 0.000001",
         ),
         ('time: "10 ms"', 'time: "nan ms"', "exposure.time: nan is not a finite number"),
         ('time: "10 ms"', 'time: "1e400 ms"', "exposure.time: inf is not a finite number"),
@@ -316,12 +316,12 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         (
             "preset: lu205c",
             "width_px: 1600.5\n  preset: lu205c",
-            "camera.width_px: 1600.5 is not allowed; it should be a valid integer",
+            "camera.width_px: 1600.5 is not allowed; allowed: a valid integer",
         ),
         (
             "preset: lu205c",
             "detector: {bits: 17}\n  preset: lu205c",
-            "camera.detector.bits: 17 is not allowed; it should be less than or equal to 16",
+            "camera.detector.bits: 17 is not allowed; allowed: less than or equal to 16",
         ),
         ("lit: [3, 6]", "lit: [3, 12]", "allowed: 1 <= least <= most <= 9"),
         ("lit: [3, 6]", "lit: [3]", "light.layout.lit.1: missing"),
@@ -335,11 +335,11 @@ def test_a_bad_override_is_one_line_and_blamed_on_the_option(key: str, value: st
         ("schema: 1", "schema: 2", "schema: version 2 is newer than skysim "),
         ("schema: 1", "schema: 0", "schema: version 0 is no longer supported; allowed: 1"),
         ("schema: 1", "schema: yes", "schema: unknown version True; allowed: 1"),
-        ("seed: 1\n", "seed: one\n", "seed: 'one' is not allowed; it should be a valid integer"),
+        ("seed: 1\n", "seed: one\n", "seed: 'one' is not allowed; allowed: a valid integer"),
         (
             "2012-03-01T12:00:00",
             "yesterday",
-            "start_time: 'yesterday' is not allowed; it should be a valid datetime",
+            "start_time: 'yesterday' is not allowed; allowed: a valid datetime",
         ),
         ("title: AFIT", "name: x\ntitle: AFIT", "name: unknown key"),
         (
@@ -374,12 +374,12 @@ def test_a_slip_is_answered_with_its_key_what_is_allowed_and_its_line(
         (
             "ra_deg: 83.0",
             "ra_deg: 400",
-            "motion.start.ra_deg: 400 is not allowed; it should be less than 360",
+            "motion.start.ra_deg: 400 is not allowed; allowed: less than 360",
         ),
         (
             "dec_deg: 2.0",
             "dec_deg: -91",
-            "motion.start.dec_deg: -91 is not allowed; it should be greater than",
+            "motion.start.dec_deg: -91 is not allowed; allowed: greater than",
         ),
         ("ra_deg: 83.0", "ra_deg: .nan", "motion.start.ra_deg: nan is not a finite number"),
         (
@@ -503,7 +503,7 @@ def test_a_kind_that_is_none_is_answered_with_those_that_are(
             "ccd",
             "unknown curve 'ccd'; allowed: cmos, interline, thick_ccd",
         ),
-        ("camera.detector.offset_dn", "1024", "offset_dn 1024 is beyond the range of 10 bits"),
+        ("camera.detector.offset_dn", "1024", "camera.detector.offset_dn: 1024 is beyond the range of 10 bits"),
     ],
 )
 def test_a_slip_within_a_kind_is_told_of_that_kind_alone(key: str, value: str, says: str) -> None:
@@ -550,15 +550,15 @@ UNLOAD = "{start: 2 N m s, stop: 1 N m s}"
         ),
         (
             {"tracker.exposure_control": "{mean_dn: 150, shortest: 60 ms}"},
-            "tracker.exposure_control: shortest 0.06 s is above longest 0.05 s",
+            "tracker.exposure_control.shortest: 0.06 s is above longest 0.05 s",
         ),
         (
             {"tracker.exposure_control": "{mean_dn: 150, longest: 11 s}"},
-            "tracker.exposure_control.longest: '11 s' is not allowed; it should be less than or equal to 10",
+            "tracker.exposure_control.longest: '11 s' is not allowed; allowed: less than or equal to 10",
         ),
         (
             {"tracker.exposure_control": "{mean_dn: 150, step: 0.1 us}"},
-            "tracker.exposure_control.step: '0.1 us' is not allowed; it should be greater than or equal to 0.000001",
+            "tracker.exposure_control.step: '0.1 us' is not allowed; allowed: greater than or equal to 0.000001",
         ),
         ({"tracker.exposure_control": "{step: 2 ms}"}, "tracker.exposure_control.mean_dn: missing"),
         (
@@ -587,23 +587,23 @@ UNLOAD = "{start: 2 N m s, stop: 1 N m s}"
         ),
         (
             {"motion.control": f"{{desaturation: {UNLOAD.replace('2', '0.5')}}}"},
-            "motion.control.desaturation: stop 1 N m s is not below start 0.5 N m s",
+            "motion.control.desaturation.stop: 1 N m s is not below start 0.5 N m s",
         ),
         (
             {"motion.maneuver": "[{kind: bump, rate_deg_s: [1, 2, 3], duration: 40 ms, caught_after: 30 ms}]"},
-            "motion.maneuver.0: caught_after 0.03 s is before the impulse ends",
+            "motion.maneuver.0.caught_after: 0.03 s is before the impulse ends",
         ),
     ],
 )
 def test_what_does_not_go_together_is_one_line(changes: dict[str, str], says: str) -> None:
-    assert complaint(AFIT, changes) == f"{says} (--set)"
+    assert complaint(AFIT, changes) == f"{says} (overrides)"
 
 
 @pytest.mark.parametrize(
     ("key", "value", "says"),
     [
         *(
-            ("vehicle.disturbances", value, "vehicle: disturbances: a free vehicle has none; allowed: mount:")
+            ("vehicle.disturbances", value, "vehicle.disturbances: a free vehicle has none; allowed: mount:")
             for value in (
                 "{earth_rotation: true}",
                 "{turbine: [0 N m, 0 N m, 1 mN m]}",
@@ -615,7 +615,7 @@ def test_what_does_not_go_together_is_one_line(changes: dict[str, str], says: st
             (
                 "vehicle.imu",
                 f"{{earth_rate: {rate}}}",
-                "vehicle: imu.earth_rate: a free vehicle is not on the Earth; allowed: none",
+                "vehicle.imu.earth_rate: a free vehicle is not on the Earth; allowed: none",
             )
             for rate in ("compensated", "uncompensated")
         ),
@@ -634,7 +634,7 @@ def test_a_free_vehicle_is_in_no_room(key: str, value: str, says: str) -> None:
         (
             "vehicle.wheels",
             "{coulomb: -1 mN m}",
-            "vehicle.wheels.coulomb: '-1 mN m' is not allowed; it should be gr",
+            "vehicle.wheels.coulomb: '-1 mN m' is not allowed; allowed: gr",
         ),
         (
             "vehicle.wheels",
@@ -645,8 +645,8 @@ def test_a_free_vehicle_is_in_no_room(key: str, value: str, says: str) -> None:
         ("vehicle.fans", "{thrust_limit: 1 N m}", "'1 N m' is not a force; allowed: a force such as"),
         ("vehicle.drag", "{viscous: 1 N m}", "vehicle.drag.viscous: '1 N m' is not a torque per rate; allow"),
         ("vehicle.drag", "{quadratic: 1 N m s}", "'1 N m s' is not a torque per squared rate; allowed: a t"),
-        ("vehicle.cmgs", "{steering: magic}", "it should be 'pseudo_inverse' or 'singularity_robust'"),
-        ("vehicle.cmgs", "{gimbal_time_constant: 1 ms}", "should be greater than or equal to 0.005"),
+        ("vehicle.cmgs", "{steering: magic}", "allowed: 'pseudo_inverse' or 'singularity_robust'"),
+        ("vehicle.cmgs", "{gimbal_time_constant: 1 ms}", "allowed: greater than or equal to 0.005"),
         ("vehicle.disturbances", "{cable: {}}", "vehicle.disturbances.cable.stiffness: missing"),
         (
             "vehicle.disturbances",
@@ -658,32 +658,32 @@ def test_a_free_vehicle_is_in_no_room(key: str, value: str, says: str) -> None:
             "{air_current: {rms: [1 N m]}}",
             "vehicle.disturbances.air_current.rms.1: missing",
         ),
-        ("vehicle.imu", "{earth_rate: maybe}", "it should be 'none', 'uncompensated' or 'compensated'"),
+        ("vehicle.imu", "{earth_rate: maybe}", "allowed: 'none', 'uncompensated' or 'compensated'"),
         ("vehicle.imu", "{gyro: {arw: 3}}", "vehicle.imu.gyro.arw: unknown key; allowed: arw_deg_sqrt_h, "),
         ("motion.control", "{law: pid, options: {a: 1}}", "motion.control: options has no effect with law pid; allo"),
         ("motion.control", "{law: prescribed, damping: 1}", "motion.control: damping has no effect with law prescr"),
-        ("motion.control", "{rate_hz: 0.5}", "motion.control.rate_hz: 0.5 is not allowed; it should be gr"),
-        ("motion.control", "true", "motion.control: True is not allowed; it should be a mapping of keys to"),
+        ("motion.control", "{rate_hz: 0.5}", "motion.control.rate_hz: 0.5 is not allowed; allowed: gr"),
+        ("motion.control", "true", "motion.control: True is not allowed; allowed: a mapping of keys to"),
         (
             "site",
             "{latitude_deg: 91}",
-            "site.latitude_deg: 91 is not allowed; it should be less than or equal",
+            "site.latitude_deg: 91 is not allowed; allowed: less than or equal",
         ),
-        ("filter", "{latency: -1 s}", "filter.latency: '-1 s' is not allowed; it should be greater than or"),
+        ("filter", "{latency: -1 s}", "filter.latency: '-1 s' is not allowed; allowed: greater than or"),
         (
             "filter",
             "{considered: [gain]}",
-            "it should be 'bias', 'scale', 'misalignment', 'mounting' or 'systematic'",
+            "allowed: 'bias', 'scale', 'misalignment', 'mounting' or 'systematic'",
         ),
-        ("filter", "{wrong_share: 1}", "filter.wrong_share: 1 is not allowed; it should be less than 1"),
-        ("filter", "{scale_ppm: -1}", "filter.scale_ppm: -1 is not allowed; it should be greater than or"),
-        ("filter", "{systematic_time: 0 s}", "filter.systematic_time: '0 s' is not allowed; it should be greater than"),
+        ("filter", "{wrong_share: 1}", "filter.wrong_share: 1 is not allowed; allowed: less than 1"),
+        ("filter", "{scale_ppm: -1}", "filter.scale_ppm: -1 is not allowed; allowed: greater than or"),
+        ("filter", "{systematic_time: 0 s}", "filter.systematic_time: '0 s' is not allowed; allowed: greater than"),
     ],
 )
 def test_a_slip_in_what_flies_is_told_with_its_key(key: str, value: str, says: str) -> None:
     message = complaint(AFIT, {key: value})
     assert says in message
-    assert message.endswith("(--set)")
+    assert message.endswith("(overrides)")
 
 
 @pytest.mark.parametrize("kind", ["hold", "jitter", "bump"])
@@ -796,11 +796,11 @@ def test_a_slip_is_told_with_the_file_in_which_it_stands(tmp_path: Path) -> None
     """Its own where it is above, the base's where it is there; a section between is in both."""
     lower = written(tmp_path, "lower.yaml", "schema: 1\nbase: afit_simsat\nexposure:\n  frames: 0\n  rate_hz: 2\n")
     mine = written(tmp_path, "mine.yaml", "schema: 1\nbase: lower.yaml\nseed: 3\nexposure:\n  rate_hz: 1\n")
-    says = "exposure.frames: 0 is not allowed; it should be greater than or equal to 1"
+    says = "exposure.frames: 0 is not allowed; allowed: greater than or equal to 1"
     assert complaint(mine) == f"{says} ({lower}, line 4)"
     mine.write_text("schema: 1\nbase: lower.yaml\nseed: 3\n\nexposure:\n  rate_hz: 1\n  frames: -1\n")
     assert complaint(mine) == f"{says.replace('0 is', '-1 is')} ({mine}, line 7)"
-    assert complaint(mine, {"exposure.frames": "0"}) == f"{says} (--set)"
+    assert complaint(mine, {"exposure.frames": "0"}) == f"{says} (overrides)"
 
 
 def test_what_is_missing_in_a_list_is_not_looked_for_in_the_base_s(tmp_path: Path) -> None:
@@ -852,14 +852,14 @@ def test_a_lens_is_focused_at_infinity_unless_told_otherwise() -> None:
 def test_a_focus_nearer_than_twice_the_focal_length_is_refused(tmp_path: Path, focus: str) -> None:
     """There the image would be greater than the object; at the focal length there is none at all."""
     message, _ = spoilt(tmp_path, AFIT, 'focus: "33 in"', f'focus: "{focus}"')
-    assert re.match(r"camera: focus \S+ m is less than twice the focal length 0.035 m \(", message)
+    assert re.match(r"camera.focus: \S+ m is less than twice the focal length 0.035 m \(", message)
 
 
 @pytest.mark.parametrize(
     ("focus", "says"),
     [
-        ("0 m", "camera.focus: '0 m' is not allowed; it should be greater than 0"),
-        ("-33 in", "camera.focus: '-33 in' is not allowed; it should be greater than 0"),
+        ("0 m", "camera.focus: '0 m' is not allowed; allowed: greater than 0"),
+        ("-33 in", "camera.focus: '-33 in' is not allowed; allowed: greater than 0"),
         ("nan m", "camera.focus: 'nan m' is not allowed"),
         ("far", "camera.focus: 'far' is not a length; allowed: a length such as \"33 in\", or infinity"),
         ("33", 'camera.focus: 33 has no unit; allowed: a length such as "33 in", or infinity'),
@@ -883,12 +883,12 @@ def test_a_missing_section_is_named(tmp_path: Path) -> None:
 def test_an_exposure_longer_than_its_period_is_refused(tmp_path: Path) -> None:
     message, place = spoilt(tmp_path, AFIT, 'time: "10 ms"', 'time: "10 s"')
     late = "plus trigger_jitter 0.0001 s"
-    assert message == f"exposure: time 10.0 s {late} is longer than the frame period 0.5 s {place}"
+    assert message == f"exposure.time: 10.0 s {late} is longer than the frame period 0.5 s {place}"
 
 
 def test_a_maneuver_without_a_controller_is_refused(tmp_path: Path) -> None:
     message, _ = spoilt(tmp_path, AFIT, "control: pid", "control: none")
-    allowed = "such as control: pid; allowed without one: maneuver: []"
+    allowed = "such as control: pid; allowed: maneuver: [] without one"
     assert message.startswith(f"motion: a maneuver requires a controller, {allowed}")
 
 

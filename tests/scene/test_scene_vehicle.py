@@ -90,7 +90,7 @@ WRONG = [
     ),
     (
         {"motion.control": "{desaturation: {start: 1 N m s, stop: 1 N m s}}"},
-        "stop 1 N m s is not below start 1 N m s",
+        "desaturation.stop: 1 N m s is not below start 1 N m s",
     ),
     (
         {"motion.control": "{rate_hz: 300}"},
@@ -115,7 +115,7 @@ WRONG = [
     ({"motion.control": "none"}, "a maneuver requires a controller, such as control: pid"),
     (
         {"motion.maneuver": "[{kind: bump, rate_deg_s: [1, 0, 0], duration: 50 ms, caught_after: 40 ms}]"},
-        "caught_after 0.04 s is before the impulse ends",
+        "caught_after: 0.04 s is before the impulse ends",
     ),
     ({"vehicle.wheels": "{coulomb: 2 mN}"}, "'2 mN' is not a torque"),
     ({"vehicle.drag": "{viscous: 0.1}"}, "0.1 has no unit"),

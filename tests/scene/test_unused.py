@@ -213,7 +213,7 @@ def test_a_key_without_effect_is_refused(case: Case) -> None:
     assert message.startswith(f"{case.key}")
     assert ": has no effect: " in message
     assert "; allowed: " in message
-    assert message.endswith("(--set)")
+    assert message.endswith("(overrides)")
     if case.useful:
         loader.load(case.scene, settings | {case.key: case.value} | case.useful)
 

@@ -10,7 +10,9 @@ from skysim.core.errors import InputError
 from skysim.core.types import Frame, Truth
 from skysim.scene.loader import load
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import Lab, build_lab, build_tracker, sky_during
+from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.lights.air import Atmosphere, Skyline
+from skysim.simulation.lights.light import find_light
 from skysim.sources.air import scintillation
 from skysim.tracking.factory import solve_frame
 
@@ -33,9 +35,9 @@ def lab_of(**keys: str) -> Lab:
 
 def level(lab: Lab, altitude_deg: float) -> Rotation:
     """cam_from_icrs of a camera toward the south at an altitude, the zenith up in its image."""
-    sky = sky_during(lab.camera, 0.0)
-    assert sky is not None
-    north, _, up = sky.axes
+    atmosphere = find_light(lab.camera.lights, Atmosphere)
+    assert atmosphere is not None
+    north, _, up = atmosphere.air.at(lab.scene.start_time).axes
     h = np.radians(altitude_deg)
     z, y = -np.cos(h) * north + np.sin(h) * up, -np.sin(h) * north - np.cos(h) * up
     return Rotation.from_matrix(np.stack([np.cross(y, z), y, z]))
@@ -55,7 +57,8 @@ def test_stars_are_raised_and_dimmed_in_the_frame() -> None:
     """Against the same frame without air: up in the image by A tan Z + B tan^3 Z, fainter by Kasten & Young's law."""
     lab = lab_of()
     through = truth_at(lab, 30.0).sources
-    without = render_toward(lab.with_camera(air=None), level(lab, 30.0))[1].sources
+    airless = tuple(light for light in lab.camera.lights if not isinstance(light, Atmosphere | Skyline))
+    without = render_toward(lab.with_camera(lights=airless), level(lab, 30.0))[1].sources
     both, ours, bare = np.intersect1d(through.id, without.id, return_indices=True)
     assert len(both) > 30
     focal_px = lab.scene.camera.focal_px
@@ -134,7 +137,8 @@ def test_air_needs_a_site() -> None:
 
 def errors_arcsec(lab: Lab, altitude_deg: float, index: int = 0) -> tuple[float, float]:
     """Error across the boresight and rms residual in px of a frame."""
-    cam_from_lab = level(lab, altitude_deg) if lab.camera.air else level(lab_of(), altitude_deg)
+    has_air = find_light(lab.camera.lights, Atmosphere) is not None
+    cam_from_lab = level(lab if has_air else lab_of(), altitude_deg)
     frame, truth = render_toward(lab, cam_from_lab, index)
     attitude = solve_frame(build_tracker(lab.camera), frame).attitude
     assert attitude.cam_from_ref is not None

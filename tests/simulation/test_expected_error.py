@@ -12,13 +12,14 @@ from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.results import metrics
 from skysim.results.simulate import render_at
 from skysim.scene import loader
-from skysim.simulation.checks import attitudes, beliefs, detection, expected_error, plan
+from skysim.simulation.checks import attitudes, beliefs, detection, expected_error, sampling
 from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, fit_loss, timing_sigma_s
 from skysim.simulation.checks.expected_error import Common, Independent, covariance, gains
-from skysim.simulation.checks.views import View, image_gradient, peak_share, view
-from skysim.simulation.exposure import render_frame
+from skysim.simulation.checks.views import VISIBLE, View, image_gradient, peak_share, view
+from skysim.simulation.exposure import expected_exposure, render_frame
 from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.lights.light import beam_of
 from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.sources.dome.led import lit_moments_s
 from skysim.tracking import factory
@@ -129,7 +130,7 @@ def test_a_fitted_focal_length_has_no_error_in_the_attitude() -> None:
         keys = {"tracker.identifier": identifier, "tracker.assumed_focal_length": f"{focal_length} mm"}
         lab = build_lab(loader.load("afit_simsat", uneven | keys))
         context = detection.context_of(lab)
-        samples = plan.sampled(attitudes.of_frames(lab), context)
+        samples = sampling.sampled(attitudes.of_frames(lab), context)
         error = samples.error.total("cross")
         found[identifier, focal_length] = samples.error.cross_rad2["focal length"].max(), error.mean()
         cam_from_body = lab.camera.mount.cam_from_body
@@ -173,7 +174,11 @@ def test_positions_electrons_peaks_and_paths_are_the_renderer_s(name: str, rate_
     context = detection.context_of(lab)
     rate = np.radians([rate_deg_s, 0.0, 0.0])
     _, truth = render_moving(lab, lab.start, rate)
-    seen = view(lab, lab.camera.sources, lab.start, rate, context.camera)
+    exposure = expected_exposure(lab.camera, lab.start, rate, 0.0)
+    beam = beam_of(lab.camera.lights, exposure)
+    (lit,) = (lit for lit in beam.lits if lit.known)
+    seen = view(lit, exposure, context.camera, beam.before(lit))
+    seen = seen.take(seen.behind == VISIBLE)
     _, row, other = np.intersect1d(lab.camera.sources.id[seen.row], truth.sources.id, return_indices=True)
     assert len(row) == len(seen) > 10
     inside = np.minimum(seen.xy_px, np.array(lab.camera.canvas.shape[::-1]) - seen.xy_px).min(axis=1)[row] > 30
@@ -229,7 +234,7 @@ def variances_of(survey: dict[str, str]) -> dict[str, Floats]:
     none = {"led_sigma": "0 mm", "lever_sigma": "0 mm"}
     lab = build_lab(loader.load("afit_simsat", keyed(none | survey)))
     context = detection.context_of(lab)
-    found = plan.sampled(attitudes.of_frames(lab), context).error
+    found = sampling.sampled(attitudes.of_frames(lab), context).error
     return {name: np.array([found.cross_rad2[name].mean(), found.roll_rad2[name].mean()]) for name in found.cross_rad2}
 
 
@@ -292,7 +297,7 @@ def random_attitude(lab: Lab, frames: Attitudes, rng: np.random.Generator) -> Ro
 
 def expected_at(context: Context, lab_from_body: Rotation, rate_rad_s: Floats) -> tuple[float, float]:
     at = Attitudes(Rotation.concatenate([lab_from_body]), rate_rad_s[None], np.zeros(1))
-    return tuple(value * ARCSEC_RAD for value in plan.sampled(at, context).error.rms_arcsec())  # type: ignore[return-value]
+    return tuple(value * ARCSEC_RAD for value in sampling.sampled(at, context).error.rms_arcsec())  # type: ignore[return-value]
 
 
 @pytest.mark.long
@@ -338,12 +343,12 @@ def test_an_angular_acceleration_shifts_images_by_the_mean_of_its_parabola() -> 
     assert len(shift_px) > 20
     assert np.abs(shift_px - seen.bend_px[predicted]).max() < 0.02 * np.abs(shift_px).max()
     at = Attitudes(Rotation.concatenate([lab_from_body]), np.zeros((1, 3)), np.zeros(1), about_body[None])
-    sampled = plan.sampled(at, context).error.cross_rad2["angular acceleration"]
+    sampled = sampling.sampled(at, context).error.cross_rad2["angular acceleration"]
     assert np.sqrt(sampled[0]) / ARCSEC_RAD == pytest.approx(3600 * acceleration_deg_s2 * exposure_s**2 / 24, rel=0.01)
 
 
 def test_an_expected_error_is_no_number_with_two_lights(stars: Lab) -> None:
     context = detection.context_of(stars)
     at = attitudes.of_frames(stars)
-    few = [one.take(np.arange(2)) for one in plan.sampled(at, context).used]
+    few = [one.take(np.arange(2)) for one in sampling.sampled(at, context).used]
     assert np.isnan(expected_error.expected(few, at, context).rms_arcsec()).all()

@@ -16,8 +16,9 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.dynamics import multibody
 from skysim.scene import loader
-from skysim.simulation.checks import attitudes, check, detection, facts, plan
-from skysim.simulation.checks.facts import Fact, Samples
+from skysim.simulation.checks import attitudes, check, detection, facts, plan, sampling
+from skysim.simulation.checks.facts import Fact
+from skysim.simulation.checks.sampling import Samples
 from skysim.simulation.checks.sky import claims, depth
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import Flight, simulate_motion
@@ -54,7 +55,7 @@ def samples_of(lab: Lab) -> tuple[detection.Context, Samples]:
     context = detection.context_of(lab)
     frames = attitudes.of_frames(lab)
     reach = attitudes.within_reach(lab.scene, lab.camera.mount, frames)
-    return context, Samples(plan.sampled(frames, context), plan.sampled(reach, context))
+    return context, Samples(sampling.sampled(frames, context), sampling.sampled(reach, context))
 
 
 # Attitudes
@@ -139,7 +140,7 @@ def test_the_least_lights_are_where_it_says() -> None:
     there = attitudes.Attitudes(
         Rotation.from_euler("ZYX", [[yaw, pitch, roll]], degrees=True), np.zeros((1, 3)), np.full(1, np.nan)
     )
-    assert len(plan.sampled(there, context).used[0]) == pytest.approx(samples.reach.counts().min(), abs=1)
+    assert len(sampling.sampled(there, context).used[0]) == pytest.approx(samples.reach.counts().min(), abs=1)
 
 
 @pytest.mark.slow

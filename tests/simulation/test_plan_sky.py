@@ -13,8 +13,8 @@ from skysim.scene import loader
 from skysim.simulation.checks import attitudes, findings
 from skysim.simulation.checks.detection import Context, context_of
 from skysim.simulation.checks.dome import reflections
-from skysim.simulation.checks.facts import Samples
-from skysim.simulation.checks.plan import check, sampled
+from skysim.simulation.checks.plan import check
+from skysim.simulation.checks.sampling import Samples, sampled
 from skysim.simulation.checks.sky import air, depth, stray
 from skysim.simulation.flight import Flight
 from skysim.simulation.lab import build_lab, build_tracker

@@ -106,7 +106,7 @@ def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
             "actuators has no effect with law prescribed",
         ),
         ({"motion.start": "profile"}, "start: profile requires a first maneuver of kind profile"),
-        ({"motion.start": "rest"}, "motion.start: 'rest' is not allowed; it should be 'profile'"),
+        ({"motion.start": "rest"}, "motion.start: 'rest' is not allowed; allowed: 'profile'"),
         ({"motion.maneuver": [{"kind": "slew", "roll_deg": 40}], "exposure.frames": 30}, "tilt of 30.1 deg at"),
     ],
 )

@@ -147,7 +147,7 @@ def test_stars_are_extinct_by_air_mass_and_color() -> None:
     cat = catalog.read_for("x", "hipparcos_hp6.5")
     all_stars = stars.sources(cat, time, None, _identity(), BAND)
     sky = air.at(time)
-    seen = sky.stars_seen(all_stars)
+    seen = sky.points_seen(all_stars)
     altitude = horizontal(sky.axes, seen.place[:, :3])[1]
     high = (altitude > np.radians(5)) & np.isfinite(cat.b_v) & (np.abs(cat.b_v) > 0.01) & (cat.b_v < 1.5)
     high &= cat.v_i != 0

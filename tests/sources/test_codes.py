@@ -10,6 +10,7 @@ from skysim.scene import loader
 from skysim.scene.sections.leds import CyclicCodeConfig, PlainCodeConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import build_lab
+from skysim.simulation.lights.dome import LedDome
 from skysim.sources.dome.timing.clocks import Clocks
 from skysim.sources.dome.timing.codebooks import codebook, light_levels
 from skysim.sources.dome.timing.codes import LedCodes
@@ -70,10 +71,14 @@ def test_a_bit_of_several_levels_fails_to_any_other_level() -> None:
 def test_a_run_s_code_begins_anywhere_and_its_clock_is_the_hardware_s() -> None:
     settings = {"light.led.code": "{kind: cyclic, bit_time: 20 ms}", "light.led.clock": "{offset_ppm: 50}"}
     lab = build_lab(loader.load(SCENE, settings))
-    runs = [lab.in_run(seed).camera.codes for seed in (5, 6)]
+    dome = lab.camera.known
+    assert isinstance(dome, LedDome)
+    runs = [dome.timing(seed).codes for seed in (5, 6)]
     assert runs[0].clock.offset == runs[1].clock.offset
     assert abs(runs[0].clock.on_s - runs[1].clock.on_s) > 1
-    assert build_lab(loader.load("afit_simsat")).camera.codes is None
+    plain = build_lab(loader.load("afit_simsat")).camera.known
+    assert isinstance(plain, LedDome)
+    assert plain.timing(5).codes is None
 
 
 def test_a_rendered_led_has_the_light_of_its_bits() -> None:
@@ -83,7 +88,9 @@ def test_a_rendered_led_has_the_light_of_its_bits() -> None:
     truths = [render_at_rest(lab.camera, lab.start, index)[1].sources for index in (2, 9)]
     assert len(truths[0].id) >= 3
     row = np.searchsorted(lab.camera.sources.id, truths[0].id)
-    expected = [np.where(lab.camera.codes.words[row, bit], 1.0, 0.75) for bit in (2, 9)]
+    assert isinstance(lab.camera.known, LedDome)
+    words = lab.camera.known.timing(lab.scene.seed).codes.words
+    expected = [np.where(words[row, bit], 1.0, 0.75) for bit in (2, 9)]
     assert len(set((expected[0] / expected[1]).tolist())) > 1
     np.testing.assert_array_equal(truths[0].id, truths[1].id)
     np.testing.assert_allclose(truths[0].electrons / truths[1].electrons, expected[0] / expected[1], rtol=1e-6, atol=0)

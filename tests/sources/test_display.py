@@ -16,7 +16,8 @@ from skysim.scene import loader
 from skysim.scene.sections import layouts
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import Lab, build_lab, light_sources
+from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lights.dome import LedDome
 from skysim.simulation.timing import exposure_window
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
@@ -253,8 +254,10 @@ def test_on_the_frame_rows_are_dark_whose_turn_is_not_in_the_exposure() -> None:
     dark = dark_lab.camera
     steady = build_lab(loader.load("nps_tas2", changes | {"light.led.drive": "{kind: direct}"}))
     window = exposure_window(dark.scene, 0)
-    assert dark.clocks is not None
-    trains = dark.clocks.pulses_at(dark.sources, window.middle_s(dark.scene.camera.height_px))
+    assert isinstance(dark.known, LedDome)
+    clocks = dark.known.timing(dark.run_seed).clocks
+    assert clocks is not None
+    trains = clocks.pulses_at(dark.sources, window.middle_s(dark.scene.camera.height_px))
     looks = window.open_s + (np.arange(20_000) + 0.5) / 20_000 * window.exposure_s
     (_, flickering), (_, full) = still_frame(dark_lab), still_frame(steady)
     all_e = dict(zip(full.sources.id.tolist(), full.sources.electrons, strict=True))
@@ -440,10 +443,13 @@ def test_the_glow_is_on_the_frame_and_nothing_glows_without_a_contrast() -> None
         ),
         (
             {"light.led.drive": "{kind: pwm}"},
-            "light: led.drive: pwm cannot drive an lcd; allowed: direct",
+            "light.led.drive: pwm cannot drive an lcd; allowed: direct",
         ),
         ({"light.led.drive.duty": "0"}, "light.led.drive.duty: 0 is not allowed"),
-        ({"light.layout.block": "2000"}, "block 2000 is wider than the display; allowed: up to 1050 pixels"),
+        (
+            {"light.layout.block": "2000"},
+            "light.layout.block: 2000 is wider than the display; allowed: up to 1050 pixels",
+        ),
         ({"light.layout.gray_levels": "1"}, "light.layout.gray_levels: 1 is not allowed"),
         (
             {"light.layout.points.kind": "patch_boards"},
@@ -499,7 +505,7 @@ def test_a_wrong_display_is_told_in_one_line(name: str, overrides: dict[str, str
 
 def assert_refused(name: str, overrides: dict[str, str], says: str) -> None:
     with pytest.raises(InputError) as caught:
-        light_sources(loader.load(name, overrides), BAND)
+        build_lab(loader.load(name, overrides))
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
 

@@ -517,7 +517,7 @@ def test_a_bad_file_is_told_in_one_line(tmp_path: Path, text: str, says: str) ->
         ("{kind: patch_boards, cap_deg: 30, pitch: 8 mm}", "patch_boards takes spacing, or boards by list"),
         (
             "{kind: patch_boards, cap_deg: 30, pitch: 8 mm, boards: [{azimuth_deg: 0, tilt_deg: 0, leds: [1, 1]}]}",
-            "light.layout.boards.0: leds: [1, 1] has a duplicate hole",
+            "light.layout.boards.0.leds: [1, 1] has a duplicate hole",
         ),
         (
             "{kind: patch_boards, cap_deg: 30, pitch: 8 mm, boards: [{azimuth_deg: 0, tilt_deg: 0, leds: [9]}]}",
@@ -658,7 +658,7 @@ def test_a_layout_without_boards_needs_to_be_told_its_controllers() -> None:
         "light.layout": "{kind: fibonacci, cap_deg: 30, count: 9}",
         "light.led.drive": "{kind: sequential}",
     }
-    assert_refused(spread, "light: led.drive.controller: fibonacci has no boards; allowed: dome, or a number of LEDs")
+    assert_refused(spread, "light.led.drive.controller: fibonacci has no boards; allowed: dome, or a number of LEDs")
     assert_refused(
         {"light.led.drive": "{kind: fm}"},
         "light.led.drive.kind: unknown kind 'fm'; allowed: direct, pwm, sequential",

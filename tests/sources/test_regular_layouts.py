@@ -301,9 +301,9 @@ def test_controllers_along_a_tape_light_their_leds_in_turn() -> None:
 @pytest.mark.parametrize(
     ("layout", "complaint"),
     [
-        ("{kind: geodesic, frequency: 3, class: II, cap_deg: 30}", "3 is odd; allowed with class: II: even"),
+        ("{kind: geodesic, frequency: 3, class: II, cap_deg: 30}", "3 is odd, with class: II; allowed: even"),
         ("{kind: geodesic, frequency: 0, cap_deg: 30}", "frequency: 0 is not allowed"),
-        ("{kind: geodesic, frequency: 4, class: III, cap_deg: 30}", "class: 'III' is not allowed; it should be 'I'"),
+        ("{kind: geodesic, frequency: 4, class: III, cap_deg: 30}", "class: 'III' is not allowed; allowed: 'I'"),
         ("{kind: geodesic, frequency: 4, lit_fraction: 0, cap_deg: 30}", "lit_fraction: 0 is not allowed"),
         ("{kind: string, pitch: 1 cm, cap_deg: 30}", "light.layout.spacing: missing"),
         ("{kind: string, pitch: 0.1 mm, spacing: 1 cm, cap_deg: 30}", "light.layout.pitch: '0.1 mm' is not allowed"),

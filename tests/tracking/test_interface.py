@@ -24,7 +24,7 @@ from skysim.apps.cli import main
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.paths import ROOT
-from skysim.core.plugins.program import ProgramError
+from skysim.core.plugins import ProgramError
 from skysim.experiments import tracker_comparison
 from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study.execution import runner, setups, store

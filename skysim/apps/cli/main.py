@@ -26,7 +26,7 @@ from skysim.apps.cli.commands.stream import stream
 from skysim.apps.cli.commands.study import app as studies
 from skysim.apps.cli.commands.validate import check, validate
 from skysim.apps.cli.examples import add_examples
-from skysim.apps.cli.options import with_location
+from skysim.apps.cli.option_names import as_typed
 from skysim.apps.cli.terminal import print_error
 from skysim.core import __version__, errors
 from skysim.core.errors import InputError
@@ -96,8 +96,10 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # clean up after SIGTERM as after Ctrl-C
     try:
         code = app(standalone_mode=False)
-    except (InputError, ImageError) as error:
-        code = print_error(with_location(str(error)))
+    except InputError as error:
+        code = print_error(str(as_typed(error)))
+    except ImageError as error:
+        code = print_error(str(error))
     except OSError as error:
         code = print_error(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except (MemoryError, OverflowError) as error:

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from skysim.scene.scene import Scene
 
 # Loaded scenes: name and command-line overrides, for the locations in error messages.
-LOADED: list[tuple[str, dict[str, str]]] = []
+Loaded = tuple[str, dict[str, str]]
+LOADED: list[Loaded] = []
+TYPED: dict[str, str] = {}  # keys of the scene that options of their own have set, with the option
 
 
 def complete_scene(incomplete: str) -> list[str]:
@@ -79,13 +81,17 @@ def load(
     from skysim.scene import unused
     from skysim.scene.loader import load as load_scene
 
+    TYPED.clear()
     values = parse_overrides(overrides)
     if frames is not None:
         values["exposure.frames"] = str(frames)
+        TYPED["exposure.frames"] = "--frames"
     if seed is not None:
         values["seed"] = str(seed)
+        TYPED["seed"] = "--seed"
     if trackers:
         values["tracker.name"] = trackers[0]
+        TYPED["tracker.name"] = "--tracker"
     LOADED.append((name, values))
     scene = load_scene(name, values, refuses_unused=not trackers)
     if trackers:
@@ -101,10 +107,8 @@ def used_programs(options: list[str] | None, names: Iterable[str | None]) -> dic
     programs, used = process.program_commands(options), set(names)
     for name in programs:
         if name not in used:
-            raise InputError(
-                f"--program {name}: has no effect: nothing has this name; allowed: that of --tracker, tracker.name or"
-                " motion.control.law"
-            )
+            problem = "has no effect: nothing has this name"
+            raise InputError(f"programs.{name}", problem, "that of --tracker, tracker.name or motion.control.law")
     return programs
 
 
@@ -145,13 +149,4 @@ def datetime_from_iso(text: str | None) -> datetime.datetime | None:
     try:
         return datetime.datetime.fromisoformat(text)
     except ValueError:
-        raise InputError(f"--time {text}: allowed: ISO 8601, e.g. 2012-06-22T21:00:00") from None
-
-
-def with_location(message: str) -> str:
-    """Add file and line of the scene to an error message about a key that was only checked after loading."""
-    if not LOADED:
-        return message
-    from skysim.scene.loader import with_location
-
-    return with_location(message, *LOADED[-1])
+        raise InputError(f"--time {text}", "", "ISO 8601, e.g. 2012-06-22T21:00:00") from None

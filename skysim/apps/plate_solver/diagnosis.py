@@ -101,7 +101,7 @@ def deeper_catalog(solver: Solver, share: float) -> str:
     for limit in (limit for limit in GAIA_LIMITS_MAG if limit > solver.stars.v_mag[-1]):
         if GAIA_STARS * 10 ** (GAIA_DEX_PER_MAG * (limit - first)) * share >= ENOUGH_CATALOG_STARS:
             build = "" if limit == first else f", after `skysim catalog build --source gaia --limit {limit}`"
-            return f"--catalog gaia_v{limit}.0{build}"
+            return f"the catalog gaia_v{limit}.0{build}"
     return f"a wider picture: the deepest catalog, to V {last}, has too few as well"
 
 
@@ -137,7 +137,7 @@ def other_field(refusal: Refusal) -> str:
     if not attitude.solved:
         return ""
     assert attitude.camera is not None
-    return f"perhaps another field of view: it solves with --fov {math.degrees(attitude.camera.fov_rad):.1f}"
+    return f"perhaps another field of view: it solves with a field of {math.degrees(attitude.camera.fov_rad):.1f}°"
 
 
 def overexposed(refusal: Refusal) -> str:
@@ -208,7 +208,7 @@ def unknown_cause(refusal: Refusal) -> str:
     if len(solver.stars) * share >= ENOUGH_CATALOG_STARS:
         return text
     enough_deg = narrow_deg * math.sqrt(ENOUGH_CATALOG_STARS / (len(solver.stars) * share))
-    field = "or take " if solver.field_is_known else f"if the field is below {enough_deg:.1g}°, give --fov and "
+    field = "or take " if solver.field_is_known else f"if the field is below {enough_deg:.1g}°, give it and take "
     return f"{text}; {field}{deeper_catalog(solver, share)}"
 
 

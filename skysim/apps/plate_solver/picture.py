@@ -28,7 +28,7 @@ from skysim.apps.plate_solver.solver import (
     solve_array,
     validated_date,
 )
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, printable
 from skysim.core.io import files, images
 
 ANNOTATED = ".annotated.png"
@@ -81,9 +81,7 @@ def solve(
         )
     else:
         solver = kept_solver(fov_deg, time_utc)
-    result = solve_file(Path(path), solver, None)
-    if result["bad_input"]:
-        raise InputError(result["status"])
+    result = read_and_solve(Path(path), solver, None)
     return PlateSolution(**{name.name: result[name.name] for name in fields(PlateSolution)})
 
 
@@ -100,7 +98,7 @@ def pictures_in(paths: Iterable[Path]) -> list[Path]:
         names = sorted(child for child in path.iterdir() if images.image_suffix(child.name))
         names = [child for child in names if child.name[0] != "." and not child.name.endswith(ANNOTATED)]
         if not names:
-            raise InputError(f"{path}: a folder without images; allowed: {', '.join(images.IMAGE_SUFFIXES)}")
+            raise InputError(path, "a folder without images", ", ".join(images.IMAGE_SUFFIXES))
         found += names
     return found
 
@@ -128,7 +126,20 @@ def solve_file(path: Path, solver: Solver, annotated: Path | None) -> dict[str, 
     An unreadable image does not raise, so that the files after it are still solved: its error line becomes `status`,
     and `bad_input` is true (for the exit code). `warning` says why the header's date was ignored, if it was.
     """
-    result: dict[str, Any] = {"file": str(path), **asdict(PlateSolution()), "time_ms": None, "warning": ""}
+    try:
+        return read_and_solve(path, solver, annotated)
+    except InputError as error:
+        return blank_result(path) | {"status": str(error), "bad_input": True}
+
+
+def blank_result(path: Path) -> dict[str, Any]:
+    """The fields of a file that is not solved."""
+    return {"file": str(path), **asdict(PlateSolution()), "time_ms": None, "warning": ""}
+
+
+def read_and_solve(path: Path, solver: Solver, annotated: Path | None) -> dict[str, Any]:
+    """`solve_file`, which raises InputError for an unreadable image."""
+    result = blank_result(path)
     begin = time.perf_counter()
     try:
         picture = load_picture(path, solver)
@@ -136,10 +147,10 @@ def solve_file(path: Path, solver: Solver, annotated: Path | None) -> dict[str, 
         if warning and not solver.time_utc:
             result["warning"] = f"{path}: DATE-OBS {warning}: ignored"
         outcome = solve_picture(picture, solver, date_utc)
-    except (InputError, ImageError) as error:
-        message = str(error)
-        result["status"] = message if message.startswith(str(path)) else f"{path}: {message}"
-        return result | {"bad_input": True}
+    except InputError as error:
+        raise error if error.key == printable(path) else error.within(path) from None
+    except ImageError as error:
+        raise InputError(path, error) from None
     result["time_ms"] = 1e3 * (time.perf_counter() - begin)
     result |= {"bad_input": False} | outcome_fields(outcome, date_utc)
     if annotated:
@@ -163,14 +174,14 @@ def check_image(path: Path, image: NDArray, solver: Solver) -> None:
     """
     camera = solver.camera
     if camera and image.ndim != 2:
-        raise InputError(f"{path}: a color image of shape {image.shape}; this camera's are monochrome")
+        raise InputError(path, f"a color image of shape {image.shape}; this camera's are monochrome")
     if camera and image.dtype == np.uint8 and camera.detector.bits > 8:
         bits = camera.detector.bits
-        raise InputError(f"{path}: an 8-bit image; this camera's have {bits} bits, in 16-bit FITS, PNG or TIFF")
+        raise InputError(path, f"an 8-bit image; this camera's have {bits} bits, in 16-bit FITS, PNG or TIFF")
     sensor = camera or solver.opencv_calibration
     if sensor and image.shape[:2] != (sensor.height_px, sensor.width_px):
         size = f"{image.shape[1]}x{image.shape[0]}"
-        raise InputError(f"{path}: {size} pixels; this camera's are {sensor.width_px}x{sensor.height_px}")
+        raise InputError(path, f"{size} pixels; this camera's are {sensor.width_px}x{sensor.height_px}")
 
 
 def solve_picture(picture: images.Picture, solver: Solver, date_utc: datetime.datetime | None) -> Outcome:

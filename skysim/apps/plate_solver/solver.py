@@ -208,12 +208,12 @@ def make_solver(
     """
     low, high = FOV_LIMITS_DEG
     if fov_deg is not None and camera_file is not None:
-        raise InputError("give either --fov DEG or --camera FILE")
+        raise InputError("solve.fov_deg", "conflicts with a camera", "one of the two")
     if fov_deg is not None and not low <= fov_deg <= high:
-        raise InputError(f"--fov {fov_deg:g}: allowed: the horizontal field of view, {low:g} to {high:g} degrees")
+        raise InputError("solve.fov_deg", f"{fov_deg:g}", f"the horizontal field of view, {low:g} to {high:g} degrees")
     time_utc, warning = validated_date(time_utc)
     if warning:
-        raise InputError(f"--time: {warning}")
+        raise InputError("solve.time_utc", warning)
     camera, lens, settings = read_camera(camera_file) if camera_file else (None, None, Settings())
     if stages:
         check_stages(stages)
@@ -239,7 +239,7 @@ def check_stages(stages: Mapping[str, str]) -> None:
 
     for stage, name in stages.items():
         if name not in STAR_ALGORITHMS[stage]:
-            raise InputError(f"--{stage}: {unknown_name(stage, name, STAR_ALGORITHMS[stage])}")
+            raise InputError(f"solve.{stage}", *unknown_name(stage, name, STAR_ALGORITHMS[stage]))
 
 
 def read_camera(path: Path) -> tuple[CameraConfig | None, Calibration | None, Settings]:
@@ -259,23 +259,23 @@ def read_camera(path: Path) -> tuple[CameraConfig | None, Calibration | None, Se
 
 
 def read_catalog(name: str | None) -> star_catalog.StarCatalog:
-    """The catalog of `--catalog`, a name in data/catalogs/ or a file; the shipped one for None. Raises InputError."""
+    """The catalog of the user: a name in data/catalogs/ or a file; the shipped one for None. Raises InputError."""
     if name is not None:
         from skysim.tracking.onboard_model import onboard_catalog
 
-        return onboard_catalog("--catalog", name)
+        return onboard_catalog("solve.catalog", name)
     try:
         return star_catalog.read(CATALOG)
     except ImageError as error:
-        raise InputError(f"{error}; make it with: skysim catalog build") from None
+        raise InputError("", f"{error}; `skysim catalog build` makes it") from None
 
 
 def validated_date(date_utc: datetime.datetime | None) -> tuple[datetime.datetime | None, str]:
     """Return (date in UTC, ""), or (None, reason) for a date outside the supported range; (None, "") without a date."""
     try:
         return (check_year(date_utc) if date_utc else None), ""
-    except ValueError as error:
-        return None, str(error)
+    except InputError as error:
+        return None, error.problem
 
 
 def solve_array(

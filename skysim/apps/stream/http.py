@@ -186,7 +186,7 @@ def start_server(hub: FrameHub, host: str, port: int) -> ThreadingHTTPServer:
     try:
         server = ThreadingHTTPServer((host, port), handler)
     except OSError as error:
-        raise InputError(f"--http {port}: cannot listen on {host}:{port}: {error.strerror}") from None
+        raise InputError(f"--http {port}", f"cannot listen on {host}:{port}: {error.strerror}") from None
     server.daemon_threads = True
     threading.Thread(target=server.serve_forever, name="http", daemon=True).start()
     return server

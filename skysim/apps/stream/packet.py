@@ -76,11 +76,11 @@ def unpack(stream: BinaryIO) -> tuple[dict[str, Any], NDArray[Any]] | None:
         if not re.fullmatch(r"[<>|]?(u[1248]|f[248])", dtype_name):
             raise ValueError(dtype_name)
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise InputError(f"not a packet of skysim stream: {line[:40]!r}") from error
+        raise InputError("", f"not a packet of skysim stream: {line[:40]!r}") from error
     count, dtype = shape[0] * shape[1], np.dtype(dtype_name)
     if min(shape) < 1 or count > MAX_PIXELS:
-        raise InputError(f"not a packet of skysim stream: {shape[1]} x {shape[0]} pixels of {dtype}")
+        raise InputError("", f"not a packet of skysim stream: {shape[1]} x {shape[0]} pixels of {dtype}")
     pixels = stream.read(count * dtype.itemsize)
     if len(pixels) < count * dtype.itemsize:
-        raise InputError(f"the stream ended within frame {header.get('index')}")
+        raise InputError("", f"the stream ended within frame {header.get('index')}")
     return header, np.frombuffer(pixels, dtype).reshape(shape)

@@ -95,7 +95,7 @@ def folder_writer(path: Path) -> Callable[[Packet], None]:
     """
     files.make_folder(path)
     if any(path.glob("frame_*.json")):
-        raise InputError(f"{path}: holds frames of an earlier stream; allowed: an empty folder")
+        raise InputError(path, "holds frames of an earlier stream", "an empty folder")
 
     def write(packet: Packet) -> None:
         stem = path / f"frame_{packet.header['index']:06d}"
@@ -119,7 +119,7 @@ def pipe_writer(path: str) -> Callable[[Packet], None]:
     The pipe is opened at the first packet, which blocks until a reader opens it. Raises InputError if it is no pipe.
     """
     if path != "-" and not Path(path).is_fifo():
-        raise InputError(f"--pipe {path}: not a named pipe; allowed: - or a pipe made by mkfifo")
+        raise InputError(f"--pipe {path}", "not a named pipe", "- or a pipe made by mkfifo")
 
     @functools.cache
     def stream() -> BinaryIO:

@@ -80,8 +80,7 @@ def draw_tracks(
     expected = config.per_cm2_s * area_cm2 * exposure_s
     if expected > MAX_TRACKS:
         raise InputError(
-            f"camera.detector.particles: {expected:.3g} tracks come near the chip in an exposure;"
-            f" allowed: {MAX_TRACKS:,}"
+            "camera.detector.particles", f"{expected:.3g} tracks come near the chip in an exposure", f"{MAX_TRACKS:,}"
         )
     count = rng.poisson(expected)
     tracks = np.zeros(count, TRACK)

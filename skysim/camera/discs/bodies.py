@@ -145,5 +145,7 @@ def hidden_points(body: BodyLight, nearer: Sequence[BodyLight], occluded: Occlus
 
 def concatenated(truths: Sequence[SourceTruth]) -> SourceTruth:
     """The rows of several truths, in their order."""
+    if len(truths) == 1:
+        return truths[0]
     names = [field.name for field in fields(SourceTruth)]
     return SourceTruth(**{name: np.concatenate([getattr(truth, name) for truth in truths]) for name in names})

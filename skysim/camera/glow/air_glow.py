@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 
@@ -27,13 +25,6 @@ from skysim.sources.solar_system.places import Place, place
 ERG_NL = 1.02e-15  # erg s^-1 cm^-2 um^-1 arcsec^-2 in a nanolambert (Schaefer 1998)
 V_ZERO_MAG = -11.05  # of the V magnitude in erg s^-1 cm^-2 um^-1 (Schaefer 1998)
 NEAREST_DEG = 0.25  # to the Sun: the scattering functions are those at its limb
-
-
-def sky_light(sky: Sky | None) -> Callable[[ViewingGeometry], Floats] | None:
-    """The light of `air_glow` for a frame's geometry; None where the scene has no such glow."""
-    if sky is None or sky.air.config.glow is None:
-        return None
-    return partial(air_glow, sky.air.config.glow, sky)
 
 
 def air_glow(config: AirGlowConfig, sky: Sky, view: ViewingGeometry) -> Floats:

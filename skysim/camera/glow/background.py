@@ -189,21 +189,14 @@ def angular_separation_deg(vectors: Floats, vector: Floats) -> Floats:
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(vectors, vector), axis=-1), vectors @ vector))
 
 
-def glow_map(
-    glows: Sequence[Glow],
-    optics: Optics,
-    cam_from_lab: Rotation,
-    band: Band,
-    sky_light: Callable[[ViewingGeometry], Floats] | None = None,
-) -> Floats:
+def glow_map(glows: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band: Band) -> Floats:
     """(h, w) electrons s^-1 px^-1 of all extended light, at nodes evenly spread over the chip up to its edges.
 
     `fill` interpolates the frame from it, to 1e-3 for maps as smooth as these (test_background). Cusps are smoothed:
     that of two_stops on the axis by up to 2 % within a node of it, and that at the Moon if it is in the field.
     One node is enough where no light depends on the position, or there is none.
-    sky_light : of the scene's air (`air_glow`), if it has any
     """
-    if sky_light is None and all(glow.kind in ("uniform", "stray") for glow in glows):
+    if all(glow.kind in ("uniform", "stray") for glow in glows):
         (toward, pixel_sr), shape = pixel_directions(np.array([optics.camera.center_px]), optics), (1, 1)
     else:
         toward, pixel_sr, shape = node_directions(optics)
@@ -211,8 +204,6 @@ def glow_map(
     total = np.zeros(len(toward))
     for glow in glows:
         total += BACKGROUNDS[glow.kind](glow, view)
-    if sky_light is not None:
-        total += sky_light(view)
     return total.reshape(shape)
 
 
@@ -288,6 +279,16 @@ def fill(image: NDArray[Any], coarse: Floats, factor: float) -> None:
         _fill_flat(image, float(coarse[0, 0]) * factor)
     else:
         _fill_bilinear(image, coarse * factor)
+
+
+def add(image: NDArray[Any], glow: Floats, factor: float) -> None:
+    """Add extended light to an (H, W) frame in place: glow * factor, of all pixels, or at nodes as in `fill`."""
+    if glow.shape == image.shape:
+        image += glow * factor
+    else:
+        own = np.empty_like(image)
+        fill(own, glow, factor)
+        image += own
 
 
 @jit(parallel=True)

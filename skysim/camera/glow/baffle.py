@@ -31,27 +31,34 @@ def pst(baffle: BaffleConfig, directions: Floats, boresight: Floats) -> Floats:
 
 
 def stray_of_bodies_e_s_m2(baffle: BaffleConfig, bodies: Sequence[BodyLight], boresight: Floats) -> dict[str, float]:
-    """Photo-electrons s^-1 m^-2 of the chip that each body causes, as a point at its center; boresight: (3,)."""
+    """Photo-electrons s^-1 m^-2 of the chip that each body causes, by its name, as a point at its center.
+
+    boresight : (3,)
+    """
     directions = np.array([body.place.direction for body in bodies]).reshape(-1, 3)
     through = pst(baffle, directions, boresight)
-    return {body.name: body.flux_e_s_m2 * float(t) for body, t in zip(bodies, through, strict=True)}
+    return {body.title: body.flux_e_s_m2 * float(t) for body, t in zip(bodies, through, strict=True)}
 
 
-def stray_of_earth_e_s_m2(
-    baffle: BaffleConfig, earth: EarthConfig, observer_m: Floats, sun_m: Floats, boresight: Floats, band: Band
-) -> float:
-    """Photo-electrons s^-1 m^-2 of the chip that the Earth causes: the integral of radiance L times PST over its disc.
+def earth_around(config: EarthConfig, observer_m: Floats, sun_m: Floats, band: Band) -> tuple[Floats, Floats]:
+    """(M, 3) directions to the Earth and (M,) irradiances, photo-electrons s^-1 m^-2, of its parts around them.
 
-    E = ∫ L(u) PST(u) dω over the cone about the nadir that holds the disc and the air around it, by Gauss-Legendre
-    rules in the cosine of the nadir angle, one for the ground and one for the air, and even steps around it. L is that
-    of `earth_radiance`.
+    A sum over them is an integral over the cone about the nadir that holds the disc and the air around it, by
+    Gauss-Legendre rules in the cosine of the nadir angle, one for the ground and one for the air, and even steps around
+    it. The radiance is that of `earth_radiance`.
     """
     distance_m = float(np.linalg.norm(observer_m))
     edges = [math.sqrt(max(1 - (radius * EARTH_RADIUS_M / distance_m) ** 2, 0.0)) for radius in (1.0, LAYER[1])]
     in_cone, weights_sr = cone_rule(*edges)
     directions = in_cone @ axes_about(-observer_m / distance_m)
-    radiance = earth_radiance(earth, observer_m, directions, sun_m, band)
-    return float(np.sum(weights_sr * radiance * pst(baffle, directions, boresight)))
+    return directions, weights_sr * earth_radiance(config, observer_m, directions, sun_m, band)
+
+
+def stray_around_e_s_m2(
+    baffle: BaffleConfig, directions: Floats, irradiance_e_s_m2: Floats, boresight: Floats
+) -> float:
+    """Photo-electrons s^-1 m^-2 of the chip from parts of an extended light: the sum of irradiance times PST."""
+    return float(np.sum(irradiance_e_s_m2 * pst(baffle, directions, boresight)))
 
 
 @lru_cache(maxsize=4)

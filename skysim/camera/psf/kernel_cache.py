@@ -107,8 +107,9 @@ def source_kernels(
     largest = (widest + blur).max(initial=0.0)
     if largest > MAX_RADIUS_PX:
         raise InputError(
-            f"camera.focus: a source's image, {blur.max():.0f} px out of focus, has a radius of {largest:.0f} px;"
-            f" allowed: up to {MAX_RADIUS_PX:.0f} px"
+            "camera.focus",
+            f"a source's image, {blur.max():.0f} px out of focus, has a radius of {largest:.0f} px",
+            f"up to {MAX_RADIUS_PX:.0f} px",
         )
     steps = np.rint(np.column_stack([extra, emitter, blur]) / QUANTUM_PX).astype(np.int64)
     disk = np.zeros((len(steps), len(ellipse.EllipseDisk._fields)))
@@ -212,8 +213,9 @@ def add_kernels(cache: KernelCache, camera: CameraConfig, keys: list[tuple[int, 
         begin += table.size
         if 4 * begin > 2 * CACHE_BYTES:
             raise InputError(
-                f"camera.psf: images of different sizes take more than {2 * CACHE_BYTES >> 20} MB;"
-                " allowed: a smaller table, or corner_sigma_px: 0"
+                "camera.psf",
+                f"images of different sizes take more than {2 * CACHE_BYTES >> 20} MB",
+                "a smaller table, or corner_sigma_px: 0",
             )
     if len(tables) > 1:
         cache.tables[0] = np.concatenate(tables)

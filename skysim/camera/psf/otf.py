@@ -156,14 +156,16 @@ def read_cells(file: str) -> Floats:
             cells = np.loadtxt(path, delimiter=",", ndmin=2)
         else:
             cells = monochrome(read_image(path)).astype(float)
-    except (InputError, OSError, ValueError) as error:
-        message = str(error) if str(path) in str(error) else f"{path}: {error}"
-        raise InputError(f"camera.psf.file: {' '.join(message.split())}") from None
+    except InputError as error:
+        named = error if error.key else error.under(path)
+        raise named.within("camera.psf.file") from None
+    except (OSError, ValueError) as error:
+        raise InputError("camera.psf.file", f"{path}: {error}") from None
     if cells.ndim != 2 or cells.shape[0] != cells.shape[1] or not 3 <= len(cells) <= 1024:
-        raise InputError(f"camera.psf.file: {path}: shape {cells.shape}; allowed: a square of 3 to 1024 numbers a side")
+        raise InputError("camera.psf.file", f"{path}: shape {cells.shape}", "a square of 3 to 1024 numbers a side")
     total = cells.sum()
     if not (np.isfinite(total) and total > 0):
-        raise InputError(f"camera.psf.file: {path}: its numbers add up to {total:g}; allowed: a finite sum above 0")
+        raise InputError("camera.psf.file", f"{path}: its numbers add up to {total:g}", "a finite sum above 0")
     return np.asarray(cells / total)
 
 

@@ -120,7 +120,7 @@ def make_folder(path: Path) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{path}: cannot be created as a folder: {error.strerror}") from error
+        raise InputError(path, f"cannot be created as a folder: {error.strerror}") from error
     remove_stale_temporaries(path)
     return path
 
@@ -148,7 +148,7 @@ def write_image(path: Path, image: NDArray) -> None:
     except cv2.error:
         encoded = False
     if not encoded:
-        raise InputError(f"{path}: an image of {image.dtype} and shape {image.shape} cannot be encoded in this format")
+        raise InputError(path, f"an image of {image.dtype} and shape {image.shape} cannot be encoded in this format")
     with atomic_file(path) as temporary:
         temporary.write_bytes(data.data)
 
@@ -166,7 +166,7 @@ def read_table(path: Path) -> Any:
     try:
         return Table.read(path, format="ascii.ecsv")
     except Exception as error:  # astropy's parsers raise many types of exception for a file that is not ECSV
-        raise InputError(f"{path}: not an ECSV table: {' '.join(str(error).split())[:120]}") from None
+        raise InputError(path, f"not an ECSV table: {' '.join(str(error).split())[:120]}") from None
 
 
 def header_numbers(path: Path, meta: dict[str, Any], key: str, count: int) -> list[float]:
@@ -178,7 +178,7 @@ def header_numbers(path: Path, meta: dict[str, Any], key: str, count: int) -> li
     positive = key in ("size_px", "focal_px")
     if numbers.shape != (count,) or not np.isfinite(numbers).all() or (positive and numbers.min() <= 0):
         what = f"{count} finite number{'s' if count > 1 else ''}{' above 0' if positive else ''}"
-        raise InputError(f"{path}: {key} in the header is {meta.get(key)!r}; allowed: {what}")
+        raise InputError(path, f"{key} in the header is {meta.get(key)!r}", what)
     return [float(number) for number in numbers]
 
 

@@ -1,9 +1,9 @@
-"""Read YAML files safely, and turn a pydantic validation error into a one-line message with file and line.
+"""Read YAML files safely, and turn a pydantic validation error into an InputError with file and line.
 
 Input files may come from untrusted sources, so their size, depth and number of values are limited (`StrictLoader`),
 and duplicate keys are rejected (`reject_duplicate_keys`). `explain` takes the first error that pydantic reports,
-translates its location to the keys of the YAML tree, and `location_of` finds the line of that key in the file that
-defines it.
+translates its location to the keys of the YAML tree, and `where_of` finds the line of that key in the file that defines
+it.
 """
 
 from __future__ import annotations
@@ -12,16 +12,17 @@ import copy
 import difflib
 import functools
 import json
-import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from skysim.core import __version__
-from skysim.core.errors import InputError, printable, unknown_name
+from skysim.core.errors import OVERRIDES, InputError, Where, printable, unknown_name
 
 Files = list[tuple[Path, str]]  # paths and texts
 VERSION = 1  # of scene and study files; raised by an incompatible change, with a conversion of old files here
@@ -95,9 +96,9 @@ def is_file(path: Path) -> bool:
 
 
 def existing_file(value: str) -> str:
-    """Validator of a key: the path of a file that exists. Raises ValueError."""
+    """Validator of a key: the path of a file that exists. Raises InputError."""
     if not is_file(Path(value)):
-        raise ValueError(f"{value!r} is not a file; allowed: a path, or a file in the scene's folder")
+        raise InputError("", f"{value!r} is not a file", "a path, or a file in the scene's folder")
     return value
 
 
@@ -110,9 +111,9 @@ def find_file(name: str, folder: Path, what: str) -> Path:
         return shipped
     near = Path(f"{name}.yaml")
     if is_file(near):
-        raise InputError(f"{excerpt(name)}: no such {what}; did you mean {excerpt(near)}?")
+        raise InputError(excerpt(name), f"no such {what}; did you mean {excerpt(near)}?")
     names = sorted(file.stem for file in folder.glob("*.yaml"))
-    raise InputError(f"{excerpt(name)}: no such {what}; allowed: a .yaml file or one of {', '.join(names)}")
+    raise InputError(excerpt(name), f"no such {what}", f"a .yaml file or one of {', '.join(names)}")
 
 
 def excerpt(value: object) -> str:
@@ -121,13 +122,15 @@ def excerpt(value: object) -> str:
     return text if len(text) <= MAX_EXCERPT else f"{text[:MAX_EXCERPT]}…"
 
 
-def parse_overrides(sets: list[str] | None, option: str = "--set", form: str = "path.to.key=value") -> dict[str, str]:
-    """Keys and values of `--set path.to.key=value`, or of another option and form. Raises InputError."""
+def parse_overrides(
+    sets: list[str] | None, parameter: str = "overrides", form: str = "path.to.key=value"
+) -> dict[str, str]:
+    """Keys and values of texts `path.to.key=value`, or of another form. Raises InputError that names the parameter."""
     overrides = {}
     for item in sets or []:
         key, equals, value = item.partition("=")
         if not equals or not key:
-            raise InputError(f"{option} {excerpt(item)}: allowed: {form}")
+            raise InputError(parameter, excerpt(item), form)
         overrides[key] = value
     return overrides
 
@@ -141,18 +144,17 @@ def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
     """A YAML mapping and its text. Raises InputError."""
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: {path.stat().st_size} bytes; allowed: up to {MAX_BYTES}")
+            raise InputError(path, f"{path.stat().st_size} bytes", f"up to {MAX_BYTES}")
         text = path.read_text(encoding="utf-8")
         node, tree = (parse_kept if len(text) <= MAX_KEPT else parse_yaml)(text)
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+        raise InputError(path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark else ""
-        problem = " ".join(str(getattr(error, "problem", error)).split())
-        raise InputError(f"{path}{where}: not YAML: {problem}") from error
+        where = Where(path, mark.line + 1 if mark else None)
+        raise InputError(path, f"not YAML: {getattr(error, 'problem', error)}", where=where) from error
     if not isinstance(tree, dict):
-        raise InputError(f"{path}: allowed: a mapping of keys to values")
+        raise InputError(path, "", "a mapping of keys to values")
     reject_duplicate_keys(node, path)
     return copy.deepcopy(tree), text
 
@@ -166,7 +168,8 @@ def reject_duplicate_keys(node: yaml.Node | None, path: Path) -> None:
         names: set[str] = set()
         for key, value in node.value:
             if str(key.value) in names:
-                raise InputError(f"{excerpt(key.value)}: duplicate key ({path}, line {key.start_mark.line + 1})")
+                where = Where(path, key.start_mark.line + 1)
+                raise InputError(excerpt(key.value), "duplicate key", where=where)
             names.add(str(key.value))
             reject_duplicate_keys(value, path)
 
@@ -174,7 +177,7 @@ def reject_duplicate_keys(node: yaml.Node | None, path: Path) -> None:
 def check_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
     """Raise InputError for a file of another schema version, before its unknown keys are reported as mistakes."""
     if "schema" not in tree:
-        raise InputError(f"schema: missing; add the line schema: {VERSION} ({path})")
+        raise InputError("schema", f"missing; add the line schema: {VERSION}", where=Where(path))
     version = tree["schema"]
     if type(version) is int and version == VERSION:
         return
@@ -183,23 +186,24 @@ def check_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
         problem = f"version {version} is " + (
             f"newer than skysim {__version__} supports" if version > VERSION else "no longer supported"
         )
-    raise InputError(f"schema: {problem}; allowed: {VERSION} {location_of(['schema'], [(path, text)], {})}")
+    raise InputError("schema", problem, VERSION, where_of(["schema"], [(path, text)], {}))
 
 
 def set_key(tree: dict[str, Any], key: str, value: str) -> None:
     """Set one dotted key of the raw scene; the value is YAML. A number is an index into a list: `camera_body.2`."""
     *parents, last = key.split(".")
     if not all((*parents, last)):
-        raise InputError(f"--set {excerpt(key)}={excerpt(value)}: allowed: path.to.key=value")
+        raise InputError(OVERRIDES.file, f"{excerpt(key)}={excerpt(value)}", "path.to.key=value")
     node: Any = tree
     for depth, parent in enumerate(parents):
         node = node.setdefault(parent, {}) if isinstance(node, dict) else node[list_index(node, parent, key)]
         if not isinstance(node, dict | list):
-            raise InputError(f"--set {excerpt(key)}: {excerpt('.'.join(parents[: depth + 1]))} holds a value, not keys")
+            section = excerpt(".".join(parents[: depth + 1]))
+            raise InputError(excerpt(key), f"{section} holds a value, not keys", where=OVERRIDES)
     try:
         node[last if isinstance(node, dict) else list_index(node, last, key)] = parse_yaml(value)[1]
     except yaml.YAMLError as error:
-        raise InputError(f"--set {excerpt(key)}: {excerpt(repr(value))} is not YAML") from error
+        raise InputError(excerpt(key), f"{excerpt(repr(value))} is not YAML", where=OVERRIDES) from error
 
 
 def list_index(values: list[Any], component: str, key: str) -> int:
@@ -207,9 +211,33 @@ def list_index(values: list[Any], component: str, key: str) -> int:
     digits = component.isascii() and component.isdigit() and len(component) < 10
     if not digits or int(component) >= len(values):
         raise InputError(
-            f"--set {excerpt(key)}: {excerpt(component)} is not a list index; allowed: 0 to {len(values) - 1}"
+            excerpt(key), f"{excerpt(component)} is not a list index", f"0 to {len(values) - 1}", OVERRIDES
         )
     return int(component)
+
+
+# What a value should be, by pydantic's type of the error, with its context.
+EXPECTED = {
+    "greater_than": "greater than {gt}",
+    "greater_than_equal": "greater than or equal to {ge}",
+    "less_than": "less than {lt}",
+    "less_than_equal": "less than or equal to {le}",
+    "literal_error": "{expected}",
+    "string_pattern_mismatch": "text that matches the pattern '{pattern}'",
+    "string_too_short": "at least {min_length} characters",
+    "string_too_long": "at most {max_length} characters",
+    "too_short": "at least {min_length} values",
+    "too_long": "at most {max_length} values",
+    "model_type": "a mapping of keys to values",
+    "model_attributes_type": "a mapping of keys to values",
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float", "int_parsing_size"), "a valid integer"),
+    **dict.fromkeys(("float_type", "float_parsing"), "a valid number"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
+    **dict.fromkeys(("tuple_type", "list_type"), "a list"),
+    **dict.fromkeys(("datetime_type", "datetime_parsing", "datetime_from_date_parsing"), "a valid datetime"),
+    "dict_type": "a mapping of keys to values",
+    "string_type": "text",
+}
 
 
 def explain(
@@ -218,46 +246,60 @@ def explain(
     tree: dict[str, Any],
     files: Files,
     overrides: Mapping[str, str],
-) -> str:
-    """One-line message of the first error: `light.kind: unknown kind 'domes'; allowed: … (scenes/x.yaml, line 31)`.
+) -> InputError:
+    """The first error of a validation: `light.kind: unknown kind 'domes'; allowed: … (scenes/x.yaml, line 31)`.
 
     tree is the merged content of the files; files are their paths and texts, the one with the highest priority first.
     """
     # A misspelled key causes two errors, unknown and missing. Report the unknown one.
     first = min(error.errors(), key=lambda item: item["type"] == "missing")
-    keys = [str(key) for key in yaml_keys(first["loc"], tree, first["type"] == "missing")]
-    message = re.sub(r"^(Value error, |\w+ should )", "", first["msg"])
-    if first["type"] == "extra_forbidden":
-        message = "unknown key" + suggestion(keys[-1], allowed_keys(model, first["loc"][:-1]))
-    elif first["type"] == "missing":
-        message = "missing"
-    elif first["type"] == "union_tag_invalid":
-        keys, context = [*keys, "kind"], first["ctx"]
-        message = unknown_name("kind", context["tag"], [context["expected_tags"].replace("'", "")])
-    elif first["type"] == "union_tag_not_found":
-        message = "kind is missing"
-    elif first["type"] in ("model_type", "model_attributes_type"):
-        message = f"{excerpt(repr(first['input']))} is not allowed; it should be a mapping of keys to values"
-    elif first["type"] == "value_error" and not keys:  # validator of the whole scene: its message begins with the key
-        dotted, _, message = message.partition(": ")
-        keys = dotted.split(".")
-    elif not first["type"].startswith("value_error"):
-        message = f"{excerpt(repr(first['input']))} is not allowed; it should {message}"
-    dotted = ".".join(keys)
+    missing = first["type"] == "missing"
+    keys = [str(key) for key in yaml_keys(first["loc"], tree, missing)]
+    found = fault_of(first, model)
+    if found.key:
+        keys += found.key.split(".")
     # A missing key has no line of its own, so its section's is given. (A file may have it in a section or list that
     # another file replaces.)
-    located = keys[:-1] if first["type"] == "missing" else keys
-    return f"{excerpt(dotted) + ': ' if dotted else ''}{message} {location_of(located, files, overrides)}"
+    where = where_of(keys[:-1] if missing else keys, files, overrides)
+    return InputError(excerpt(".".join(keys)), found.problem, found.allowed, where)
 
 
-def location_of(keys: list[str], files: Files, overrides: Mapping[str, str]) -> str:
-    """Where a key was given: `(--set)`, or `(scenes/x.yaml, line 31)` in the file that has most of its components."""
+def fault_of(error: ErrorDetails, model: type[BaseModel]) -> InputError:
+    """One error of pydantic; its key is relative to the error's location."""
+    kind, context = error["type"], error.get("ctx", {})
+    if kind == "value_error":  # a validator's own, which may name a key below
+        cause = context["error"]
+        return cause if isinstance(cause, InputError) else InputError("", cause)
+    if kind == "extra_forbidden":
+        known = allowed_keys(model, error["loc"][:-1])
+        names = ", ".join(name for name in known if name.isidentifier())
+        return InputError("", f"unknown key{suggestion(str(error['loc'][-1]), known)}", names)
+    if kind == "missing":
+        return InputError("", "missing")
+    if kind == "union_tag_invalid":
+        return InputError("kind", *unknown_name("kind", context["tag"], [context["expected_tags"].replace("'", "")]))
+    if kind == "union_tag_not_found":
+        return InputError("", "kind is missing")
+    value = excerpt(repr(error["input"]))
+    if kind not in EXPECTED:
+        return InputError("", f"{value} is not allowed: {error['msg']}")
+    limits = {name: plain_number(limit) for name, limit in context.items()}
+    return InputError("", f"{value} is not allowed", EXPECTED[kind].format(**limits))
+
+
+def plain_number(value: Any) -> Any:
+    """A float without an exponent, 0.000001, as text; other values unchanged."""
+    return f"{Decimal(repr(value)).normalize():f}" if isinstance(value, float) else value
+
+
+def where_of(keys: list[str], files: Files, overrides: Mapping[str, str]) -> Where:
+    """Where a key was given: OVERRIDES, or the place in the file that has most of its components."""
     dotted = ".".join(keys)
     if any(k == dotted or dotted.startswith(k + ".") for k in overrides):
-        return "(--set)"
+        return OVERRIDES
     matches = [(*line_of(text, keys), path) for path, text in files]
     _, line, path = max(matches, key=lambda match: match[0])  # the first of equal depth
-    return f"({path}{f', line {line}' if line else ''})"
+    return Where(path, line)
 
 
 def yaml_keys(loc: tuple[int | str, ...], tree: Any, missing: bool) -> list[int | str]:
@@ -305,10 +347,10 @@ def kind_of(node: dict[str, Any]) -> str | None:
     return node.get("properties", {}).get("kind", {}).get("const")
 
 
-def suggestion(word: str, allowed: list[str]) -> str:
+def suggestion(word: str, allowed: Sequence[str]) -> str:
+    """The most similar of the allowed words, as the end of a problem; empty if none is similar."""
     close = difflib.get_close_matches(word, allowed, 1)
-    guess = f"; did you mean {close[0]}?" if close else ""
-    return f"{guess}; allowed: {', '.join(k for k in allowed if k.isidentifier())}" if allowed else guess
+    return f"; did you mean {close[0]}?" if close else ""
 
 
 def line_of(text: str, keys: list[str]) -> tuple[int, int | None]:

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skysim.core.errors import InputError, printable
-from skysim.core.plugins.host import describe_error
-from skysim.core.plugins.program import MAX_STATUS_CHARS, Program, ProgramError, host_command
+from skysim.core.plugins import MAX_STATUS_CHARS, Program, ProgramError, describe_error, host_command
 from skysim.core.types import Floats
 from skysim.dynamics.controllers.interface import (
     CONTROLLERS,
@@ -85,7 +84,7 @@ class ExternalLaw:
             reason = str(error) if isinstance(error, ProgramError | ValueError) else describe_error(error)
             self.close()
             text = printable(reason)[:MAX_STATUS_CHARS]
-            raise InputError(f"{CONTROLLERS.key}: {self.name}: {text}, at {t_s:g} s") from error
+            raise InputError(CONTROLLERS.key, f"{self.name}: {text}, at {t_s:g} s") from error
         self.tick += 1
         return self.commanded_nm
 
@@ -109,7 +108,7 @@ def external_law(
         try:
             law = build_law(source.factory, setup)
         except Exception as error:
-            raise InputError(f"{CONTROLLERS.key}: {name}: {describe_error(error)}") from error
+            raise InputError(CONTROLLERS.key, f"{name}: {describe_error(error)}") from error
         return ExternalLaw(reference, name, lambda inputs: check_torque(law(inputs), setup.authority_nm))
     environment = None
     if name in source.programs:

@@ -9,7 +9,7 @@ import sys
 from functools import partial
 from typing import IO, Any
 
-from skysim.core.plugins.host import Respond, describe_error, serve
+from skysim.core.plugins import Respond, describe_error, serve
 from skysim.dynamics.controllers.interface import CONTROLLERS, ControllerInput, ControllerSetup, build_law, check_torque
 
 

@@ -16,9 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from skysim.core.errors import printable
-from skysim.core.plugins.kind import PluginKind
-from skysim.core.plugins.messages import Floats, finite_array, to_lists
-from skysim.core.plugins.program import MAX_STATUS_CHARS
+from skysim.core.plugins import MAX_STATUS_CHARS, Floats, PluginKind, finite_array, to_lists
 from skysim.scene.sections.motion import BUILT_IN_LAWS, PRESCRIBED
 
 if TYPE_CHECKING:

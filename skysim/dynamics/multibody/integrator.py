@@ -134,8 +134,9 @@ class Simulation:
     def check_warnings(self) -> None:
         if self.data.warning.number.any():
             raise InputError(
-                f"motion: not integrable at a step of {1e3 * self.step_s:g} ms: MuJoCo warned before {self.now_s:.3f} s"
-                f" ({self.warning_names()}); check vehicle and motion.control for stiff, fast or NaN values"
+                "motion",
+                f"not integrable at a step of {1e3 * self.step_s:g} ms: MuJoCo warned before {self.now_s:.3f} s"
+                f" ({self.warning_names()}); check vehicle and motion.control for stiff, fast or NaN values",
             )
 
     def warning_names(self) -> str:
@@ -225,6 +226,5 @@ def check_tilt(vehicle: VehicleModel, lab_from_body: Rotation) -> None:
     tilt = float(tilt_deg(lab_from_body))
     if vehicle.config.mount == "air_bearing" and tilt > vehicle.config.tilt_stop_deg:
         raise InputError(
-            f"motion.start: tilt of {tilt:.1f} deg; allowed: up to vehicle.tilt_stop_deg"
-            f" {vehicle.config.tilt_stop_deg:g}"
+            "motion.start", f"tilt of {tilt:.1f} deg", f"up to vehicle.tilt_stop_deg {vehicle.config.tilt_stop_deg:g}"
         )

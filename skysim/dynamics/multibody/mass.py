@@ -70,16 +70,17 @@ def declare_mass(bus: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Ma
     mass = declared.mass_kg - carried.mass_kg
     if mass <= 0:
         raise InputError(
-            f"vehicle.mass: {declared.mass_kg:g} kg; allowed: more than the {carried.mass_kg:g} kg that the bus"
-            f" carries ({path})"
+            "vehicle.mass",
+            f"{declared.mass_kg:g} kg",
+            f"more than the {carried.mass_kg:g} kg that the bus carries ({path})",
         )
     # The bus's own center follows from the first moments: total minus carried, over the bus's mass.
     center_bus = (declared.mass_kg * declared.center_m - carried.mass_kg * carried.center_m) / mass
     own_inertia = inertia - carried.inertia_kg_m2 - parallel_axis(mass, center_bus)
-    subject = f"vehicle.inertia: less what the bus carries ({path}), its"
+    subject = ("vehicle.inertia", f"less what the bus carries ({path}), its")
     if vehicle.camera_m is not None and is_lever_too_long(own_inertia, model, np.array(vehicle.camera_m)):
         distance_m = np.linalg.norm(vehicle.camera_m)
-        subject = f"vehicle.camera: with the camera {distance_m:.3g} m from the bearing, the bus's ({path})"
+        subject = ("vehicle.camera", f"with the camera {distance_m:.3g} m from the bearing, the bus's ({path})")
     set_inertial(bus, mass, center_bus, own_inertia, subject)
     return declared
 
@@ -111,13 +112,9 @@ def unbalance(model: Any, wheel_joints: list[Any], wheels: WheelsConfig, path: P
         product = np.outer(axle, np.cross(axle, across))
         axes = Rotation.from_quat(own.iquat, scalar_first=True).as_matrix()
         inertia = axes @ np.diag(own.inertia) @ axes.T + wheels.dynamic_imbalance_kg_m2 * (product + product.T)
-        set_inertial(
-            rotor,
-            own.mass[0],
-            own.ipos + wheels.static_imbalance_kg_m / own.mass[0] * across,
-            inertia,
-            f"vehicle.wheels.dynamic_imbalance: with it {joint.name}'s ({path})",
-        )
+        center_m = own.ipos + wheels.static_imbalance_kg_m / own.mass[0] * across
+        subject = ("vehicle.wheels.dynamic_imbalance", f"with it {joint.name}'s ({path})")
+        set_inertial(rotor, own.mass[0], center_m, inertia, subject)
 
 
 def is_possible(moments: NDArray[Any]) -> bool:
@@ -125,13 +122,18 @@ def is_possible(moments: NDArray[Any]) -> bool:
     return bool(moments[0] > 0 and moments[2] <= (moments[0] + moments[1]) * (1 + 1e-12))
 
 
-def set_inertial(body: Any, mass_kg: float, center_m: Floats, inertia_kg_m2: Floats, subject: str) -> None:
-    """Set mass, center and inertia (3, 3) about it in a body of a spec. Raises InputError for impossible inertia."""
+def set_inertial(body: Any, mass_kg: float, center_m: Floats, inertia_kg_m2: Floats, subject: tuple[str, str]) -> None:
+    """Set mass, center and inertia (3, 3) about it in a body of a spec. Raises InputError for impossible inertia.
+
+    subject : the key at fault, and whose moments they are
+    """
+    key, whose = subject
     moments, axes = np.linalg.eigh(inertia_kg_m2)
     if not is_possible(moments):
         raise InputError(
-            f"{subject} principal moments about its center of mass are"
-            f" {', '.join(f'{m:.3g}' for m in moments)} kg m2, impossible for a rigid body"
+            key,
+            f"{whose} principal moments about its center of mass are {', '.join(f'{m:.3g}' for m in moments)} kg m2,"
+            " impossible for a rigid body",
         )
     body.explicitinertial = True
     # MuJoCo silently takes a NaN ipos as the body's pos: always set it.
@@ -180,8 +182,9 @@ def held_position_m(config: TrimConfig, names: tuple[str, ...]) -> Floats:
     """(n,) positions that the motors can hold: whole steps. Raises InputError for another number of positions."""
     if config.position_m and len(config.position_m) != len(names):
         raise InputError(
-            f"vehicle.trim.position: {len(config.position_m)} values; allowed: {len(names)}, one for each of"
-            f" {', '.join(names)}, or none"
+            "vehicle.trim.position",
+            f"{len(config.position_m)} values",
+            f"{len(names)}, one for each of {', '.join(names)}, or none",
         )
     position_m = np.array(config.position_m or (0.0,) * len(names))
     return np.asarray(config.step_m * np.round(position_m / config.step_m))
@@ -200,7 +203,7 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
     for joint, axis, at_m in zip(slides, axes.T, position_m, strict=True):
         body = joint.parent
         if body.parent.name != "bus" or body.frame is not None:
-            raise InputError(f"{path}: joint {joint.name} must be on a body directly in body bus, not in another body")
+            raise InputError(path, f"joint {joint.name} must be on a body directly in body bus, not in another body")
         body.pos = body.pos + at_m * axis  # the bus's axes are the lab's in the model
         spec.delete(joint)
     return Trims(names, axes, centers_m, model.body_subtreemass[bodies].copy(), position_m)

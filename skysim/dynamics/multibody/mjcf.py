@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 
 from skysim.core.errors import InputError
-from skysim.core.io.guard.process import run_guarded
+from skysim.core.io.guarded import run_guarded
 from skysim.core.paths import SCENES
 from skysim.dynamics.multibody.mjcf_sandbox import check_confined
 
@@ -22,14 +22,14 @@ TRIAL_CPU_S, TRIAL_BYTES = 3, 1 << 30
 def load(path: Path) -> Any:
     """The MJCF file as an MjSpec."""
     if not path.is_file():
-        raise InputError(f"{path}: no such file; vehicle.model is a path relative to the scene or to scenes/")
+        raise InputError(path, "no such file; vehicle.model is a path relative to the scene or to scenes/")
     check_confined(path)
     if fault := trial_fault(path, path.stat().st_mtime_ns):
-        raise InputError(f"{path}: not a MuJoCo model that skysim reads: {fault}")
+        raise InputError(path, f"not a MuJoCo model that skysim reads: {fault}")
     try:
         return mujoco.MjSpec.from_file(str(path))
     except (ValueError, mujoco.FatalError) as error:
-        raise InputError(f"{path}: not a MuJoCo model: {one_line(error)}") from error
+        raise InputError(path, f"not a MuJoCo model: {one_line(error)}") from error
 
 
 @lru_cache(maxsize=64)
@@ -48,7 +48,7 @@ def compile_spec(spec: Any, path: Path) -> Any:
     try:
         return spec.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise InputError(f"{path}: MuJoCo cannot compile it: {one_line(error)}") from error
+        raise InputError(path, f"MuJoCo cannot compile it: {one_line(error)}") from error
 
 
 @contextmanager

@@ -68,9 +68,7 @@ class References:
         """
         subfolders = {"", *(reference.value for reference in self.folders)}
         if len(self.bases) * len(subfolders) * len(self.files) > MAX_CANDIDATES:
-            raise InputError(
-                f"{self.folder}: the model names too many files; allowed: {MAX_CANDIDATES} candidate paths"
-            )
+            raise InputError(self.folder, "the model names too many files", f"{MAX_CANDIDATES} candidate paths")
         for base in self.bases:
             for reference in self.folders:
                 yield from ((reference, candidate) for candidate in path_variants(base, reference.value))
@@ -107,9 +105,9 @@ def check_confined(path: Path) -> None:
 def check_candidate(reference: FileReference, candidate: Path, folder: Path) -> None:
     """Raise InputError (one line) for a path outside of the folder, and for one that is not a plain file."""
     if "\\" in reference.value or not resolved(candidate).is_relative_to(folder):
-        raise InputError(f"{reference.source} is outside {folder}; allowed: files in it")
+        raise InputError("", f"{reference.source} is outside {folder}", "files in it")
     if os.path.exists(candidate) and not (os.path.isfile(candidate) or os.path.isdir(candidate)):
-        raise InputError(f"{reference.source} is not a regular file; allowed: files in {folder}")
+        raise InputError("", f"{reference.source} is not a regular file", f"files in {folder}")
 
 
 def file_identity(path: Path) -> tuple[str, Path, Path]:
@@ -146,7 +144,7 @@ def xml_root(path: Path) -> ElementTree.Element:
         for key, value in element.attrib.items():
             if not all(map(is_moderate, value.split())):
                 raise InputError(
-                    f"{path}: {element.tag} {key}={excerpt(repr(value))}; allowed: finite numbers up to {MAX_NUMBER:g}"
+                    path, f"{element.tag} {key}={excerpt(repr(value))}", f"finite numbers up to {MAX_NUMBER:g}"
                 )
     return root
 
@@ -161,10 +159,10 @@ def is_moderate(word: str) -> bool:
 
 def unreadable(path: Path, error: Exception) -> InputError:
     """The error for a file that cannot be read, or is not UTF-8 or not XML."""
-    return InputError(f"{path}: not a MuJoCo model: {' '.join(str(error).split())}")
+    return InputError(path, f"not a MuJoCo model: {error}")
 
 
 def require(path: Path, condition: bool, allowed: str) -> None:
     """Raise InputError (one line) where a rule for model files is violated."""
     if not condition:
-        raise InputError(f"{path}: not a MuJoCo model that skysim reads; allowed: {allowed}")
+        raise InputError(path, "not a MuJoCo model that skysim reads", allowed)

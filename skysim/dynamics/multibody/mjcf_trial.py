@@ -1,4 +1,4 @@
-"""Script for `core.io.guard.process`: read and compile an MJCF file, to see whether MuJoCo survives it.
+"""Script for `core.io.guarded`: read and compile an MJCF file, to see whether MuJoCo survives it.
 
 It fails if memory runs out or the model is too large. Any other error of MuJoCo is left to the caller, who meets it
 again and reports it. The compilation is then repeated without joints: the caller may lock those that MuJoCo rejects.

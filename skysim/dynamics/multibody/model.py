@@ -120,7 +120,7 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
     """
     if vehicle.mount == "free" and any(vehicle.center_of_mass_m):
         raise InputError(
-            "vehicle.center_of_mass: a free vehicle rotates about it, so it must be the body's origin; allowed: 0"
+            "vehicle.center_of_mass", "a free vehicle rotates about it, so it must be the body's origin", "0"
         )
     spec = load(path)
     spec.compiler.fusestatic = False  # keep bodies separate until the bearing is added
@@ -131,12 +131,12 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
     try:
         bare = compile_spec(spec, path)
     except InputError as error:
-        raise InputError(f"{error}{locked_joint_hint(str(error), locked)}") from None
+        raise InputError(error.key, f"{error.problem}{locked_joint_hint(spec, locked)}") from None
     mass = declare_mass(bus, bare, vehicle, path)
     try:
         add_bearing(spec, bus, vehicle)
     except ValueError as error:  # a name is taken
-        raise InputError(f"{path}: a name is reserved for skysim's bearing: {one_line(error)}") from error
+        raise InputError(path, f"a name is reserved for skysim's bearing: {one_line(error)}") from error
     balanced = compile_spec(spec, path)
     # Checked while the wheels are balanced, since `unbalance` changes the mass properties on purpose.
     check_compiled(balanced, mass, path)
@@ -152,13 +152,13 @@ def put_at_origin(spec: Any, path: Path) -> Any:
     required = {"body bus": spec.body("bus"), f"camera {CAMERA}": spec.camera(CAMERA)}
     missing = [name for name, element in required.items() if element is None]
     if missing:
-        raise InputError(f"{path}: no {', no '.join(missing)}; a vehicle needs {REQUIRED}")
+        raise InputError(path, f"no {', no '.join(missing)}; a vehicle needs {REQUIRED}")
     bus = spec.body("bus")
     if bus.parent.name != "world" or bus.frame is not None:
-        raise InputError(f"{path}: body bus must be a direct child of worldbody, not of another body or frame")
+        raise InputError(path, "body bus must be a direct child of worldbody, not of another body or frame")
     for joint in list(bus.joints):
         if joint.name.startswith(tuple(prefix for kind in KINDS for prefix in kind.joints)):
-            raise InputError(f"{path}: joint {joint.name} must be on a child body of bus")
+            raise InputError(path, f"joint {joint.name} must be on a child body of bus")
         spec.delete(joint)
     for key in list(spec.keys):  # keyframes are lists of joint positions, which no longer fit
         spec.delete(key)
@@ -243,11 +243,11 @@ def check_compiled(model: Any, declared: MassProperties, path: Path) -> None:
     for prefix in (prefix for kind in KINDS for prefix in kind.sites):
         bodies = [model.site(k).bodyid[0] for k in range(model.nsite) if model.site(k).name.startswith(prefix)]
         if any(model.body_rootid[body] != bus for body in bodies):
-            raise InputError(f"{path}: sites {prefix}* must be on body bus or its children")
+            raise InputError(path, f"sites {prefix}* must be on body bus or its children")
     if (model.body_rootid[model.jnt_bodyid] != bus).any():
-        raise InputError(f"{path}: a joint outside body bus; allowed: joints of bus and its children")
+        raise InputError(path, "a joint outside body bus", "joints of bus and its children")
     if model.body_rootid[model.cam_bodyid[model.camera(CAMERA).id]] != bus:
-        raise InputError(f"{path}: camera {CAMERA} must be on body bus or its children")
+        raise InputError(path, f"camera {CAMERA} must be on body bus or its children")
     matches = (
         abs(mass.mass_kg - declared.mass_kg) < 1e-9 * declared.mass_kg
         and np.abs(mass.center_m - declared.center_m).max() < 1e-9
@@ -255,8 +255,9 @@ def check_compiled(model: Any, declared: MassProperties, path: Path) -> None:
     )
     if not matches:
         raise InputError(
-            f"{path}: the compiled mass is {mass.mass_kg:g} kg at {mass.center_m} m, not as declared;"
-            " remove inertiafromgeom, settotalmass and the like from <compiler>"
+            path,
+            f"the compiled mass is {mass.mass_kg:g} kg at {mass.center_m} m, not as declared; remove inertiafromgeom,"
+            " settotalmass and the like from <compiler>",
         )
 
 

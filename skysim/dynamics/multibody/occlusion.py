@@ -1,4 +1,4 @@
-"""Occlusion of sources by the vehicle and the lab (MuJoCo ray casting) and by the dome's wall.
+"""Occlusion of sources by the vehicle and the lab: MuJoCo's ray casting.
 
 Sources and pupil are points: a source is visible or not, at the pose of mid-exposure. Wheels and gimbals are as at
 the start.
@@ -23,11 +23,9 @@ from skysim.dynamics.multibody.actuators.registry import lock_unused, set_start
 from skysim.dynamics.multibody.mass import CAMERA
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount, place_camera, put_at_origin
-from skysim.sources.dome.shell.surface import Surface
 
 OPAQUE, TRANSPARENT = 0, 5  # groups of geoms: those that block light, and the camera's own housing
 GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)  # rays are tested against the first only
-INWARD_FRACTION = 1e-6  # an LED is moved off its wall by this fraction of its distance from the bearing
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,16 +34,14 @@ class Obstacles:
 
     model, data   : MuJoCo model and data of their own, not the simulated ones; body bus is set as a mocap body
     camera_body_m : (3,) the pupil, where all rays end
-    wall          : the dome's inside; None in star scenes
     """
 
     model: Any
     data: Any
     camera_body_m: Floats
-    wall: Surface | None
 
 
-def build_obstacles(vehicle: VehicleModel, wall: Surface | None, mount: Mount | None = None) -> Obstacles:
+def build_obstacles(vehicle: VehicleModel, mount: Mount | None = None) -> Obstacles:
     """Compile the vehicle's file again with separate bodies: the simulated model has all rigid ones fused into bus.
 
     The camera's housing lets light through: all geoms of the body that carries the camera, if it is not bus, and any
@@ -68,7 +64,7 @@ def build_obstacles(vehicle: VehicleModel, wall: Surface | None, mount: Mount | 
     camera_body_m = (mount or camera_mount(vehicle)).camera_body_m
     housing = camera_housing(model, data, camera_body_m, is_main=mount is None)
     model.geom_group[:] = np.where(housing, TRANSPARENT, OPAQUE)
-    return Obstacles(model, data, camera_body_m, wall)
+    return Obstacles(model, data, camera_body_m)
 
 
 def camera_housing(model: Any, data: Any, camera_body_m: Floats, is_main: bool) -> NDArray[np.bool_]:
@@ -83,7 +79,7 @@ def camera_housing(model: Any, data: Any, camera_body_m: Floats, is_main: bool) 
 
 
 def occluded(obstacles: Obstacles, lab_from_body: Rotation, place: Floats) -> NDArray[np.bool_]:
-    """(N,) whether an obstacle is on the line from the pupil to each LED or star at that attitude.
+    """(N,) whether a part of the vehicle or the lab is on the line from the pupil to each LED or star at that attitude.
 
     place : (N, 4), as in `Sources`
     """
@@ -92,12 +88,7 @@ def occluded(obstacles: Obstacles, lab_from_body: Rotation, place: Floats) -> ND
     rays, end_m = _rays(np.ascontiguousarray(place), camera_m)
     obstacles.data.mocap_quat[obstacles.model.body("bus").mocapid[0]] = lab_from_body_wxyz
     mujoco.mj_kinematics(obstacles.model, obstacles.data)
-    free_m = free_distance_m(obstacles.model, obstacles.data, camera_m, rays)
-    blocked = free_m < end_m
-    if obstacles.wall is not None:
-        near = place[:, 3] > 0
-        blocked[near] |= behind_wall(obstacles.wall, camera_m, place[near, :3])
-    return np.asarray(blocked)
+    return free_distance_m(obstacles.model, obstacles.data, camera_m, rays) < end_m
 
 
 @jit
@@ -126,19 +117,3 @@ def free_distance_m(model: Any, data: Any, from_m: Floats, rays: Floats) -> Floa
             model, data, from_m, directions, GROUPS, True, -1, geom, distance_m, None, count, mujoco.mjMAXVAL
         )
     return np.where(distance_m >= 0, distance_m, np.inf)
-
-
-def behind_wall(wall: Surface, camera_m: Floats, position_m: Floats) -> NDArray[np.bool_]:
-    """(N,) whether the line from LEDs at (N, 3) to the camera passes through the dome's wall (not beneath its rim).
-
-    A camera inside sees no LED through the wall, as convex surfaces cannot hide their inside; all surfaces here are
-    convex, except for the millimeters of a surveyed one.
-    """
-    behind = np.zeros(len(position_m), dtype=bool)
-    if wall.inside(camera_m):
-        return behind
-    for n, led_m in enumerate(position_m * (1 - INWARD_FRACTION)):
-        ray = (camera_m - led_m)[None]
-        wall_m = wall.meet(led_m, ray)[0]
-        behind[n] = np.linalg.norm(wall_m - led_m) < np.linalg.norm(ray)  # NaN, beneath the rim, is not
-    return behind

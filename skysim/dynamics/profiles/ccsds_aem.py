@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.core.errors import InputError
-from skysim.core.io.ccsds import Segment, check_version, keyword_value, one_of
-from skysim.core.io.text import Line, excerpt, seconds_since, to_numbers
+from skysim.core.errors import InputError, Where
+from skysim.core.io.text import Line, Segment, check_version, excerpt, keyword_value, one_of, seconds_since, to_numbers
 from skysim.core.time import SCALES
 from skysim.core.types import Floats
 from skysim.dynamics.profiles.frames import REFERENCES, frame_of, icrs_from
@@ -37,7 +36,7 @@ def read_aem(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
     """The samples of all segments. Raises InputError for a file that is not an AEM of quaternions."""
     version, segments = split_segments(path, lines)
     if not segments:
-        raise InputError(f"{path}: no segment; allowed: META_START ... META_STOP, DATA_START ... DATA_STOP")
+        raise InputError(path, "no segment", "META_START ... META_STOP, DATA_START ... DATA_STOP")
     parts = [segment_samples(path, version, segment, start) for segment in segments]
     joined = parts[0]
     for part in parts[1:]:
@@ -52,7 +51,7 @@ def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[Segment]]:
         if line.split(maxsplit=1)[0] == "COMMENT":
             continue
         if line in ("META_START", "META_STOP", "DATA_START", "DATA_STOP"):
-            section = next_section(f"{path}, line {n}", section, line)
+            section = next_section(Where(path, n), section, line)
             if line == "META_START":
                 segments.append(Segment({}, []))
         elif section == "DATA_START":
@@ -64,19 +63,19 @@ def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[Segment]]:
             elif key == VERSION:
                 version = value
         else:
-            raise InputError(f"{path}, line {n}: {excerpt(line)} after {section}; allowed: DATA_START or META_START")
+            raise InputError(path, f"{excerpt(line)} after {section}", "DATA_START or META_START", where=Where(path, n))
     check_version(path, VERSION, version, VERSIONS)
     if section not in ("", "DATA_STOP"):
-        raise InputError(f"{path}: ends within a segment, after {section}: the file is cut off")
+        raise InputError(path, f"ends within a segment, after {section}: the file is cut off")
     return version, segments
 
 
-def next_section(where: str, section: str, keyword: str) -> str:
+def next_section(where: Where, section: str, keyword: str) -> str:
     """The section that a keyword begins or ends. Raises InputError if it is out of order."""
     after = {"META_START": ("", "DATA_STOP"), "META_STOP": ("META_START",)}
     after |= {"DATA_START": ("META_STOP",), "DATA_STOP": ("DATA_START",)}
     if section not in after[keyword]:
-        raise InputError(f"{where}: {keyword} after {section or 'the header'}")
+        raise InputError(where.file, f"{keyword} after {section or 'the header'}", where=where)
     return keyword
 
 
@@ -86,16 +85,18 @@ def segment_samples(path: Path, version: str, segment: Segment, start: datetime.
     segment.require(path, (*REQUIRED, *(("ATTITUDE_DIR", "QUATERNION_TYPE") if version == "1.0" else ())))
     system = one_of(path, metadata, "TIME_SYSTEM", SCALES)
     width = TYPES[one_of(path, metadata, "ATTITUDE_TYPE", TYPES)]
-    frames = [frame_of(f"{path}, line {metadata[key][0]}", metadata[key][1]) for key in REQUIRED[:2]]
+    frames = [frame_of(Where(path, metadata[key][0]), metadata[key][1]) for key in REQUIRED[:2]]
     names = [metadata[key][1] for key in REQUIRED[:2]]
     if sum(name.upper() in REFERENCES for name in names) != 1:
         raise InputError(
-            f"{path}, line {metadata['REF_FRAME_B'][0]}: the attitude of {names[1]} in {names[0]}; allowed: one of the"
-            " two an inertial or laboratory frame, the other of the vehicle"
+            path,
+            f"the attitude of {names[1]} in {names[0]}",
+            "one of the two an inertial or laboratory frame, the other of the vehicle",
+            where=Where(path, metadata["REF_FRAME_B"][0]),
         )
     for n, words in segment.data:
         if len(words) != width + 1:
-            raise InputError(f"{path}, line {n}: {len(words)} values; allowed: an epoch and {width} numbers")
+            raise InputError(path, f"{len(words)} values", f"an epoch and {width} numbers", where=Where(path, n))
     lines = [n for n, _ in segment.data]
     numbers = to_numbers(source, lines, [words[1:] for _, words in segment.data], width)
     t_s = seconds_since(source, lines, [words[0] for _, words in segment.data], start, system)
@@ -144,7 +145,7 @@ def join(first: Samples, second: Samples) -> Samples:
     if direction != first.direction:
         second = second.inverted()
     if second.direction != first.direction:
-        raise second.error(0, f"a segment of {direction} after one of {first.direction}; allowed: the same frames")
+        raise second.error(0, f"a segment of {direction} after one of {first.direction}", "the same frames")
     gap_s = second.t_s[0] - first.t_s[-1]
     if gap_s == 0 and (first.a_from_b[-1].inv() * second.a_from_b[0]).magnitude() < SAME_ATTITUDE_RAD:
         second = take(second, slice(1, None))
@@ -152,9 +153,7 @@ def join(first: Samples, second: Samples) -> Samples:
         raise second.error(0, f"a segment that begins {-gap_s:.6g} s before the end of the one before it")
     longest_s = max(float(np.diff(part.t_s).max(initial=0.0)) for part in (first, second))
     if gap_s > 1.5 * longest_s:
-        raise second.error(
-            0, f"a gap of {gap_s:.6g} s between two segments; allowed: up to 1.5 steps, {1.5 * longest_s:.6g}"
-        )
+        raise second.error(0, f"a gap of {gap_s:.6g} s between two segments", f"up to 1.5 steps, {1.5 * longest_s:.6g}")
     return replace(
         first,
         places=np.concatenate([first.places, second.places]),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from scipy.spatial.transform import Rotation
 
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, Where
 from skysim.core.io.text import excerpt
 from skysim.core.time import J2000_JD
 
@@ -14,11 +14,11 @@ REFERENCES = {ICRF: "icrs", "GCRF": "icrs", LAB: "lab", **dict.fromkeys(EME2000,
 VEHICLES = {BODY: "body", "SC_BODY": "body", CAMERA: "cam", "STARTRACKER": "cam"}
 
 
-def frame_of(where: str, name: str) -> str:
+def frame_of(where: Where, name: str) -> str:
     """The frame (icrs, lab, body or cam) that a file's name stands for. Raises InputError."""
     frames = REFERENCES | VEHICLES
     if name.upper() not in frames:
-        raise InputError(f"{where}: unknown frame {excerpt(name)}; allowed: {', '.join(frames)}")
+        raise InputError(where.file, f"unknown frame {excerpt(name)}", ", ".join(frames), where)
     return frames[name.upper()]
 
 

@@ -34,7 +34,7 @@ def load_profiles(scene: Scene, mount: Mount, given: Any = None) -> tuple[Attitu
                 samples = read_profile(source, in_utc(scene.start_time), element.rotation)
                 profiles.append(fit_spline(check_samples(to_body(samples, scene, mount))))
             except InputError as error:
-                raise InputError(f"motion.maneuver.{n}: {error}") from None
+                raise error.within(f"motion.maneuver.{n}") from None
     return tuple(profiles)
 
 
@@ -49,7 +49,7 @@ def read_profile(source: Any, start: datetime.datetime, rotation: str | None = N
     first = next((line for _, line in lines if not line.startswith("COMMENT")), "")
     named = first.startswith("CCSDS_AEM_VERS"), first.lower().startswith("stk.v.")
     if any(named) and rotation is not None:
-        raise InputError(f"{source}: the file names its frames; allowed: no key rotation in the maneuver")
+        raise InputError(source, "the file names its frames", "no key rotation in the maneuver")
     if named[0]:
         return ccsds_aem.read_aem(source, lines, start)
     if named[1]:
@@ -57,7 +57,7 @@ def read_profile(source: Any, start: datetime.datetime, rotation: str | None = N
     if first.startswith("# %ECSV"):
         return table.read_ecsv(source, start, rotation)
     if first.startswith("<"):
-        raise InputError(f"{source}: XML; allowed: CSV, ECSV, CCSDS AEM in keyword = value notation, or STK (.a)")
+        raise InputError(source, "XML", "CSV, ECSV, CCSDS AEM in keyword = value notation, or STK (.a)")
     return table.read_csv(source, lines, start, rotation)
 
 
@@ -69,8 +69,9 @@ def to_body(samples: Samples, scene: Scene, mount: Mount) -> Samples:
     allowed = ("icrs_from_body", "icrs_from_cam") if sky else ("lab_from_body",)
     if samples.direction not in allowed:
         raise InputError(
-            f"{samples.source}: attitudes {samples.direction}; allowed with light of kind {scene.light.kind}:"
-            f" {', '.join(allowed)}, or the inverse"
+            samples.source,
+            f"attitudes {samples.direction} with light of kind {scene.light.kind}",
+            f"{', '.join(allowed)}, or the inverse",
         )
     lab_from_body = samples.a_from_b * mount.cam_from_body if samples.b == "cam" else samples.a_from_b
     return Samples(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, Where
 from skysim.core.types import Floats
 
 MIN_SAMPLES, MAX_SAMPLES = 4, 1_000_000  # a not-a-knot cubic takes four
@@ -41,9 +41,9 @@ class Samples:
     a_from_b: Rotation
     absolute: bool = False
 
-    def error(self, n: int, problem: str) -> InputError:
+    def error(self, n: int, problem: str, allowed: str = "") -> InputError:
         """The error of one sample."""
-        return InputError(f"{self.source}, {self.unit} {self.places[n]}: {problem}")
+        return InputError(self.source, problem, allowed, Where(self.source, int(self.places[n]), self.unit))
 
     @property
     def direction(self) -> str:
@@ -70,8 +70,10 @@ def from_quaternions(
     bad = np.flatnonzero(~(np.abs(norm - 1) <= UNIT_TOLERANCE))  # NaN is bad, too
     if len(bad):
         raise InputError(
-            f"{source}, {unit} {places[bad[0]]}: a quaternion of norm {norm[bad[0]]:.6g}; allowed: 1, to"
-            f" {UNIT_TOLERANCE:g}"
+            source,
+            f"a quaternion of norm {norm[bad[0]]:.6g}",
+            f"1, to {UNIT_TOLERANCE:g}",
+            where=Where(source, int(places[bad[0]]), unit),
         )
     rotation = Rotation.from_quat(xyzw) if len(xyzw) else Rotation.identity(0)
     return Samples(source, unit, places, t_s, *frames, rotation, absolute)
@@ -81,11 +83,9 @@ def check_samples(samples: Samples) -> Samples:
     """The samples. Raises InputError for too few or too many, times that do not ascend, or samples too far apart."""
     count = len(samples.t_s)
     if not MIN_SAMPLES <= count <= MAX_SAMPLES:
-        raise InputError(f"{samples.source}: {count} attitudes; allowed: {MIN_SAMPLES} to {MAX_SAMPLES}")
+        raise InputError(samples.source, f"{count} attitudes", f"{MIN_SAMPLES} to {MAX_SAMPLES}")
     if len(bad := np.flatnonzero(~(np.abs(samples.t_s) <= MAX_TIME_S))):
-        raise samples.error(
-            int(bad[0]), f"time {samples.t_s[bad[0]]:.9g} s; allowed: within {MAX_TIME_S:g} s of the start"
-        )
+        raise samples.error(int(bad[0]), f"time {samples.t_s[bad[0]]:.9g} s", f"within {MAX_TIME_S:g} s of the start")
     if len(bad := np.flatnonzero(np.diff(samples.t_s) < MIN_STEP_S)):
         n = int(bad[0]) + 1
         after, before = samples.t_s[n], samples.t_s[n - 1]
@@ -95,7 +95,7 @@ def check_samples(samples: Samples) -> Samples:
         n = int(bad[0]) + 1
         raise samples.error(
             n,
-            f"{angle_deg[n - 1]:.3g} deg from the attitude before it; allowed: up to {MAX_STEP_DEG:g} deg; sample more"
-            " densely",
+            f"{angle_deg[n - 1]:.3g} deg from the attitude before it",
+            f"up to {MAX_STEP_DEG:g} deg; sample more densely",
         )
     return samples

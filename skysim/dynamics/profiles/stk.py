@@ -11,7 +11,7 @@ import datetime
 from dataclasses import replace
 from pathlib import Path
 
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, Where, unknown_name
 from skysim.core.io.text import Line, excerpt, to_numbers
 from skysim.dynamics.profiles.frames import REFERENCES, icrs_from
 from skysim.dynamics.profiles.samples import Samples, from_quaternions
@@ -41,21 +41,21 @@ def read_stk(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
             break
         if not inside:
             if lower.split() != ["begin", "attitude"]:
-                raise InputError(f"{path}, line {n}: {excerpt(line)}; allowed: BEGIN Attitude")
+                raise InputError(path, excerpt(line), "BEGIN Attitude", where=Where(path, n))
             inside = True
         elif section:
             rows.append((n, words))
         elif lower.startswith("attitudetime"):
             if lower not in SECTIONS:
-                raise InputError(f"{path}, line {n}: {unknown_name('data', words[0], SECTION_NAMES)}")
+                raise InputError(path, *unknown_name("data", words[0], SECTION_NAMES), Where(path, n))
             section = lower
         else:
             name = next((known for known in KEYWORDS if known.lower() == words[0].lower()), None)
             if name is None:
-                raise InputError(f"{path}, line {n}: {unknown_name('keyword', words[0], KEYWORDS)}")
+                raise InputError(path, *unknown_name("keyword", words[0], KEYWORDS), Where(path, n))
             keywords[name] = (n, " ".join(words[1:]))
     if not section:
-        raise InputError(f"{path}: no attitudes; allowed: {', '.join(SECTION_NAMES)}")
+        raise InputError(path, "no attitudes", ", ".join(SECTION_NAMES))
     return to_samples(path, keywords, section, rows, start)
 
 
@@ -72,11 +72,11 @@ def to_samples(
     for key, allowed in (("CentralBody", "Earth"), ("TimeFormat", "EpSec")):
         line, value = keywords.get(key, (0, allowed))
         if value.lower() != allowed.lower():
-            raise InputError(f"{path}, line {line}: {key} {excerpt(value)}; allowed: {allowed}")
+            raise InputError(path, f"{key} {excerpt(value)}", allowed, where=Where(path, line))
     line, axes = keywords.get("CoordinateAxes", (0, ""))
     if axes.upper() not in REFERENCES:
-        where = f"{path}, line {line}" if line else str(path)
-        raise InputError(f"{where}: CoordinateAxes {excerpt(axes)}; allowed: {', '.join(REFERENCES)}")
+        where = Where(path, line) if line else None
+        raise InputError(path, f"CoordinateAxes {excerpt(axes)}", ", ".join(REFERENCES), where)
     places = [n for n, _ in rows]
     values = to_numbers(str(path), places, [words for _, words in rows], width)
     t_s = values[:, 0]
@@ -95,10 +95,10 @@ def point_count(path: Path, keywords: dict[str, Line], count: int) -> int:
         return count
     line, text = keywords["NumberOfAttitudePoints"]
     if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise InputError(f"{path}, line {line}: NumberOfAttitudePoints {excerpt(text)}; allowed: a whole number")
+        raise InputError(path, f"NumberOfAttitudePoints {excerpt(text)}", "a whole number", where=Where(path, line))
     if int(text) > count:
         raise InputError(
-            f"{path}, line {line}: NumberOfAttitudePoints {text}, but there are {count}: the file is cut off"
+            path, f"NumberOfAttitudePoints {text}, but there are {count}: the file is cut off", where=Where(path, line)
         )
     return int(text)
 
@@ -114,5 +114,5 @@ def scenario_epoch(path: Path, line: int, text: str) -> datetime.datetime:
         return date + datetime.timedelta(hours=int(hours), minutes=int(minutes), seconds=float(seconds))
     except (ValueError, OverflowError):
         raise InputError(
-            f"{path}, line {line}: ScenarioEpoch {excerpt(text)}; allowed: 1 Jul 2005 12:00:00.00"
+            path, f"ScenarioEpoch {excerpt(text)}", "1 Jul 2005 12:00:00.00", where=Where(path, line)
         ) from None

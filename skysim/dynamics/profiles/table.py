@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.core.errors import InputError, printable
+from skysim.core.errors import InputError, Where, printable
 from skysim.core.io import files
 from skysim.core.io.text import Line, excerpt, seconds_since, to_numbers
 from skysim.core.types import Floats
@@ -41,12 +41,12 @@ def read_csv(path: Path, lines: list[Line], start: datetime.datetime, rotation: 
     """Samples of a CSV file: a line of column names, then a line each; lines that begin with # are comments."""
     rows = [(n, [cell.strip() for cell in line.split(",")]) for n, line in lines if not line.startswith("#")]
     if not rows:
-        raise InputError(f"{path}: empty; allowed: a line of column names, then a line for each attitude")
+        raise InputError(path, "empty", "a line of column names, then a line for each attitude")
     (head, names), body = rows[0], rows[1:]
-    check_names(f"{path}, line {head}", names, rotation)
+    check_names(Where(path, head), names, rotation)
     for n, cells in body:
         if len(cells) != len(names):
-            raise InputError(f"{path}, line {n}: {len(cells)} values; allowed: {len(names)}, one for each column")
+            raise InputError(path, f"{len(cells)} values", f"{len(names)}, one for each column", where=Where(path, n))
     places, columns = [n for n, _ in body], dict[str, Any]()
     if "utc" in names:
         date = names.index("utc")
@@ -69,19 +69,19 @@ def from_table(table: Any, source: str, start: datetime.datetime, rotation: str 
         columns = {name: table[name] for name in names}
     except (AttributeError, TypeError, KeyError):
         raise InputError(
-            f"{source}: {type(table).__name__}; allowed: an astropy Table, a pandas DataFrame or a mapping of columns"
+            source, type(table).__name__, "an astropy Table, a pandas DataFrame or a mapping of columns"
         ) from None
-    check_names(source, names, rotation)
+    check_names(Where(source), names, rotation)
     values: dict[str, Any] = {}
     for name, column in columns.items():
         unit = getattr(column, "unit", None)
         if unit is not None and str(unit) != UNITS.get(name, ""):
-            raise InputError(f"{source}: column {name} is in {unit}; allowed: {UNITS.get(name) or 'no unit'}")
+            raise InputError(source, f"column {name} is in {unit}", UNITS.get(name) or "no unit")
         values[name] = to_epochs(column) if name == "utc" else to_column(source, name, column)
     count = len(next(iter(values.values())))
     for name, column in values.items():
         if len(column) != count:
-            raise InputError(f"{source}: column {name} has {len(column)} values; allowed: {count}, as the first")
+            raise InputError(source, f"column {name} has {len(column)} values", f"{count}, as the first")
     return to_samples(source, "row", range(1, count + 1), values, start, rotation)
 
 
@@ -90,11 +90,11 @@ def to_column(source: str, name: str, column: Any) -> Floats:
     try:
         numbers = np.ma.filled(np.ma.asarray(column).astype(np.float64), np.nan)
     except (TypeError, ValueError):
-        raise InputError(f"{source}: column {name} has values that are no numbers") from None
+        raise InputError(source, f"column {name} has values that are no numbers") from None
     if numbers.ndim != 1:
-        raise InputError(f"{source}: column {name} has shape {numbers.shape}; allowed: one number in each row")
+        raise InputError(source, f"column {name} has shape {numbers.shape}", "one number in each row")
     if len(bad := np.flatnonzero(~np.isfinite(numbers))):
-        raise InputError(f"{source}, row {bad[0] + 1}: {name} is not a finite number")
+        raise InputError(source, f"{name} is not a finite number", where=Where(source, int(bad[0]) + 1, "row"))
     return np.asarray(numbers, dtype=np.float64)
 
 
@@ -110,28 +110,30 @@ def to_epochs(column: Any) -> list[str]:
     return [value.isoformat() if isinstance(value, datetime.datetime) else str(value) for value in values.tolist()]
 
 
-def check_names(where: str, names: Sequence[str], rotation: str | None) -> None:
+def check_names(where: Where, names: Sequence[str], rotation: str | None) -> None:
     """Raise InputError unless the columns are one time and one attitude, and no others."""
     repeated = [name for n, name in enumerate(names) if name in names[:n]]
     if repeated:
-        raise InputError(f"{where}: two columns {excerpt(repeated[0])}; allowed: one")
+        raise InputError(where.file, f"two columns {excerpt(repeated[0])}", "one", where)
     attitudes = [tuple(f"{name}_q{end}" for end in "xyzw") for name in QUATERNIONS]
     attitudes += [BARE, BODY_ANGLES, CAMERA_ANGLES]
     known = {*TIMES, *(name for columns in attitudes for name in columns)}
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise InputError(f"{where}: unknown column {excerpt(unknown[0])}; allowed: {COLUMNS}")
+        raise InputError(where.file, f"unknown column {excerpt(unknown[0])}", COLUMNS, where)
     found = {name for name in names if name not in TIMES}
     if len(found) + 1 != len(names) or not any(set(columns) == found for columns in attitudes):
         given = ", ".join(printable(name) for name in names)
-        raise InputError(f"{where}: columns {given} are not one time and one attitude; allowed: {COLUMNS}")
+        raise InputError(where.file, f"columns {given} are not one time and one attitude", COLUMNS, where)
     if found == set(BARE) and rotation is None:
         raise InputError(
-            f"{where}: q_x, q_y, q_z, q_w do not say which rotation they are; allowed: rotation: {QUATERNIONS[0]} in"
-            f" the maneuver, or columns {QUATERNIONS[0]}_qx, ..."
+            where.file,
+            "q_x, q_y, q_z, q_w do not say which rotation they are",
+            f"rotation: {QUATERNIONS[0]} in the maneuver, or columns {QUATERNIONS[0]}_qx, ...",
+            where,
         )
     if found != set(BARE) and rotation is not None:
-        raise InputError(f"{where}: the columns name the rotation; allowed: no key rotation in the maneuver")
+        raise InputError(where.file, "the columns name the rotation", "no key rotation in the maneuver", where)
 
 
 def to_samples(
@@ -155,7 +157,7 @@ def to_samples(
         return Samples(source, unit, ends, t_s, "lab", "body", body, absolute)
     if "ra_deg" in columns:
         if len(bad := np.flatnonzero(np.abs(columns["dec_deg"]) > 90)):
-            raise InputError(f"{source}, {unit} {places[bad[0]]}: dec_deg is beyond a pole; allowed: -90 to 90")
+            raise InputError(source, "dec_deg is beyond a pole", "-90 to 90", where=Where(source, places[bad[0]], unit))
         camera = cam_from_icrs(*stack(columns, CAMERA_ANGLES).T)
         return Samples(source, unit, ends, t_s, "cam", "icrs", camera, absolute)
     first = next(name for name in columns if name.endswith(("_qw", "q_w")))

@@ -9,9 +9,9 @@ import numpy as np
 from estimator.calibration.mass_properties.record import Lab, Prior, inertia_six
 from skysim.core.constants import RPM_RAD_S
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import option_quantities
 from skysim.core.random_streams import BALANCE, random_stream
 from skysim.core.types import Floats
+from skysim.core.units import quantities_within
 from skysim.dynamics import imu
 from skysim.dynamics.multibody import VehicleModel
 from skysim.scene.scene import Scene
@@ -23,8 +23,8 @@ LEAST_TORQUE_NM = 1e-7  # rms of the random torque that is always assumed
 DEFAULT_CORRELATION_S = 2.0
 MAX_TACHO_RPM = 1000.0
 
-# Options: unit, quantity, example, minimum and maximum.
-OPTIONS = {
+# Unit, quantity, example, minimum and maximum.
+RANGES = {
     "inertia_sigma": ("", "share", '"10%"', 1e-3, 0.5),
     "offset_sigma": ("m", "length", '"300 um"', 1e-7, 0.01),
     "wheel_sigma": ("", "share", '"0.1%"', 1e-6, 0.1),
@@ -53,11 +53,11 @@ class Uncertainty:
 def parse_uncertainty(
     inertia_sigma: str, offset_sigma: str, wheel_sigma: str, mount_sigma: str, tacho_sigma_rpm: float
 ) -> Uncertainty:
-    """Parse the command line's quantities. Raises InputError for an invalid or out-of-range value."""
+    """Parse quantities with units. Raises InputError for an invalid or out-of-range value."""
     texts = inertia_sigma, offset_sigma, wheel_sigma, mount_sigma
-    inertia, offset_m, wheel, mount_rad = option_quantities(OPTIONS, texts)
+    inertia, offset_m, wheel, mount_rad = quantities_within("balance", RANGES, texts)
     if not 0 <= tacho_sigma_rpm <= MAX_TACHO_RPM:
-        raise InputError(f"--tacho-sigma {tacho_sigma_rpm:g}: allowed: 0 to {MAX_TACHO_RPM:g} rpm")
+        raise InputError("balance.tacho_sigma", f"{tacho_sigma_rpm:g}", f"0 to {MAX_TACHO_RPM:g} rpm")
     return Uncertainty(inertia, offset_m, wheel, mount_rad, tacho_sigma_rpm * RPM_RAD_S)
 
 

@@ -52,13 +52,13 @@ def check_scene(scene: Scene) -> None:
     """Refuse a scene whose vehicle cannot be weighed so."""
     vehicle = scene.vehicle
     if vehicle.mount != "air_bearing":
-        raise InputError("vehicle.mount: a free vehicle has no bearing to be balanced on; allowed: air_bearing")
+        raise InputError("vehicle.mount", "a free vehicle has no bearing to be balanced on", "air_bearing")
     if isinstance(scene.light, StarsConfig):
-        raise InputError("light.kind: stars: balancing needs attitudes relative to the lab; allowed: dome")
+        raise InputError("light.kind", "stars: balancing needs attitudes relative to the lab", "dome")
     if vehicle.disturbances.cable:
-        raise InputError("vehicle.disturbances.cable: its spring acts like a low center of mass; allowed: no cable")
+        raise InputError("vehicle.disturbances.cable", "its spring acts like a low center of mass", "no cable")
     if vehicle.cmgs:
-        raise InputError("vehicle.cmgs: the stored momentum must be that of wheels; allowed: no cmgs")
+        raise InputError("vehicle.cmgs", "the stored momentum must be that of wheels", "no cmgs")
 
 
 def excited_by_wheels(scene: Scene, vehicle: VehicleModel, tilt_deg: float) -> Scene:
@@ -69,7 +69,7 @@ def excited_by_wheels(scene: Scene, vehicle: VehicleModel, tilt_deg: float) -> S
     """
     wheels = scene.vehicle.wheels
     if wheels is None:
-        raise InputError("vehicle.wheels: none, and the inertia's scale is that of the wheels; allowed: --excite swing")
+        raise InputError("vehicle.wheels", "none, and the inertia's scale is that of the wheels", "excite swing")
     largest = float(np.linalg.eigvalsh(vehicle.inertia_kg_m2)[2])
     torque = TORQUE_SHARE * wheels.torque_limit_nm / (largest * math.radians(tilt_deg))
     limit_rad_s = wheels.speed_limit_rpm * RPM_RAD_S
@@ -137,7 +137,7 @@ def fly(
     kept = rows[: contact[0]] if len(contact) else rows
     if len(kept) < LEAST_ATTITUDES:
         cause = "before the vehicle touched its tilt stop: balance it by hand first" if len(contact) else "were solved"
-        raise InputError(f"balance: {len(kept)} attitudes {cause}; allowed: {LEAST_ATTITUDES} or more")
+        raise InputError("balance", f"{len(kept)} attitudes {cause}", f"{LEAST_ATTITUDES} or more")
     t_s, attitudes, covariances, shared = zip(*kept, strict=True)
     speeds = log.wheel_rad_s + uncertainty.tacho_sigma_rad_s * random_stream(scene.seed, BALANCE, 1).standard_normal(
         log.wheel_rad_s.shape

@@ -43,7 +43,7 @@ def check_observed(
                 f"{known}, not {1e6 * moment_bar_kg_m[axis]:.3g}, after tilts of {tilt_deg:.1f} deg: {needed}"
             )
     if faults:
-        raise InputError(f"balance: {faults[0]}{f' ({len(faults) - 1} more)' if len(faults) > 1 else ''}")
+        raise InputError("balance", f"{faults[0]}{f' ({len(faults) - 1} more)' if len(faults) > 1 else ''}")
 
 
 def remedy(motion: str, sigma: float, prior_sigma: float, bar: float) -> str:

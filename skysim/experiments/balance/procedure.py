@@ -17,8 +17,8 @@ from estimator.calibration.mass_properties.record import MOMENT, BearingRecord, 
 from estimator.calibration.mass_properties.recursive import filter_mass
 from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import quantity
 from skysim.core.types import Floats
+from skysim.core.units import quantity
 from skysim.dynamics import multibody
 from skysim.dynamics.multibody import VehicleModel
 from skysim.experiments.balance import flight
@@ -66,15 +66,15 @@ class Bars:
 
 
 def parse_bars(torque: str, inertia_percent: float, offset: str | None) -> Bars:
-    """Parse the command line's bars. Raises InputError for what is no torque or length, or not above 0."""
+    """Parse the bars. Raises InputError for what is no torque or length, or not above 0."""
     values: list[float | None] = []
-    for option, text, unit, what in (("--torque", torque, "N m", "torque"), ("--offset-bar", offset, "m", "length")):
+    for name, text, unit, what in (("torque", torque, "N m", "torque"), ("offset_bar", offset, "m", "length")):
         try:
             value = None if text is None else quantity(unit, what, '"1 um"' if unit == "m" else '"5e-5 N m"')(text)
-        except ValueError as error:
-            raise InputError(f"{option}: {error}") from None
+        except InputError as error:
+            raise error.under(f"balance.{name}") from None
         if value is not None and not value > 0:
-            raise InputError(f"{option} {text}: allowed: above 0")
+            raise InputError(f"balance.{name}", text, "above 0")
         values.append(value)
     torque_nm, offset_m = values
     assert torque_nm is not None
@@ -129,8 +129,9 @@ def balance(scene: Scene, plan: Plan, uncertainty: Uncertainty, watch: Watch | N
     vehicle = multibody.build(scene.vehicle)
     if plan.moves and not len(vehicle.trims):
         raise InputError(
-            "vehicle.trim: none, so nothing can be moved; allowed: joints trim_* in the vehicle's file and"
-            " vehicle.trim, or --estimate-only"
+            "vehicle.trim",
+            "none, so nothing can be moved",
+            "joints trim_* in the vehicle's file and vehicle.trim, or an estimate only",
         )
     assumptions, records = assumed(scene, uncertainty), list[BearingRecord]()
     position_m = vehicle.trims.position_m
@@ -169,7 +170,7 @@ def estimated(records: list[BearingRecord], assumptions: Assumptions) -> MassEst
     try:
         return estimate_with_noise(records, assumptions.lab, assumptions.prior)
     except ImageError as error:
-        raise InputError(f"balance: {error}") from error
+        raise InputError("balance", error) from error
 
 
 def filtered(record: BearingRecord, assumptions: Assumptions) -> MassEstimate:
@@ -177,7 +178,7 @@ def filtered(record: BearingRecord, assumptions: Assumptions) -> MassEstimate:
     try:
         *_, last = filter_mass(record, assumptions.lab, assumptions.prior)
     except ImageError as error:
-        raise InputError(f"balance: {error}") from error
+        raise InputError("balance", error) from error
     return last
 
 
@@ -188,16 +189,18 @@ def balanced_position_m(vehicle: VehicleModel, moment_kg_m: Floats, scene: Scene
     lever = trims.axes * trims.mass_kg
     if np.linalg.matrix_rank(lever, tol=MAX_SHRINK) < 3:
         raise InputError(
-            f"vehicle.trim: {', '.join(trims.names)} do not move the center of mass along all axes; allowed: three"
-            " slides in independent directions"
+            "vehicle.trim",
+            f"{', '.join(trims.names)} do not move the center of mass along all axes",
+            "three slides in independent directions",
         )
     position_m = trims.position_m - np.linalg.pinv(lever) @ moment_kg_m
     worst = int(np.argmax(np.abs(position_m)))
     if abs(position_m[worst]) > config.travel_m:
         excess_kg_m = trims.mass_kg[worst] * (abs(position_m[worst]) - config.travel_m)
         raise InputError(
-            f"balance: {trims.names[worst]} would have to go to {1e3 * position_m[worst]:.1f} mm; allowed:"
-            f" vehicle.trim.travel {1e3 * config.travel_m:g} mm: first move ballast along its axis, by"
-            f" {1e6 * excess_kg_m:.3g} g mm"
+            "balance",
+            f"{trims.names[worst]} would have to go to {1e3 * position_m[worst]:.1f} mm",
+            f"vehicle.trim.travel {1e3 * config.travel_m:g} mm: first move ballast along its axis, by"
+            f" {1e6 * excess_kg_m:.3g} g mm",
         )
     return np.asarray(position_m)

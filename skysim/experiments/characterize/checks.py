@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -43,8 +44,9 @@ def check_darks(darks: Stack) -> None:
         worst, path = max(medians)
         if worst - middle > max(MEDIAN_SIGMAS * noise_dn, 1.0):
             raise InputError(
-                f"{path}: not dark: median {worst:g} DN, the other frames of {describe(setting)} {middle:g} DN;"
-                " allowed: darks with the lens capped"
+                path,
+                f"not dark: median {worst:g} DN, the other frames of {describe(setting)} {middle:g} DN",
+                "darks with the lens capped",
             )
     for level in darks.levels:
         check_dark(darks, level)
@@ -52,8 +54,9 @@ def check_darks(darks: Stack) -> None:
     if len(times) < 2:
         only = times.pop()
         raise InputError(
-            f"--darks {darks.folder}: darks of {only:g} s only; allowed: two exposures or more: add 4 of the shortest"
-            f" and 4 of {max(10 * only, 10):g} s"
+            darks.folder,
+            f"darks of {only:g} s only",
+            f"two exposures or more: add 4 of the shortest and 4 of {max(10 * only, 10):g} s",
         )
 
 
@@ -64,20 +67,21 @@ def level_of(stack: Stack, setting: Setting) -> Level:
 
 def check_dark(darks: Stack, level: Level) -> None:
     """Raise InputError for a level of darks that is cut off at 0, equal frame by frame, or has structure or stars."""
-    where = f"--darks {darks.folder}: the darks of {describe(Setting(level.exposure_s, level.temperature_c))}"
+    folder, which = darks.folder, f"the darks of {describe(Setting(level.exposure_s, level.temperature_c))}"
     mean, noise_dn = level.mean_dn, math.sqrt(float(np.median(level.variance_dn2)))
     zeros = float(np.mean(mean < 1))
     if zeros > MAX_ZEROS:
-        raise InputError(f"{where} have {100 * zeros:.2g} % of the pixels at 0 DN; allowed: a higher black level")
+        raise InputError(folder, f"{which} have {100 * zeros:.2g} % of the pixels at 0 DN", "a higher black level")
     if not level.variance_dn2.any():
-        raise InputError(f"{where} are equal in every pixel; allowed: frames of their own, no copies")
+        raise InputError(folder, f"{which} are equal in every pixel", "frames of their own, no copies")
     noise_dn = max(noise_dn, 0.3)
     medians = block_medians(mean)
     if (extent := float(np.ptp(medians))) > MAX_DARK_RANGE * noise_dn:
         place = extremes(medians)
         raise InputError(
-            f"{where} are not dark: {extent:.3g} DN brighter at the {place.brightest} than at the {place.darkest};"
-            f" allowed: {MAX_DARK_RANGE * noise_dn:.2g} DN: cap the lens, cover the window"
+            folder,
+            f"{which} are not dark: {extent:.3g} DN brighter at the {place.brightest} than at the {place.darkest}",
+            f"{MAX_DARK_RANGE * noise_dn:.2g} DN: cap the lens, cover the window",
         )
     # Hot pixels are single, but for those that touch by chance; images of stars cover several pixels. A track of a
     # particle is in one half of the frames.
@@ -89,8 +93,10 @@ def check_dark(darks: Stack, level: Level) -> None:
     if (touching := int((sizes >= SPOT_PIXELS).sum())) > MAX_SPOTS + by_chance:
         y, x = ndimage.center_of_mass(bright, labels, int(np.argmax(sizes)) + 1)
         raise InputError(
-            f"{where} are not dark: {touching} spots of {SPOT_PIXELS} pixels or more, the largest at"
-            f" x {x:.0f}, y {y:.0f}; allowed: darks with the lens capped"
+            folder,
+            f"{which} are not dark: {touching} spots of {SPOT_PIXELS} pixels or more, the largest at x {x:.0f},"
+            f" y {y:.0f}",
+            "darks with the lens capped",
         )
 
 
@@ -102,39 +108,43 @@ def check_flats(flats: Stack, usable: Mask, black_dn: float) -> None:
     below = (signals < FIT_RANGE * top) & (signals > 0.01 * top)
     if signals.min() > 0.95 * top and times.max() > 1.2 * times.min():
         raise InputError(
-            f"--flats {flats.folder}: all saturated, at {top + black_dn:.0f} DN; allowed: {LEAST_LEVELS} levels or more"
-            f" below: exposures shorter than {times.min():.3g} s"
+            flats.folder,
+            f"all saturated, at {top + black_dn:.0f} DN",
+            f"{LEAST_LEVELS} levels or more below: exposures shorter than {times.min():.3g} s",
         )
     if below.sum() < LEAST_LEVELS:
         lacking = LEAST_LEVELS - int(below.sum())
         longest = float(times[signals >= top].min())
         raise InputError(
-            f"--flats {flats.folder}: {int(below.sum())} levels from 1 to {100 * FIT_RANGE:.0f} % of the brightest;"
-            f" allowed: {LEAST_LEVELS} or more: add pairs at {lacking} exposures from {0.05 * longest:.2g} to"
-            f" {0.6 * longest:.2g} s"
+            flats.folder,
+            f"{int(below.sum())} levels from 1 to {100 * FIT_RANGE:.0f} % of the brightest",
+            f"{LEAST_LEVELS} or more: add pairs at {lacking} exposures from {0.05 * longest:.2g} to"
+            f" {0.6 * longest:.2g} s",
         )
     for one, signal in zip(flats.levels, signals, strict=True):
-        where = f"--flats {flats.folder}: the flats of {describe(Setting(one.exposure_s, one.temperature_c))}"
+        which = f"the flats of {describe(Setting(one.exposure_s, one.temperature_c))}"
         if not one.variance_dn2.any() and signal < 0.95 * top:
-            raise InputError(f"{where} are equal in every pixel; allowed: frames of their own, no copies")
+            raise InputError(flats.folder, f"{which} are equal in every pixel", "frames of their own, no copies")
         change = math.sqrt(one.difference_dn2) / signal if signal > 0.02 * top else 0.0
         if change > MAX_PAIR_CHANGE:
             raise InputError(
-                f"{where} differ by {100 * change:.2g} % from frame to frame; allowed: {100 * MAX_PAIR_CHANGE:g} %:"
-                " a steady lamp, warmed up, on direct current"
+                flats.folder,
+                f"{which} differ by {100 * change:.2g} % from frame to frame",
+                f"{100 * MAX_PAIR_CHANGE:g} %: a steady lamp, warmed up, on direct current",
             )
         if BRIGHT * top < signal < FIT_RANGE * top:
-            check_flat(where, block_medians(one.mean_dn) - black_dn)
+            check_flat(flats.folder, which, block_medians(one.mean_dn) - black_dn)
 
 
-def check_flat(where: str, medians: Floats) -> None:
+def check_flat(folder: Path, which: str, medians: Floats) -> None:
     """Raise InputError for a flat whose blocks' medians differ too much."""
     extent = float(np.ptp(medians) / medians.mean())
     if extent > MAX_FLAT_RANGE:
         place = extremes(medians)
         raise InputError(
-            f"{where} are not flat: {100 * extent:.0f} % brighter at the {place.brightest} than at the"
-            f" {place.darkest}; allowed: {100 * MAX_FLAT_RANGE:.0f} %: an integrating sphere or a diffuser, no lens"
+            folder,
+            f"{which} are not flat: {100 * extent:.0f} % brighter at the {place.brightest} than at the {place.darkest}",
+            f"{100 * MAX_FLAT_RANGE:.0f} %: an integrating sphere or a diffuser, no lens",
         )
 
 

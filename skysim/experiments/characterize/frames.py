@@ -45,10 +45,10 @@ class Stack:
     shape: tuple[int, ...] = ()
 
 
-def image_files(folder: Path, option: str) -> list[Path]:
+def image_files(folder: Path) -> list[Path]:
     """The images of a folder and its subfolders, by name; of several formats of one name FITS. Raises InputError."""
     if not folder.is_dir():
-        raise InputError(f"--{option} {folder}: no such folder; allowed: a folder of images")
+        raise InputError(folder, "no such folder", "a folder of images")
     best: dict[Path, Path] = {}
     for path in sorted(folder.rglob("*")):
         if (suffix := images.image_suffix(path.name)) and path.name[0] != ".":
@@ -56,14 +56,14 @@ def image_files(folder: Path, option: str) -> list[Path]:
             best[stem] = min(best.get(stem, path), path, key=lambda one: not images.is_fits(one))
     found = list(best.values())
     if not found:
-        raise InputError(f"--{option} {folder}: no images; allowed: {', '.join(images.IMAGE_SUFFIXES)}")
+        raise InputError(folder, "no images", ", ".join(images.IMAGE_SUFFIXES))
     return found
 
 
-def read_frames(folder: Path, option: str) -> Iterator[tuple[Path, Setting, NDArray[np.uint16]]]:
+def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, NDArray[np.uint16]]]:
     """The frames of a folder. Raises InputError for a frame that cannot be used."""
     tables: dict[Path, dict[str, Setting]] = {}
-    for path in image_files(folder, option):
+    for path in image_files(folder):
         parent = path.parent
         if parent not in tables:
             tables[parent] = read_settings(parent / TABLE) if (parent / TABLE).exists() else {}
@@ -74,13 +74,13 @@ def read_frames(folder: Path, option: str) -> Iterator[tuple[Path, Setting, NDAr
 def raw_numbers(path: Path, pixels: NDArray) -> NDArray[np.uint16]:
     """The digital numbers of a frame. Raises InputError unless they are a raw monochrome frame's."""
     if pixels.ndim != 2:
-        raise InputError(f"{path}: a color image; allowed: monochrome frames, raw, of 8 to 16 bits a pixel")
+        raise InputError(path, "a color image", "monochrome frames, raw, of 8 to 16 bits a pixel")
     if images.image_suffix(path.name) in (".jpg", ".jpeg"):
-        raise InputError(f"{path}: JPEG changes the noise; allowed: raw frames in FITS, PNG or TIFF")
+        raise InputError(path, "JPEG changes the noise", "raw frames in FITS, PNG or TIFF")
     if pixels.dtype.kind == "f" and not np.all(pixels == np.rint(pixels)):
-        raise InputError(f"{path}: numbers that are not whole, as of an average; allowed: raw frames")
+        raise InputError(path, "numbers that are not whole, as of an average", "raw frames")
     if pixels.min() < 0 or pixels.max() > 65535:
-        raise InputError(f"{path}: {pixels.min()} to {pixels.max()} DN; allowed: 0 to 65535")
+        raise InputError(path, f"{pixels.min()} to {pixels.max()} DN", "0 to 65535")
     return pixels.astype(np.uint16)
 
 
@@ -96,8 +96,10 @@ def setting_of(path: Path, root: Path, picture: images.Picture, table: dict[str,
         temperature_c = next((float(hit[1]) for name in names if (hit := TEMPERATURE.search(name))), None)
     if exposure_s is None or exposure_s < 0:
         raise InputError(
-            f"{path}: no exposure time; allowed: EXPTIME in a FITS header, a row of {TABLE} beside it (file,"
-            " exposure_s, temperature_c), or a name such as dark_100ms_20C_01.png"
+            path,
+            "no exposure time",
+            f"EXPTIME in a FITS header, a row of {TABLE} beside it (file, exposure_s, temperature_c), or a name such"
+            " as dark_100ms_20C_01.png",
         )
     if temperature_c is not None:
         temperature_c = round(temperature_c / TEMPERATURE_STEP_C) * TEMPERATURE_STEP_C
@@ -106,17 +108,17 @@ def setting_of(path: Path, root: Path, picture: images.Picture, table: dict[str,
 
 def read_settings(path: Path) -> dict[str, Setting]:
     """Exposure and temperature by the file's name, from a CSV file. Raises InputError with one line."""
-    refusal = "no exposures; allowed: columns file, exposure_s and, if known, temperature_c"
+    refusal = InputError(path, "no exposures", "columns file, exposure_s and, if known, temperature_c")
     files, numbers = read_named_rows(path, "file", ["exposure_s"], refusal, ["temperature_c"])
     if (numbers[:, 0] < 0).any():
-        raise InputError(f"{path}: an exposure below 0; allowed: seconds, 0 or more")
+        raise InputError(path, "an exposure below 0", "seconds, 0 or more")
     return {
         name: Setting(float(row[0]), float(row[1]) if len(row) == 2 else None)
         for name, row in zip(files, numbers, strict=True)
     }
 
 
-def read_stack(folder: Path, option: str, shape: tuple[int, int], bits: int) -> Stack:
+def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
     """The levels of a folder's frames, by exposure. Raises InputError with one line.
 
     Numbers that a camera or program has shifted to the upper bits of 16 are shifted back, if all are multiples.
@@ -124,14 +126,14 @@ def read_stack(folder: Path, option: str, shape: tuple[int, int], bits: int) -> 
     """
     builders: dict[Setting, LevelBuilder] = {}
     stack, shift = Stack(folder), None
-    for path, setting, frame in read_frames(folder, option):
+    for path, setting, frame in read_frames(folder):
         if frame.shape != shape:
             size = f"{frame.shape[1]} x {frame.shape[0]} pixels"
-            raise InputError(f"{path}: {size}; allowed: {shape[1]} x {shape[0]}, as --camera has them")
+            raise InputError(path, size, f"{shape[1]} x {shape[0]}, as the camera has them")
         shift = padding_bits(frame, bits) if shift is None else shift
         numbers = np.right_shift(frame, np.uint16(shift))
         if numbers.max() >= 2**bits:
-            raise InputError(f"{path}: {numbers.max()} DN; allowed: up to {2**bits - 1}, the {bits} bits of --camera")
+            raise InputError(path, f"{numbers.max()} DN", f"up to {2**bits - 1}, the {bits} bits of the camera")
         builders.setdefault(setting, LevelBuilder()).add(numbers)
         stack.medians.setdefault(setting, []).append((float(np.median(numbers)), path))
     check_settings(stack, builders)
@@ -154,11 +156,11 @@ def check_settings(stack: Stack, builders: dict[Setting, LevelBuilder]) -> None:
     for setting, builder in builders.items():
         if builder.frames < 2:
             path = stack.medians[setting][0][1]
-            raise InputError(f"{path}: the only frame of {describe(setting)}; allowed: 2 or more, alike")
+            raise InputError(path, f"the only frame of {describe(setting)}", "2 or more, alike")
     unknown = [setting for setting in builders if setting.temperature_c is None]
     if unknown and len(unknown) < len(builders):
         path = stack.medians[unknown[0]][0][1]
-        raise InputError(f"{path}: no temperature, which other frames have; allowed: of all frames, or of none")
+        raise InputError(path, "no temperature, which other frames have", "of all frames, or of none")
 
 
 def describe(setting: Setting) -> str:

@@ -50,9 +50,9 @@ def read_camera(name: str) -> tuple[CameraConfig, dict[str, Any]]:
 def measure_sensor(camera: CameraConfig, darks_folder: Path, flats_folder: Path) -> Sensor:
     """The sensor from folders of darks and flats. Raises InputError for frames that do not tell."""
     shape, bits = (camera.height_px, camera.width_px), camera.detector.bits
-    darks = read_stack(darks_folder, "darks", shape, bits)
+    darks = read_stack(darks_folder, shape, bits)
     checks.check_darks(darks)
-    flats = read_stack(flats_folder, "flats", shape, bits)
+    flats = read_stack(flats_folder, shape, bits)
     usable = sensor.usable_pixels(darks.levels)
     shortest = min(darks.levels, key=lambda one: one.exposure_s)
     checks.check_flats(flats, usable, float(np.median(shortest.mean_dn)))
@@ -63,7 +63,9 @@ def measure_night(config: CameraConfig, raw: dict[str, Any], folder: Path, found
     """The lens from a folder of night frames. Raises InputError for a camera without a lens, and as `lens` does."""
     if "focal_length" not in raw:
         raise InputError(
-            "--night: the camera's file has no lens; allowed: with focal_length, to 5 %, and f_number in --camera"
+            "characterize.night",
+            "the camera's file has no lens",
+            "a camera file with focal_length, to 5 %, and f_number",
         )
     return lens.measure_night(config, folder, found.transfer, found.saturation_dn)
 
@@ -128,7 +130,7 @@ def check_folders(darks: Path | None, flats: Path | None) -> tuple[Path, Path]:
     """Both folders. Raises InputError if one is missing."""
     for name, folder, why in (("darks", darks, "dark current and black level"), ("flats", flats, "gain and full well")):
         if folder is None:
-            raise InputError(f"--{name}: missing: without them {why} are unknown; allowed: a folder of {name}")
+            raise InputError(f"characterize.{name}", f"missing: without them {why} are unknown", f"a folder of {name}")
     assert darks is not None
     assert flats is not None
     return darks, flats

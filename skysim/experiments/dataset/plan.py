@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import OVERRIDES, InputError, unknown_name
 from skysim.core.io.yaml_reader import check_version, parse_yaml, read_yaml
 from skysim.core.random_streams import random_stream
 from skysim.experiments.study import loader
@@ -112,12 +112,12 @@ def load(
 
     scene : name or path;  vary : file with the sections `set`, `trial`, `factors` and `hardware` of a study, or None
     """
-    for name, count in (("--frames", frames), ("--shard-frames", frames_per_shard)):
+    for name, count in (("frames", frames), ("frames_per_shard", frames_per_shard)):
         if count < 1:
-            raise InputError(f"{name}: {count}; allowed: 1 or more")
+            raise InputError(f"dataset.{name}", count, "1 or more")
     for name in formats:
         if name not in FORMATS:
-            raise InputError(f"--to: {unknown_name('format', name, FORMATS)}")
+            raise InputError("dataset.formats", *unknown_name("format", name, FORMATS))
     plan = study_plan(scene, vary, seed, overrides or {})
     check_trial(plan, vary)
     return DatasetPlan(plan.spec, dict(plan.study.factors), frames, frames_per_shard, tuple(dict.fromkeys(formats)))
@@ -127,7 +127,7 @@ def check_trial(plan: Plan, vary: Path | None) -> None:
     """Refuse the key of the trial that is for solving alone. Raises InputError."""
     keys = {*(TRIAL + key for key in plan.spec.trial)}.union(*map(keys_of, plan.study.factors.values()))
     if TRACKED in keys:
-        raise InputError(f"{vary}: {TRACKED}: no effect on single frames; allowed: studies")
+        raise InputError(vary, f"{TRACKED}: no effect on single frames", "studies")
 
 
 def study_plan(scene: str, vary: Path | None, seed: int | None, overrides: Mapping[str, str]) -> Plan:
@@ -137,13 +137,13 @@ def study_plan(scene: str, vary: Path | None, seed: int | None, overrides: Mappi
         check_version(tree, vary, text)
     for key in tree:
         if key not in KEYS:
-            raise InputError(f"{vary}: {unknown_name('key', key, KEYS)}")
+            raise InputError(vary, *unknown_name("key", key, KEYS))
     trial = tree.get("trial") or {"kind": "frames"}
     if not isinstance(trial, dict) or trial.get("kind", "frames") != "frames":
-        raise InputError(f"{vary}: trial.kind: a dataset has frames; allowed: frames")
+        raise InputError(vary, "trial.kind: a dataset has frames", "frames")
     settings = tree.get("set") or {}
     if not isinstance(settings, dict):
-        raise InputError(f"{vary}: set: {settings!r}; allowed: keys of the scene with their values")
+        raise InputError(vary, f"set: {settings!r}", "keys of the scene with their values")
     settings = settings | {key: parse_yaml(value)[1] for key, value in overrides.items()}
     tree = {
         **{"title": "dataset", "factors": AS_IT_IS, "design": {"kind": "lhs", "points": 2}},
@@ -152,4 +152,4 @@ def study_plan(scene: str, vary: Path | None, seed: int | None, overrides: Mappi
         **{"trial": {**trial, "kind": "frames"}, "set": settings},
     }
     # Scenes are found from the folder of the command, not from that of the variations.
-    return loader.plan_of(tree, text, vary or Path("--set"), Path.cwd() / "dataset")
+    return loader.plan_of(tree, text, vary or Path(OVERRIDES.file), Path.cwd() / "dataset")

@@ -127,7 +127,7 @@ def prepare(plan: DatasetPlan, storage: Storage) -> None:
     if MANIFEST in there:
         check_manifest(storage, described | {"digest": plan.digest})
     elif there:
-        raise InputError(f"--out {storage.url}: contains {min(there)}; allowed: an empty folder, or this dataset")
+        raise InputError(storage.url, f"contains {min(there)}", "an empty folder, or this dataset")
     else:
         storage.prepare(())
         text = json.dumps(described | {"digest": plan.digest} | plan.manifest(), indent=1, default=str)
@@ -145,20 +145,20 @@ def folders_of(plan: DatasetPlan) -> tuple[str, ...]:
 
 def check_manifest(storage: Storage, own: dict[str, Any]) -> None:
     """Raise InputError if a dataset is another one, or of another version."""
-    where = f"--out {storage.url}"
     try:
         stored = json.loads(storage.read_text(MANIFEST))
         kept = {key: stored[key] for key in own}
     except (LookupError, TypeError, ValueError, RecursionError):
-        raise InputError(f"{where}: {MANIFEST} is not that of a dataset; allowed: an empty folder") from None
+        raise InputError(storage.url, f"{MANIFEST} is not that of a dataset", "an empty folder") from None
     if kept["format"] != FORMAT:
-        raise InputError(f"{where}: a dataset of format {kept['format']}; allowed: {FORMAT}, or another --out")
+        raise InputError(storage.url, f"a dataset of format {kept['format']}", f"{FORMAT}, or another folder")
     if kept["digest"] != own["digest"]:
-        raise InputError(f"{where}: contains another dataset or an earlier version of this one; allowed: another --out")
+        raise InputError(storage.url, "contains another dataset or an earlier version of this one", "another folder")
     if kept["code"] != own["code"]:
         raise InputError(
-            f"{where}: made by skysim {kept['skysim']}, code {kept['code']}; allowed: {own['code']}, the version here,"
-            " or another --out"
+            storage.url,
+            f"made by skysim {kept['skysim']}, code {kept['code']}",
+            f"{own['code']}, the version here, or another folder",
         )
 
 

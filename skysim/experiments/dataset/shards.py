@@ -212,7 +212,7 @@ def parquet(columns: dict[str, Any]) -> bytes:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise InputError(f"--out: a dataset {EXTRA}") from None
+        raise InputError("", f"a dataset {EXTRA}") from None
     sink = pyarrow.BufferOutputStream()
     pyarrow.parquet.write_table(pyarrow.table(columns), sink, compression="zstd")
     return bytes(sink.getvalue())
@@ -238,7 +238,7 @@ def require_zarr() -> Any:
     try:
         import zarr
     except ImportError:
-        raise InputError(f"--to zarr: {EXTRA}") from None
+        raise InputError("dataset.formats", f"zarr {EXTRA}") from None
     return zarr
 
 
@@ -268,7 +268,9 @@ def write_zarr(storage: Storage, first: int, images: list[NDArray[Any]], shard: 
     for n, image in enumerate(images):
         if image.shape != array.shape[1:] or image.dtype != array.dtype:
             raise InputError(
-                f"--to zarr: frame {first + n} of shard {shard} is {image.shape[1]}x{image.shape[0]} {image.dtype}, the"
-                f" first one {array.shape[2]}x{array.shape[1]} {array.dtype}; allowed: one size, or --to webdataset"
+                "dataset.formats",
+                f"zarr: frame {first + n} of shard {shard} is {image.shape[1]}x{image.shape[0]} {image.dtype}, the"
+                f" first one {array.shape[2]}x{array.shape[1]} {array.dtype}",
+                "one size, or webdataset",
             )
     array[first : first + len(images)] = np.stack(images)

@@ -21,13 +21,13 @@ class Storage:
         try:
             from fsspec.core import url_to_fs
         except ImportError:
-            raise InputError(f"--out {url}: a dataset {EXTRA}") from None
+            raise InputError(url, f"a dataset {EXTRA}") from None
         try:
             self.files, self.root = url_to_fs(url)
         except ImportError as error:
-            raise InputError(f"--out {url}: {error}; {EXTRA}") from None
+            raise InputError(url, f"{error}; {EXTRA}") from None
         except (OSError, ValueError) as error:
-            raise InputError(f"--out {url}: {error}; allowed: {URLS}") from None
+            raise InputError(url, error, URLS) from None
         self.url = url
         self.is_local = "file" in (self.files.protocol, *self.files.protocol)
 
@@ -88,4 +88,4 @@ class Storage:
         except Exception as error:
             if self.is_local:
                 raise
-            raise InputError(f"--out {self.url}: {error}; allowed: {URLS} that can be written") from None
+            raise InputError(self.url, error, f"{URLS} that can be written") from None

@@ -81,16 +81,18 @@ class Draw(NamedTuple):
 def check_scene(scene: Scene) -> None:
     """Raise InputError for a scene whose tracker gives no attitude for a single frame."""
     if isinstance(scene.light, CollimatedDisplayConfig):
-        raise InputError("light.kind: collimated_display has one field only; allowed: stars, dome")
+        raise InputError("light.kind", "collimated_display has one field only", "stars, dome")
     if scene.tracker.decoder:
         raise InputError(
-            "tracker.decoder: gives no attitude for one frame; allowed: none (--set tracker.decoder=null and"
-            " --set light.led.code=null)"
+            "tracker.decoder",
+            "gives no attitude for one frame",
+            "none (tracker.decoder=null and light.led.code=null)",
         )
     if scene.tracker.exposure_control:
         raise InputError(
-            "tracker.exposure_control: the frames of a datasheet have one exposure time; allowed: none (--set"
-            " tracker.exposure_control=null)"
+            "tracker.exposure_control",
+            "the frames of a datasheet have one exposure time",
+            "none (tracker.exposure_control=null)",
         )
 
 

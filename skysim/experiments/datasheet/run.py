@@ -139,5 +139,5 @@ def read(plan: Plan, kept: store.Store) -> dict[str, NDArray[Any]]:
     if failures := kept.failures():
         trial, error = failures[0]
         point: Point = plan.points[trial // plan.study.replicates]
-        raise InputError(f"{point.levels['cell']}: {error.strip().splitlines()[-1]}")
+        raise InputError(point.levels["cell"], error.strip().splitlines()[-1])
     return {name: values.reshape(len(plan.points), -1) for name, values in kept.columns().items()}

@@ -60,8 +60,9 @@ def term_errors(sheet: Sheet) -> tuple[Floats, np.ndarray]:
     if solved.sum() < MIN_FIELDS:
         share = max(float(solved.mean()), 1 / size.fields)
         raise InputError(
-            f"--fields {size.fields}: {solved.sum()} fields are solved in all {len(rows)} frames; allowed: {MIN_FIELDS}"
-            f" of them or more, as with --fields {math.ceil(1.5 * MIN_FIELDS / share)}"
+            "datasheet.fields",
+            f"{size.fields}: {solved.sum()} fields are solved in all {len(rows)} frames",
+            f"{MIN_FIELDS} of them or more, as with {math.ceil(1.5 * MIN_FIELDS / share)} fields",
         )
     return errors[:, solved], solved
 

@@ -108,8 +108,10 @@ def check_plausible(run: SurveyRun, before: Assumed) -> None:
     for then, now, sigma, known, name in rows:
         if abs(now - then) > PLAUSIBLE * math.sqrt(max(known**2 - sigma**2, (LEAST_SHARE * known) ** 2)):
             raise InputError(
-                f"survey: {name} {now:.5g} ± {sigma:.2g} contradicts the assumed {then:.5g} ± {known:.2g}:"
-                " lights are misidentified; allowed: further frames, or a larger uncertainty of what is assumed"
+                "survey",
+                f"{name} {now:.5g} ± {sigma:.2g} contradicts the assumed {then:.5g} ± {known:.2g}: lights are"
+                " misidentified",
+                "further frames, or a larger uncertainty of what is assumed",
             )
 
 
@@ -123,8 +125,9 @@ def identified_by_imu(
     rows = np.flatnonzero(np.array(shares) >= least).tolist()
     if not rows:
         raise InputError(
-            f"survey: in none of the {len(frames)} frames do the lights fit the LEDs of the list; allowed: attitudes,"
-            " LEDs and a camera that are true within the uncertainties"
+            "survey",
+            f"in none of the {len(frames)} frames do the lights fit the LEDs of the list",
+            "attitudes, LEDs and a camera that are true within the uncertainties",
         )
     return rows, [matches[row] for row in rows]
 
@@ -248,10 +251,10 @@ def adjust_connected(
             )
         except Unconnected as error:
             if len(error.frames) > MAX_UNCONNECTED * len(selected):
-                raise InputError(str(error)) from None
+                raise InputError("", error) from None
             selected = np.delete(selected, error.frames).tolist()
         except ValueError as error:
-            raise InputError(str(error)) from None
+            raise InputError("", error) from None
         else:
             matched = np.array([len(pairs[k][1].led) for k in selected])
             rejected = np.bincount(survey.outliers[:, 0], minlength=len(selected))

@@ -73,8 +73,9 @@ def centroid_noise_px(lab: Lab, tilt_deg: float) -> float:
     error_px = np.concatenate([*errors, np.zeros((0, 2))])
     if len(error_px) < MIN_LIGHTS:
         raise InputError(
-            f"survey: {len(error_px)} lights in {NOISE_FRAMES} frames; allowed: {MIN_LIGHTS} or more: brighter LEDs,"
-            " more of them, or a longer exposure"
+            "survey",
+            f"{len(error_px)} lights in {NOISE_FRAMES} frames",
+            f"{MIN_LIGHTS} or more: brighter LEDs, more of them, or a longer exposure",
         )
     return max(float(np.median(np.abs(error_px))) / MAD_PER_SIGMA, LEAST_NOISE_PX)
 

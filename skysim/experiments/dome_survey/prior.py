@@ -15,8 +15,8 @@ from estimator.calibration.survey_plan import SurveyModel
 from estimator.core.camera import Camera
 from estimator.identification.leds.codes import LedCode
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import option_quantities
 from skysim.core.types import Floats, Sources
+from skysim.core.units import quantities_within
 from skysim.experiments.configs import with_config
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
@@ -30,7 +30,7 @@ Ints = NDArray[np.int64]
 BLUR_PX = 3.0  # of an image's edge
 
 # Options: unit, quantity, example, minimum and maximum. The LED error must be > 0, because it weights the map.
-UNCERTAINTY_OPTIONS = {
+UNCERTAINTY_RANGES = {
     "imu_sigma": ("rad", "plane angle", '"0.5 deg"', 0.0, 0.1),
     "led_sigma": ("m", "length", '"2 mm"', 1e-6, 0.1),
     "lever_sigma": ("m", "length", '"5 mm"', 0.0, 0.1),
@@ -99,10 +99,9 @@ class CalibrationPrior:
 def survey_uncertainty(
     imu_sigma: str = "0.5 deg", led_sigma: str = "2 mm", lever_sigma: str = "5 mm", focal_error: str = "1%"
 ) -> SurveyUncertainty:
-    """Parse the quantities of the command line, with its defaults. Raises InputError for an invalid or out-of-range
-    value."""
+    """Parse quantities with units. Raises InputError for an invalid or out-of-range value."""
     texts = imu_sigma, led_sigma, lever_sigma, focal_error
-    return SurveyUncertainty(*option_quantities(UNCERTAINTY_OPTIONS, texts))
+    return SurveyUncertainty(*quantities_within("survey", UNCERTAINTY_RANGES, texts))
 
 
 def calibration_prior(lab: Lab) -> CalibrationPrior:
@@ -142,7 +141,7 @@ def design_of(lab: Lab) -> Sources:
 def require_dome(scene: Scene) -> DomeConfig:
     """The dome of a scene. Raises InputError if its light is another."""
     if not isinstance(scene.light, DomeConfig):
-        raise InputError(f"light.kind: a survey needs LEDs, not {scene.light.kind}; allowed: dome")
+        raise InputError("light.kind", f"a survey needs LEDs, not {scene.light.kind}", "dome")
     return scene.light
 
 

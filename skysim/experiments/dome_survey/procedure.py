@@ -122,8 +122,9 @@ def survey_images(
     """
     if len(frames) < 2:
         raise InputError(
-            f"survey: {len(frames)} of {len(pictures)} images identified; allowed: 2 or more: give their attitudes in"
-            f" {ATTITUDES}"
+            "survey",
+            f"{len(frames)} of {len(pictures)} images identified",
+            f"2 or more: give their attitudes in {ATTITUDES}",
         )
     run = run_survey(frames, prior, uncertainty, fit_distortion, watch)
     while len(frames) < len(pictures):
@@ -156,7 +157,7 @@ class Errors:
     false_alarms: int
 
 
-def repeat_survey(lab: Lab, uncertainty: SurveyUncertainty, plan: Plan, repeats: int) -> Iterator[Errors | str]:
+def repeat_survey(lab: Lab, uncertainty: SurveyUncertainty, plan: Plan, repeats: int) -> Iterator[Errors | InputError]:
     """The errors of simulated surveys at the attitudes of a plan, each with its own noise, IMU errors and list.
 
     Of a survey that does not determine the dome, why.
@@ -168,7 +169,7 @@ def repeat_survey(lab: Lab, uncertainty: SurveyUncertainty, plan: Plan, repeats:
         try:
             yield survey_errors(run_survey(frames, prior, uncertainty), prior, again)
         except InputError as error:
-            yield str(error)
+            yield error
 
 
 def in_survey(lab: Lab, n: int) -> Lab:

@@ -26,7 +26,7 @@ def stop_attitudes(scene: Scene, stream_name: str, count: int, tilt_deg: float) 
     """
     stop_deg = scene.vehicle.tilt_stop_deg if scene.vehicle.mount == "air_bearing" else 90.0
     if not 0 < tilt_deg <= stop_deg:
-        raise InputError(f"--tilt {tilt_deg:g}: allowed: above 0, up to {stop_deg:g} degrees, the vehicle's stop")
+        raise InputError("survey.tilt_deg", f"{tilt_deg:g}", f"above 0, up to {stop_deg:g} degrees, the vehicle's stop")
     rng = random_stream(scene.seed, STREAM_KEYS[stream_name])
     tilt = np.arccos(rng.uniform(np.cos(np.radians(tilt_deg)), 1, count))
     azimuth, yaw = rng.uniform(0, 2 * np.pi, (2, count))
@@ -54,8 +54,9 @@ def planned_stops(
     chosen = survey_plan.choose(model, candidates, shown, count, held, seen)
     if not chosen:
         raise InputError(
-            f"survey: no attitude within {tilt_deg:g} degrees shows {survey_plan.MIN_SHARED} LEDs; allowed: more LEDs,"
-            " or a wider field"
+            "survey",
+            f"no attitude within {tilt_deg:g} degrees shows {survey_plan.MIN_SHARED} LEDs",
+            "more LEDs, or a wider field",
         )
     return candidates[chosen].inv()
 

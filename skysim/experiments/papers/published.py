@@ -12,8 +12,8 @@ from pydantic import Field, ValidationError, model_validator
 from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import explain, read_yaml
 from skysim.core.paths import DATA
-from skysim.core.quantities.units import ConfigModel, NotNegative, Number
 from skysim.core.types import Floats
+from skysim.core.units import ConfigModel, NotNegative, Number
 
 FOLDER = DATA / "published"
 
@@ -42,7 +42,7 @@ class Row(ConfigModel):
     def check_number_or_bounds(self) -> Self:
         bounded = self.at_least is not None or self.at_most is not None
         if bounded == (self.published is not None):
-            raise ValueError("give either published, or at_least or at_most or both")
+            raise InputError("", "give either published, or at_least or at_most or both")
         return self
 
     @property
@@ -88,7 +88,7 @@ def experiments() -> dict[str, Experiment]:
         paper = read(path)
         for id, experiment in paper.experiments.items():
             if id in by_id:
-                raise InputError(f"{path}: experiments.{id} is defined in two files")
+                raise InputError(path, f"experiments.{id} is defined in two files")
             by_id[id] = experiment.model_copy(update={"paper": paper.paper})
     return by_id
 
@@ -105,4 +105,4 @@ def read(path: Path) -> Paper:
     try:
         return Paper.model_validate(tree)
     except ValidationError as error:
-        raise InputError(explain(error, Paper, tree, [(path, text)], {})) from error
+        raise explain(error, Paper, tree, [(path, text)], {}) from error

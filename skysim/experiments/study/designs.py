@@ -15,8 +15,8 @@ import scipy
 from pydantic import Field
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import ConfigModel
 from skysim.core.types import Floats
+from skysim.core.units import ConfigModel
 from skysim.experiments.study.factors import Factor, Settings, Value
 
 
@@ -48,12 +48,12 @@ def points(design: Design, factors: Factors, seed: int) -> list[Point]:
     sampled = design.kind in ("lhs", "sobol", "saltelli")
     if sampled != (design.points is not None):
         allowed = "a number of points" if sampled else "none (the levels define the points)"
-        raise InputError(f"design.points: {design.points} for {design.kind}; allowed: {allowed}")
+        raise InputError("design.points", f"{design.points} for {design.kind}", allowed)
     if design.kind in ("sobol", "saltelli") and design.points is not None and design.points & (design.points - 1):
-        raise InputError(f"design.points: {design.points} for {design.kind}; allowed: a power of two")
+        raise InputError("design.points", f"{design.points} for {design.kind}", "a power of two")
     for name, factor in factors.items():
         if not sampled and not factor.options():
-            raise InputError(f"factors.{name}: a distribution has no levels; allowed: design.kind lhs, sobol, saltelli")
+            raise InputError(f"factors.{name}", "a distribution has no levels", "design.kind lhs, sobol, saltelli")
     return list(DESIGNS[design.kind](design, factors, seed))
 
 

@@ -15,7 +15,8 @@ import numpy as np
 import scipy
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from skysim.core.quantities.units import ConfigModel
+from skysim.core.errors import InputError
+from skysim.core.units import ConfigModel
 
 Value = Any  # value of a key: any YAML value
 Settings = dict[str, Value]  # dotted keys of the scene, or of `trial.`, to values
@@ -24,12 +25,12 @@ Name = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*$")]
 
 
 def split_quantity(value: Value) -> tuple[float, str]:
-    """Split a number, or a quantity such as "48 in", into number and unit. Raises ValueError."""
+    """Split a number, or a quantity such as "48 in", into number and unit. Raises InputError."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return float(value), ""
     match = QUANTITY.match(value) if isinstance(value, str) else None
     if match is None:
-        raise ValueError(f'{value!r} is not a number; allowed: a number, or one with its unit such as "48 in"')
+        raise InputError("", f"{value!r} is not a number", 'a number, or one with its unit such as "48 in"')
     return float(match[1]), match[2] or ""
 
 
@@ -66,7 +67,7 @@ class KeyedFactor(ConfigModel):
     @model_validator(mode="after")
     def check_keys(self) -> Self:
         if (self.key is None) == (not self.keys):
-            raise ValueError("a factor needs either key or keys")
+            raise InputError("", "a factor needs either key or keys")
         return self
 
     def settings_for(self, value: Value) -> Settings:
@@ -101,11 +102,11 @@ class Range(KeyedFactor):
     def check_bounds(self) -> Range:
         (low, unit), (high, other) = split_quantity(self.from_), split_quantity(self.to)
         if unit != other:
-            raise ValueError(f"from {self.from_!r} and to {self.to!r} have different units; allowed: one unit")
+            raise InputError("", f"from {self.from_!r} and to {self.to!r} have different units", "one unit")
         if not low < high:
-            raise ValueError(f"from is {self.from_!r}; allowed: below to, {self.to!r}")
+            raise InputError("", f"from is {self.from_!r}", f"below to, {self.to!r}")
         if self.scale == "log" and low <= 0:
-            raise ValueError(f"from is {self.from_!r}; allowed: above 0 with scale: log")
+            raise InputError("", f"from is {self.from_!r}", "above 0 with scale: log")
         return self
 
     def options(self) -> list[tuple[Value, Settings]]:
@@ -141,25 +142,25 @@ class Distribution(KeyedFactor):
         required = PARAMETERS[self.distribution]
         provided = [name for name in ALL_PARAMETERS if getattr(self, name) is not None]
         if sorted(provided) != sorted(required):
-            raise ValueError(
-                f"{self.distribution}: parameters {', '.join(provided) or 'none'}; allowed: {', '.join(required)}"
+            raise InputError(
+                "", f"{self.distribution}: parameters {', '.join(provided) or 'none'}", ", ".join(required)
             )
         self.parameters()
         return self
 
     def parameters(self) -> tuple[list[float], str]:
-        """The parameters in the order of PARAMETERS, and their unit. Raises ValueError."""
+        """The parameters in the order of PARAMETERS, and their unit. Raises InputError."""
         quantities = [split_quantity(getattr(self, name)) for name in PARAMETERS[self.distribution]]
         units = {unit for _, unit in (quantities[:1] if self.distribution == "lognormal" else quantities)}
         if len(units) > 1:
-            raise ValueError(f"different units {', '.join(repr(unit) for unit in sorted(units))}; allowed: one unit")
+            raise InputError("", f"different units {', '.join(repr(unit) for unit in sorted(units))}", "one unit")
         parameters = [number for number, _ in quantities]
         if self.sigma is not None and parameters[1] <= 0:
-            raise ValueError(f"sigma is {self.sigma!r}; allowed: above 0")
+            raise InputError("", f"sigma is {self.sigma!r}", "above 0")
         ascending = [name for name in PARAMETERS[self.distribution] if name in ("low", "mode", "high")]
         values = [parameters[PARAMETERS[self.distribution].index(name)] for name in ascending]
         if values and not (values == sorted(values) and values[0] < values[-1]):
-            raise ValueError(f"{', '.join(ascending)} are not in ascending order")
+            raise InputError("", f"{', '.join(ascending)} are not in ascending order")
         return parameters, units.pop()
 
     def options(self) -> list[tuple[Value, Settings]]:

@@ -10,8 +10,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from skysim.core.errors import InputError, unknown_name
-from skysim.core.io.yaml_reader import check_version, explain, line_of, read_yaml, set_key
+from skysim.core.errors import OVERRIDES, InputError, unknown_name
+from skysim.core.io.yaml_reader import check_version, explain, read_yaml, set_key, where_of
 from skysim.dynamics.controllers.interface import CONTROLLERS
 from skysim.experiments.study import unused_options
 from skysim.experiments.study.designs import make_point
@@ -85,15 +85,14 @@ def plan_of(
     try:
         study = Study.model_validate(tree)
     except ValidationError as error:
-        raise InputError(explain(error, Study, tree, [(path, text)], overrides or {})) from None
+        raise explain(error, Study, tree, [(path, text)], overrides or {}) from None
     try:
         plan = make_plan(base or path, study, tree["trial"], programs or {})
         check(plan, to_run=programs is not None)
     except InputError as error:  # about a key of the study: add file and line
-        message = str(error)
-        line = line_of(text, message.partition(":")[0].split("."))[1]
-        where = f"{path}, line {line}" if line else path
-        raise InputError(f"{message.removesuffix(' (--set)')} ({where})") from None
+        if error.where in (None, OVERRIDES):
+            error = error.at(where_of(error.key.split("."), [(path, text)], {}))
+        raise error from None
     return plan
 
 
@@ -112,12 +111,10 @@ def check(plan: Plan, to_run: bool) -> None:
     if study.optimize:
         search.check(study)
     if study.budget.trials is not None and plan.trials > study.budget.trials:
-        raise InputError(
-            f"budget.trials: {study.budget.trials}; allowed: at least {plan.trials}, the trials of the study"
-        )
+        raise InputError("budget.trials", study.budget.trials, f"at least {plan.trials}, the trials of the study")
     for name in study.factors:
         if name in COLUMNS or name in study.responses:
-            raise InputError(f"factors.{name}: the name is that of a column of the trials; allowed: another name")
+            raise InputError(f"factors.{name}", "the name is that of a column of the trials", "another name")
     check_hardware(study)
     points = []
     for name, level, own, settings in each_level(study.factors):
@@ -127,7 +124,7 @@ def check(plan: Plan, to_run: bool) -> None:
             if study.optimize:
                 cost.check_parts(study.optimize.cost, scene)
         except InputError as error:
-            raise InputError(at_factor(study, name, level, error)) from None
+            raise at_factor(study, name, level, error) from None
         points.append(unused_options.CheckedPoint(name, level, own, settings, scene, trial))
     check_measured(study, {point.trial.kind for point in points}, [point.scene for point in points])
     unused_options.check(plan, points, partial(resolve_point, plan.spec))
@@ -142,17 +139,17 @@ def check_figures(plan: Plan) -> None:
     for where, one in named_sections(study):
         for key, factor in one.axes.items():
             if factor is not None and factor not in study.factors:
-                raise InputError(f"{where}.{key}: {unknown_name('factor', factor, study.factors)}")
+                raise InputError(f"{where}.{key}", *unknown_name("factor", factor, study.factors))
         metrics.response(one.response, where)
         if isinstance(one, Map) and study.trial.kind == "flight":
-            raise InputError(f"{where}.kind: a map of flights, which have no single attitude; allowed: curve, heat")
+            raise InputError(f"{where}.kind", "a map of flights, which have no single attitude", "curve, heat")
         if isinstance(one, Threshold):
             thresholds.check(one, where, study, rows)
         if plan.points:
             try:
                 axes.fixed_levels(one, study, rows)
             except InputError as error:
-                raise InputError(f"{where}.{error}") from None
+                raise error.under(where) from None
 
 
 def named_sections(study: Study) -> Iterator[tuple[str, Figure | Threshold]]:
@@ -167,45 +164,48 @@ def check_hardware(study: Study) -> None:
     """Raise InputError where draws of the hardware are levels of a factor, or keys that the factors set too."""
     for n, key in enumerate(study.hardware):
         if key.startswith(TRIAL):
-            raise InputError(f"hardware.{n}: {key} is no hardware; allowed: seeds of the scene's hardware")
+            raise InputError(f"hardware.{n}", f"{key} is no hardware", "seeds of the scene's hardware")
         for name, factor in study.factors.items():
             if key in dict(factor.value_at(0.5)[1]):
-                raise InputError(f"hardware.{n}: {key} is set by factors.{name} too; allowed: one of the two")
+                raise InputError(f"hardware.{n}", f"{key} is set by factors.{name} too", "one of the two")
     for name, factor in study.factors.items():
         keys = [] if isinstance(factor, Levels | Distribution) else list(factor.value_at(0.5)[1])
         if keys and all(HARDWARE_SEED.search(key) for key in keys):
             raise InputError(
-                f"factors.{name}: {keys[0]} numbers draws of the hardware; allowed: hardware: [{', '.join(keys)}],"
-                " which draws them anew in every replicate, or levels with a name for each unit"
+                f"factors.{name}",
+                f"{keys[0]} numbers draws of the hardware",
+                f"hardware: [{', '.join(keys)}], which draws them anew in every replicate, or levels with a name for"
+                " each unit",
             )
 
 
 def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
     """Raise InputError where the trial does not fit the scene of a level."""
     if isinstance(scene.light, CollimatedDisplayConfig) and not isinstance(trial, FlightTrial):
-        raise InputError(f"trial.kind: {trial.kind} with a collimated display; allowed: flight")
+        raise InputError("trial.kind", f"{trial.kind} with a collimated display", "flight")
     if scene.tracker.decoder and isinstance(trial, FrameTrial):
-        raise InputError("trial.kind: frames with tracker.decoder, which needs many; allowed: centroids, flight")
+        raise InputError("trial.kind", "frames with tracker.decoder, which needs many", "centroids, flight")
     if SURVEY_SEED in plan.spec.hardware and not has_survey_errors(scene):
         raise InputError(
-            "hardware: tracker.survey.seed has no effect without errors of the survey; allowed: with"
-            " tracker.survey.led_sigma, lever_sigma or light.surface.error"
+            "hardware",
+            "tracker.survey.seed has no effect without errors of the survey",
+            "with tracker.survey.led_sigma, lever_sigma or light.surface.error",
         )
     if isinstance(trial, FlightTrial) and trial.start:
         check_random_start(scene, trial.start)
     near = getattr(trial.start if isinstance(trial, FlightTrial) else trial, "near", None)
     if near and near.body == "zenith" and scene.site.longitude_deg is None:
-        raise InputError("trial.near.body: zenith requires site.longitude_deg in the scene")
+        raise InputError("trial.near.body", "zenith requires site.longitude_deg in the scene")
     if near and not BODIES_YEARS[0] <= scene.start_time.year <= BODIES_YEARS[1]:
         first, last = BODIES_YEARS
-        raise InputError(f"trial.near: start_time {scene.start_time} is outside {first} to {last}; allowed: none")
+        raise InputError("trial.near", f"start_time {scene.start_time} is outside {first} to {last}", "none")
     if to_run:
         tracker = scene.tracker.name
         TRACKERS.check_name(tracker, plan.spec.programs)
         if scene.motion.control:
             CONTROLLERS.check_name(scene.motion.control.law, plan.spec.programs)
         if tracker != OWN and isinstance(trial, CentroidTrial):  # an external tracker takes images
-            raise InputError(f"tracker.name: {tracker} needs frames; allowed: {OWN}, or another trial.kind")
+            raise InputError("tracker.name", f"{tracker} needs frames", f"{OWN}, or another trial.kind")
 
 
 def has_survey_errors(scene: Scene) -> bool:
@@ -225,15 +225,14 @@ def fixed_seeds(study: Study, scene: Scene) -> list[str]:
     return [seed for seed in seeds if seed not in varied]
 
 
-def at_factor(study: Study, name: str, level: Value, error: InputError) -> str:
-    """The message of a level's error, with the factor that sets the key at fault and its value."""
-    if str(error).startswith("hardware"):
-        return str(error)
-    key = str(error).partition(":")[0]
-    owners = [other for other, factor in study.factors.items() if key in dict(factor.value_at(0.5)[1])]
+def at_factor(study: Study, name: str, level: Value, error: InputError) -> InputError:
+    """A level's error with the factor that sets the key at fault, and its value; one of `hardware` unchanged."""
+    if error.key == "hardware":
+        return error
+    owners = [other for other, factor in study.factors.items() if error.key in dict(factor.value_at(0.5)[1])]
     owner = name if name in owners or not owners else owners[0]
     value = level if owner == name else study.factors[owner].value_at(0.5)[0]
-    return f"factors.{owner}: {value!r}: {error}"
+    return error.within(f"{value!r}").within(f"factors.{owner}")
 
 
 def check_measured(study: Study, kinds: set[str], scenes: Sequence[Scene]) -> None:
@@ -243,10 +242,10 @@ def check_measured(study: Study, kinds: set[str], scenes: Sequence[Scene]) -> No
     for name, key in where.items():
         measured = MEASURED_BY.get(metrics.split_name(name)[0], kinds)
         if not kinds & set(measured):
-            raise InputError(f"{key}: {name} in trials of kind {', '.join(kinds)}; allowed: of {', '.join(measured)}")
+            raise InputError(key, f"{name} in trials of kind {', '.join(kinds)}", f"of {', '.join(measured)}")
         if name == "ambiguous" and not any(map(may_report_ambiguity, scenes)):
             raise InputError(
-                f"{key}: no tracker of this study reports ambiguity; allowed: under a dome, with the default identifier"
+                key, "no tracker of this study reports ambiguity", "under a dome, with the default identifier"
             )
 
 
@@ -262,18 +261,16 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
     """Raise InputError for a random start that the scene cannot have, or whose keys have no effect in it."""
     if isinstance(scene.light, CollimatedDisplayConfig) or scene.motion.start == "profile":
         where = "a collimated display" if scene.motion.start != "profile" else "motion.start: profile"
-        raise InputError(f"trial.start: random with {where}; allowed: scene")
+        raise InputError("trial.start", f"random with {where}", "scene")
     dome = isinstance(scene.light, DomeConfig)
     for unused in ("dec_deg", "near") if dome else ("tilt_deg",):
         if unused in start.model_fields_set:
-            raise InputError(
-                f"trial.start.{unused}: has no effect with light of kind {scene.light.kind}; allowed: none"
-            )
+            raise InputError(f"trial.start.{unused}", f"has no effect with light of kind {scene.light.kind}", "none")
     greatest_deg = max(start.tilt_deg) if isinstance(start.tilt_deg, tuple) else start.tilt_deg
     vehicle = scene.vehicle
     if dome and vehicle.mount == "air_bearing" and greatest_deg > vehicle.tilt_stop_deg:
         raise InputError(
-            f"trial.start.tilt_deg: {greatest_deg:g}; allowed: up to vehicle.tilt_stop_deg {vehicle.tilt_stop_deg:g}"
+            "trial.start.tilt_deg", f"{greatest_deg:g}", f"up to vehicle.tilt_stop_deg {vehicle.tilt_stop_deg:g}"
         )
 
 

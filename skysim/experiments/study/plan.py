@@ -17,7 +17,7 @@ from skysim.core.errors import InputError
 from skysim.core.io import yaml_reader
 from skysim.core.io.yaml_reader import explain, is_file, set_key
 from skysim.core.paths import STUDIES
-from skysim.core.quantities.units import ConfigModel, Fraction, NotNegative, Number, Time, Triple
+from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Time, Triple
 from skysim.experiments.study.designs import Design, Point, points
 from skysim.experiments.study.factors import Factor, Settings, Value
 from skysim.results.files.builder.prices import Prices, find_prices, read_prices
@@ -37,7 +37,7 @@ BodyName = Literal["zenith", "sun", "moon", "mercury", "venus", "mars", "jupiter
 def check_rising(ends: tuple[float, float]) -> tuple[float, float]:
     """Check that an interval's ends are in their order."""
     if ends[0] > ends[1]:
-        raise ValueError(f"{ends[0]:g} to {ends[1]:g}; allowed: the smaller first")
+        raise InputError("", f"{ends[0]:g} to {ends[1]:g}", "the smaller first")
     return ends
 
 
@@ -85,7 +85,7 @@ class AxisConfig(ConfigModel):
     def check_vector(self) -> AxisConfig:
         given = [vector for vector in (self.body, self.camera) if vector is not None]
         if len(given) != 1 or not any(given[0]):
-            raise ValueError("allowed: one of body and camera, a vector that is not zero")
+            raise InputError("", "", "one of body and camera, a vector that is not zero")
         return self
 
 
@@ -420,8 +420,15 @@ def make_plan(path: Path, study: Study, trial: dict[str, Any], programs: Mapping
     folder = str(path.resolve().parent)
     spec = TrialSpec(study.scene, folder, study.seed, study.set, trial, study.paired, study.hardware, dict(programs))
     parts = study.optimize.cost.parts if study.optimize else None
-    prices = read_prices(find_prices(parts, path.resolve().parent)) if parts else None
-    return Plan(path, study, spec, chosen, prices)
+    return Plan(path, study, spec, chosen, prices_of(parts, path.resolve().parent) if parts else None)
+
+
+def prices_of(parts: str, folder: Path) -> Prices:
+    """The prices of a study's table of parts. Raises InputError."""
+    try:
+        return read_prices(find_prices(parts, folder))
+    except InputError as error:
+        raise error.within("optimize.cost.parts") from None
 
 
 def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
@@ -444,8 +451,7 @@ def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:
         return TrialSection.model_validate(tree).trial
     except ValidationError as error:
         # One line without file and line number; the caller adds the factor.
-        message = explain(error, TrialSection, tree, [(Path(), "")], {})
-        raise InputError(message.removesuffix(f" ({Path()})")) from None
+        raise explain(error, TrialSection, tree, [(Path(), "")], {}).at(None) from None
 
 
 def one_line(value: Value) -> str:

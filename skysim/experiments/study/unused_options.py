@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
-from skysim.core.errors import InputError
 from skysim.experiments.study.designs import make_point
 from skysim.experiments.study.factors import Settings, Value
 from skysim.experiments.study.plan import (
@@ -214,11 +213,11 @@ def check(plan: Plan, points: Iterable[CheckedPoint], resolve: Resolve) -> None:
     for (name, level, key), fault in faults.items():
         if fault is None:
             continue
-        text = unused.message(fault.key, fault.rule)
+        error = unused.no_effect(fault.key, fault.rule)
         if not name:
-            raise InputError(text if key.startswith(TRIAL) else f"set: {text}")
+            raise error if key.startswith(TRIAL) else error.within("set")
         if not has_effect_elsewhere(plan, fault.point, key, resolve):
-            raise InputError(f"factors.{name}: {level}: {text}")
+            raise error.within(level).within(f"factors.{name}")
 
 
 def unused_overrides(overrides: Mapping[str, str], scene: Scene, trial: Trial) -> set[str]:

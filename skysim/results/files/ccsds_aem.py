@@ -39,10 +39,10 @@ def message(
     X_B = a_from_b^-1 X_A. Scalar last. Raises InputError if there is no epoch or the epochs do not ascend.
     """
     if not utc:
-        raise InputError(f"{name}: no attitude to write")
+        raise InputError(name, "no attitude to write")
     late = [n for n in range(1, len(utc)) if utc[n] <= utc[n - 1]]
     if late:
-        raise InputError(f"{name}: epoch {epoch(utc[late[0]])} is not after {epoch(utc[late[0] - 1])}")
+        raise InputError(name, f"epoch {epoch(utc[late[0]])} is not after {epoch(utc[late[0] - 1])}")
     head = {
         "CCSDS_AEM_VERS": "2.0",
         "CREATION_DATE": epoch(datetime.datetime.now(datetime.UTC)),

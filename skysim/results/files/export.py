@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.io import files, images
-from skysim.core.io.images.live import silent_stderr
+from skysim.core.io.decoding import silent_stderr
 from skysim.results import stretch
 from skysim.results.files import ccsds_aem
 from skysim.results.files import frames as frame_files
@@ -65,7 +65,7 @@ def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
     if solved is not None:
         unknown = [frame for frame in solved[0].tolist() if frame not in epochs]
         if unknown:
-            raise InputError(f"{run.folder / 'solutions.ecsv'}: unknown frame {unknown[0]}; allowed: frames with truth")
+            raise InputError(run.folder / "solutions.ecsv", f"unknown frame {unknown[0]}", "frames with truth")
         utc = [epochs[frame] for frame in solved[0].tolist()]
         written.append(write("solutions", "Attitude found by the star tracker, at mid-exposure", utc, solved[1]))
     motion = run.motion()
@@ -120,7 +120,7 @@ def to_parquet(run: Recording, out: Path, bar: Bar) -> list[Path]:
     try:
         import pyarrow.parquet
     except ImportError:
-        raise InputError(f"--to parquet: {EXTRA}") from None
+        raise InputError("export.formats", f"parquet {EXTRA}") from None
     tables = {"truth": truth_table(run, bar)}
     tables |= {name: table for name in ("solutions", "telemetry", "imu") if (table := run.table(name)) is not None}
     written = []
@@ -193,7 +193,7 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
     try:
         import zarr
     except ImportError:
-        raise InputError(f"--to zarr: {EXTRA}") from None
+        raise InputError("export.formats", f"zarr {EXTRA}") from None
     path, count = out / frame_files.ZARR, len(run.stems)
     frame_truths = [replace(truth, sources=None) for truth in truths(run, bar)]
     first = run.image(run.stems[0])
@@ -233,8 +233,9 @@ def check_same_format(image: Any, first: Any, stem: Path) -> Any:
     """The image itself. Raises InputError if its size or type differs from the first one's."""
     if image.shape != first.shape or image.dtype != first.dtype:
         raise InputError(
-            f"{stem}.fits: {image.shape[1]}x{image.shape[0]} {image.dtype}; the first frame is"
-            f" {first.shape[1]}x{first.shape[0]} {first.dtype}"
+            f"{stem}.fits",
+            f"{image.shape[1]}x{image.shape[0]} {image.dtype}; the first frame is"
+            f" {first.shape[1]}x{first.shape[0]} {first.dtype}",
         )
     return image
 
@@ -256,9 +257,7 @@ def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
         try:
             if not film.isOpened():
                 check_disk_space(temporary)
-                raise InputError(
-                    f"{path}: this OpenCV cannot write {FOURCC} video of {width}x{height} at {rate_hz:g} Hz"
-                )
+                raise InputError(path, f"this OpenCV cannot write {FOURCC} video of {width}x{height} at {rate_hz:g} Hz")
             for stem in bar(run.stems, len(run.stems), "video"):
                 image = check_same_format(run.image(stem), first, stem)
                 gray = stretch.to_8bit(image, "square root", levels_dn=(float(low), float(high)))
@@ -270,7 +269,7 @@ def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
         # OpenCV reports no write errors, so count the frames that can be read back.
         if readable != count:
             check_disk_space(temporary)
-            raise InputError(f"{path}: OpenCV wrote {readable} of {count} frames, without an error message")
+            raise InputError(path, f"OpenCV wrote {readable} of {count} frames, without an error message")
     return [path]
 
 
@@ -308,6 +307,6 @@ def export(run: Recording, formats: Iterable[str], out: Path, bar: Bar) -> list[
     names = list(dict.fromkeys(formats))
     for name in names:
         if name not in EXPORTS:
-            raise InputError(f"--to: {unknown_name('format', name, EXPORTS)}")
+            raise InputError("export.formats", *unknown_name("format", name, EXPORTS))
     files.make_folder(out)
     return [path for name in names for path in EXPORTS[name](run, out, bar)]

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.io import files, images
+from skysim.core.io import files
+from skysim.core.io.fits import read_fits
 from skysim.core.types import Floats
 from skysim.sources import stars
 
@@ -51,9 +52,7 @@ class Recording:
         header = files.read_table(self.stems[0].with_suffix(".ecsv")).meta
         missing = [key for key in ("scene", "seed", "lab") if key not in header]
         if missing:
-            raise InputError(
-                f"{self.stems[0]}.ecsv: no {missing[0]} in the header; allowed: a truth file of skysim run"
-            )
+            raise InputError(f"{self.stems[0]}.ecsv", f"no {missing[0]} in the header", "a truth file of a run")
         return {key: header[key] for key in ("scene", "seed", "lab")}
 
     @property
@@ -67,9 +66,9 @@ class Recording:
 
     def image(self, stem: Path) -> NDArray[Any]:
         """A frame's digital numbers: (H, W) uint16, or float64 from a noise-free camera. Raises InputError."""
-        image = images.read_fits(stem.with_suffix(".fits"))
+        image = read_fits(stem.with_suffix(".fits"))
         if image.ndim != 2 or not image.size:
-            raise InputError(f"{stem}.fits: an image of shape {image.shape}; allowed: (height, width)")
+            raise InputError(f"{stem}.fits", f"an image of shape {image.shape}", "(height, width)")
         return image
 
     def table(self, name: str) -> Any:
@@ -89,9 +88,7 @@ class Recording:
         names = SKY_ANGLES if self.is_celestial else LAB_ANGLES
         missing = [name for name in ("frame", *names) if name not in solutions.colnames]
         if missing:
-            raise InputError(
-                f"{self.folder / 'solutions.ecsv'}: missing column {missing[0]}; allowed: a table of skysim run"
-            )
+            raise InputError(self.folder / "solutions.ecsv", f"missing column {missing[0]}", "a table of a run")
         angles = np.column_stack([np.ma.filled(solutions[name].astype(float), np.nan) for name in names])
         valid = np.isfinite(angles).all(axis=1)
         if not valid.any():
@@ -109,9 +106,7 @@ class Recording:
         columns = [f"true_{name}" for name in LAB_ANGLES]
         missing = [name for name in ("t_s", *columns) if name not in telemetry.colnames]
         if missing:
-            raise InputError(
-                f"{self.folder / 'telemetry.ecsv'}: missing column {missing[0]}; allowed: a table of skysim run"
-            )
+            raise InputError(self.folder / "telemetry.ecsv", f"missing column {missing[0]}", "a table of a run")
         angles = np.column_stack([np.asarray(telemetry[name], dtype=float) for name in columns])
         return np.asarray(telemetry["t_s"], dtype=float), attitudes(angles, is_celestial=False)
 
@@ -135,7 +130,7 @@ def open_recording(folder: Path) -> Recording:
         if number and path.with_suffix(".ecsv").is_file():
             stems[int(number[1])] = path.with_suffix("")
     if not stems:
-        raise InputError(f"{folder}: no frames with truth files; allowed: a folder of skysim run or skysim render")
+        raise InputError(folder, "no frames with truth files", "a folder of a run, or of rendered frames")
     return Recording(folder, [stems[index] for index in sorted(stems)])
 
 
@@ -150,12 +145,12 @@ def read_truth(path: Path) -> FrameTruth:
     numbers = {key: np.array(files.header_numbers(path, sources.meta, key, count)) for key, count in counts.items()}
     for key in ("lab_from_body_xyzw", "cam_from_lab_xyzw"):
         if abs(np.linalg.norm(numbers[key]) - 1) > UNIT_NORM:
-            raise InputError(f"{path}: {key} in the header is {sources.meta[key]}; allowed: a unit quaternion")
+            raise InputError(path, f"{key} in the header is {sources.meta[key]}", "a unit quaternion")
     try:
         utc = datetime.datetime.fromisoformat(str(sources.meta.get("mid_utc")))
     except ValueError:
         raise InputError(
-            f"{path}: mid_utc in the header is {sources.meta.get('mid_utc')!r}; allowed: a time; run the scene again"
+            path, f"mid_utc in the header is {sources.meta.get('mid_utc')!r}", "a time; run the scene again"
         ) from None
     return FrameTruth(
         frame=int(numbers.pop("frame")[0]),

@@ -145,11 +145,12 @@ class Part:
         if self._trials[0] != replicates:
             point, replicate = (read_column(self.path, name) for name in ("point", "replicate"))
             if not len(point) == len(replicate) == self.rows > 0:
-                raise InputError(f"{self.path}: has {len(point)} rows; allowed: {self.rows}, as the study store lists")
+                raise InputError(self.path, f"has {len(point)} rows", f"{self.rows}, as the study store lists")
             if not (are_below(point, self.last + 1) and are_below(replicate, replicates)):
                 raise InputError(
-                    f"{self.path}: not a valid part of a study store: points and replicates; allowed: 0 to {self.last},"
-                    f" 0 to {replicates - 1}"
+                    self.path,
+                    "not a valid part of a study store: points and replicates",
+                    f"0 to {self.last}, 0 to {replicates - 1}",
                 )
             self._trials = replicates, point * replicates + replicate
         return self._trials[1]
@@ -195,6 +196,6 @@ def part_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except ImportError:
-        raise InputError(f"{path}: Parquet {EXTRA}") from None
+        raise InputError(path, f"Parquet {EXTRA}") from None
     except (OSError, ValueError, KeyError, NotImplementedError, MemoryError) as error:  # pyarrow's are among them
-        raise InputError(f"{path}: not a valid part of a study store: {' '.join(str(error).split())[:120]}") from None
+        raise InputError(path, f"not a valid part of a study store: {' '.join(str(error).split())[:120]}") from None

@@ -65,7 +65,7 @@ class Report:
 
         path = Path(path)
         if path.suffix not in SUFFIXES:
-            raise InputError(f"{path}: {unknown_name('file format', path.suffix, SUFFIXES)}")
+            raise InputError(path, *unknown_name("file format", path.suffix, SUFFIXES))
         files.make_folder(path.parent)
         if path.suffix == ".html":
             files.write_text(path, self.html())

@@ -1,4 +1,4 @@
-"""Parsers of the answers, from a typed text to a value of the file. Each raises ValueError with what is allowed."""
+"""Parsers of the answers, from a typed text to a value of the file. Each raises InputError with what is allowed."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import math
 import re
 from collections.abc import Callable
 
+from skysim.core.errors import InputError
+
 
 def pixels(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d{1,6})\s*(?:px)?\s*[x×*,]\s*(\d{1,6})\s*(?:px)?", text.strip())
     if not match:
-        raise ValueError("allowed: width x height, such as 1936x1216")
+        raise InputError("", "", "width x height, such as 1936x1216")
     return int(match[1]), int(match[2])
 
 
@@ -18,12 +20,12 @@ def quantity_text(si_unit: str, what: str, example: str) -> Callable[[str], str]
     """A parser that checks a quantity and returns its text."""
 
     def parse(text: str) -> str:
-        from skysim.core.quantities.units import quantity
+        from skysim.core.units import quantity
 
         try:
             quantity(si_unit, what, example)(text)
         except ValueError:
-            raise ValueError(f"allowed: a {what} with its unit, such as {example}") from None
+            raise InputError("", "", f"a {what} with its unit, such as {example}") from None
         return " ".join(text.split())
 
     return parse
@@ -31,7 +33,7 @@ def quantity_text(si_unit: str, what: str, example: str) -> Callable[[str], str]
 
 def finite(value: float) -> float:
     if not math.isfinite(value):
-        raise ValueError("not finite")
+        raise InputError("", "not finite")
     return value
 
 
@@ -48,7 +50,7 @@ def number(units: str, example: str) -> Callable[[str], float]:
         try:
             value = finite(float(match[1] if match else ""))
         except ValueError:
-            raise ValueError(f"allowed: a number such as {example}") from None
+            raise InputError("", "", f"a number such as {example}") from None
         return plain(value)
 
     return parse
@@ -64,7 +66,7 @@ def share(text: str) -> float:
 def bits(text: str) -> int:
     value = number("bits?", "12")(text)
     if value not in range(1, 17):
-        raise ValueError("allowed: 1 to 16")
+        raise InputError("", "", "1 to 16")
     return int(value)
 
 
@@ -83,7 +85,7 @@ def shutter(text: str) -> str:
     kinds = ("global", "rolling", "frame_transfer", "interline")
     kind = text.strip().lower().replace(" ", "_").replace("-", "_").removesuffix("_shutter")
     if kind not in kinds:
-        raise ValueError(f"allowed: {', '.join(kinds)}")
+        raise InputError("", "", ", ".join(kinds))
     return kind
 
 

@@ -26,7 +26,7 @@ class Question(NamedTuple):
 
     keys        : of the section `camera` that the answer gives
     where       : where a data sheet states it
-    parse       : from the typed text to the value of the file, several for several keys; raises ValueError
+    parse       : from the typed text to the value of the file, several for several keys; raises InputError
     assume      : from the values known so far to the assumption; None if the key is then left out
     consequence : of not knowing it; empty if it must be given
     skipped     : why it is not asked, by the values known so far; empty if it is
@@ -46,7 +46,7 @@ def assumed(value: Any, why: str) -> Callable[[Values], Assumed]:
 
 
 def without_lens(values: Values) -> str:
-    return "" if "focal_length" in values else "without --focal-length"
+    return "" if "focal_length" in values else "without focal_length"
 
 
 def not_by_rows(values: Values) -> str:
@@ -64,7 +64,7 @@ def full_well(values: Values) -> Assumed:
     """Electrons, from the range of the converter if the gain is known, otherwise from the area of a pixel."""
     if "gain" in values:
         return Assumed(rounded(values["gain"] * range_dn(values)), "where the converter's range ends")
-    from skysim.core.quantities.units import in_si
+    from skysim.core.units import in_si
 
     area_um2 = (1e6 * in_si(values["pitch"], "m")) ** 2
     return Assumed(rounded(WELL_E_UM2 * area_um2), f"{WELL_E_UM2:g} e- a square micrometer, as in the IMX264")

@@ -46,17 +46,17 @@ class Sheet(NamedTuple):
 
 
 def fill(answers: Mapping[str, str]) -> Sheet:
-    """The camera of some answers, with assumptions for the rest. Raises InputError with the option's name."""
+    """The camera of some answers, with assumptions for the rest. Raises InputError; its key is `answers.NAME`."""
     values = {name: parsed(name, text) for name, text in answers.items()}
     missing, comments = [], dict.fromkeys(values, "[S1]")
     for name, question in QUESTIONS.items():
         skipped = question.skipped(values)
         if skipped and name in values:
-            raise InputError(f"--{option(name)}: has no effect {skipped}")
+            raise InputError(f"answers.{name}", f"has no effect {skipped}")
         if skipped or name in values:
             continue
         if name in REQUIRED:
-            raise InputError(f"--{option(name)}: missing; {question.ask}: {question.where}")
+            raise InputError(f"answers.{name}", f"missing; {question.ask}: {question.where}")
         guess = question.assume(values)
         if guess is not None:
             values[name], comments[name] = guess.value, f"assumed: {guess.why}"
@@ -72,16 +72,17 @@ def outstanding(answers: Mapping[str, str]) -> dict[str, Missing]:
     return {one.name: one for one in fill(PLACEHOLDERS | dict(answers)).missing}
 
 
-def option(name: str) -> str:
-    return name.replace("_", "-")
-
-
 def parsed(name: str, text: str) -> Any:
     """The value of an answer. Raises InputError."""
     try:
         return QUESTIONS[name].parse(text)
-    except ValueError as error:
-        raise InputError(f"--{option(name)}: {printable(text)[:40]!r}: {error}") from None
+    except InputError as error:
+        raise InputError(f"answers.{name}", quoted(text), error.allowed) from None
+
+
+def quoted(text: str) -> str:
+    """The begin of an answer, for messages."""
+    return repr(printable(text)[:40])
 
 
 def lines_of(values: Values, comments: Mapping[str, str]) -> Iterator[Line]:
@@ -113,29 +114,32 @@ def tree_of(lines: list[Line]) -> dict[str, Any]:
 
 
 def check(sheet: Sheet, answers: Mapping[str, str]) -> None:
-    """Validate the camera. Raises InputError that begins with the option of the first wrong answer."""
+    """Validate the camera. Raises InputError of the first wrong answer."""
     from pydantic import ValidationError
 
-    from skysim.core.io.yaml_reader import yaml_keys
+    from skysim.core.io.yaml_reader import fault_of, yaml_keys
     from skysim.scene.sections.camera import CameraConfig
 
     tree = tree_of(sheet.lines)
     try:
         CameraConfig.model_validate(PLACEHOLDER_LENS | tree)
     except ValidationError as error:
-        faults = [(".".join(map(str, yaml_keys(one["loc"], tree, False))), one["msg"]) for one in error.errors()]
-        raise InputError(blame(faults, answers)) from None
+        faults: list[InputError] = []
+        for one in error.errors():
+            fault, section = fault_of(one, CameraConfig), ".".join(map(str, yaml_keys(one["loc"], tree, False)))
+            faults.append(fault.under(section) if section else fault)
+        raise blame(faults, answers) from None
 
 
-def blame(faults: list[tuple[str, str]], answers: Mapping[str, str]) -> str:
-    """The message of the first fault, key and pydantic's message, that is of an answer; otherwise of the first."""
+def blame(faults: list[InputError], answers: Mapping[str, str]) -> InputError:
+    """The first fault that is of an answer, as an error of that answer; otherwise the first."""
     for name, text in answers.items():
-        for key, message in faults:
-            keys = QUESTIONS[name].keys
-            if key in keys or keys[0].rpartition(".")[2] in message:  # a validator of a section names the key
-                limit = message.removeprefix("Value error, ").replace("Input should be", "allowed:") + SI.get(key, "")
-                return f"--{option(name)}: {printable(text)[:40]!r}: {limit}"
-    return f"camera: {faults[0][1].removeprefix('Value error, ')}"
+        for fault in faults:
+            if fault.key in QUESTIONS[name].keys:
+                if fault.allowed:
+                    return InputError(f"answers.{name}", quoted(text), fault.allowed + SI.get(fault.key, ""))
+                return InputError(f"answers.{name}", f"{quoted(text)}: {fault.problem}")
+    return faults[0].under("camera")
 
 
 def text(sheet: Sheet, name: str) -> str:

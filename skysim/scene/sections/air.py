@@ -8,7 +8,8 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from skysim.core.constants import FWHM_PER_SIGMA
-from skysim.core.quantities.units import Ascending, ConfigModel, Fraction, Length, Number, check_table
+from skysim.core.errors import InputError
+from skysim.core.units import Ascending, ConfigModel, Fraction, Length, Number, check_table
 
 NEGLIGIBLE_PX = 0.02  # a blur of this sigma makes an image of 0.7 px wider by 0.0003 px
 Altitude = Annotated[Number, Field(ge=0, lt=90)]
@@ -27,7 +28,7 @@ class HorizonConfig(ConfigModel):
     def check_columns(self) -> Self:
         check_table(self.azimuth_deg, self.altitude_deg, "altitude_deg")
         if not 0 <= self.azimuth_deg[0] <= self.azimuth_deg[-1] < 360:
-            raise ValueError("azimuth_deg: outside the circle; allowed: 0 to below 360")
+            raise InputError("azimuth_deg", "outside the circle", "0 to below 360")
         return self
 
 

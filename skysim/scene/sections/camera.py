@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, field_validator, model_validator
 
-from skysim.core.errors import unknown_name
+from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import DATA
-from skysim.core.quantities.units import (
+from skysim.core.units import (
     Ascending,
     ConfigModel,
     Fraction,
@@ -133,7 +133,7 @@ class ChromaticConfig(ConfigModel):
             if column is not None:
                 check_table(self.wavelength_m, column, name, "wavelength")
         if not any(column and any(column) for column in columns.values()):
-            raise ValueError("nothing depends on the wavelength; allowed: focus or corner_px other than 0")
+            raise InputError("", "nothing depends on the wavelength", "focus or corner_px other than 0")
         return self
 
 
@@ -153,7 +153,7 @@ class GhostConfig(ConfigModel):
     @classmethod
     def check_magnification(cls, value: float) -> float:
         if abs(value) < 0.05:
-            raise ValueError(f"{value:g} images half of space on the chip; allowed: from 0.05 or to -0.05")
+            raise InputError("", f"{value:g} images half of space on the chip", "from 0.05 or to -0.05")
         return value
 
 
@@ -182,7 +182,7 @@ class BaffleConfig(ConfigModel):
     def check_columns(self) -> BaffleConfig:
         check_table(self.angle_deg, self.pst, "pst")
         if not 0 <= self.angle_deg[0] < self.angle_deg[-1] <= 180:
-            raise ValueError("angle_deg: outside of half a circle; allowed: 0 to 180")
+            raise InputError("angle_deg", "outside of half a circle", "0 to 180")
         return self
 
 
@@ -274,7 +274,7 @@ def transmission_tag(value: Any) -> str:
 
 def curve_exists(value: str) -> str:
     if not Path(value).is_file():
-        raise ValueError(f"no file {value!r}; allowed: a CSV file of wavelength_nm and response, or a number to 1")
+        raise InputError("", f"no file {value!r}", "a CSV file of wavelength_nm and response, or a number to 1")
     return value
 
 
@@ -339,9 +339,10 @@ class DetectorConfig(ConfigModel):
     @model_validator(mode="after")
     def check_temperature(self) -> DetectorConfig:
         if self.temperature_c is not None and self.doublings > 40:
-            raise ValueError(
-                f"temperature_c {self.temperature_c:g} doubles the dark current {self.doublings:.0f} times;"
-                " allowed: up to 40"
+            raise InputError(
+                "temperature_c",
+                f"{self.temperature_c:g} doubles the dark current {self.doublings:.0f} times",
+                "up to 40",
             )
         return self
 
@@ -354,7 +355,7 @@ class DetectorConfig(ConfigModel):
     @model_validator(mode="after")
     def check_offset(self) -> DetectorConfig:
         if self.offset_dn >= 2**self.bits:
-            raise ValueError(f"offset_dn {self.offset_dn:g} is beyond the range of {self.bits} bits")
+            raise InputError("offset_dn", f"{self.offset_dn:g} is beyond the range of {self.bits} bits")
         return self
 
 
@@ -388,7 +389,9 @@ class CameraConfig(ConfigModel):
     @model_validator(mode="after")
     def check_focus(self) -> CameraConfig:
         if self.focus_m <= 2 * self.focal_length_m:
-            raise ValueError(f"focus {self.focus_m:g} m is less than twice the focal length {self.focal_length_m:g} m")
+            raise InputError(
+                "focus", f"{self.focus_m:g} m is less than twice the focal length {self.focal_length_m:g} m"
+            )
         return self
 
     @property
@@ -433,11 +436,11 @@ CURVE_FOLDER = DATA / "qe"
 def curve_file(name: str) -> Path:
     """The file of a quantum efficiency: a name in data/qe, or a path that ends in .csv.
 
-    Raises ValueError, with the names of data/qe, if it is neither.
+    Raises InputError, with the names of data/qe, if it is neither.
     """
     curves = {path.stem: path for path in sorted(CURVE_FOLDER.glob("*.csv"))}
     if name in curves:
         return curves[name]
     if name.endswith(".csv") and Path(name).is_file():
         return Path(name)
-    raise ValueError(unknown_name("curve", name, curves))
+    raise InputError("", *unknown_name("curve", name, curves))

@@ -9,8 +9,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from skysim.core.quantities.tolerance import LengthError, NumberError
-from skysim.core.quantities.units import ConfigModel, Length, Number
+from skysim.core.errors import InputError
+from skysim.core.tolerance import LengthError, NumberError
+from skysim.core.units import ConfigModel, Length, Number
 
 HOLES = 9  # of a patch board: 3x3
 Level = Annotated[Number, Field(gt=0, le=1)]
@@ -44,9 +45,9 @@ class BoardConfig(ConfigModel):
     @model_validator(mode="after")
     def check_leds(self) -> BoardConfig:
         if len(set(self.leds)) < len(self.leds):
-            raise ValueError(f"leds: {list(self.leds)} has a duplicate hole")
+            raise InputError("leds", f"{list(self.leds)} has a duplicate hole")
         if self.levels is not None and len(self.levels) != len(self.leds):
-            raise ValueError(f"leds has {len(self.leds)} holes, levels {len(self.levels)}")
+            raise InputError("", f"leds has {len(self.leds)} holes, levels {len(self.levels)}")
         return self
 
 
@@ -77,15 +78,17 @@ class PatchBoardsConfig(ConfigModel):
     @classmethod
     def check_lit(cls, value: tuple[int, int]) -> tuple[int, int]:
         if not 1 <= value[0] <= value[1] <= HOLES:
-            raise ValueError(f"{value} is not a range of LEDs on a 3x3 board; allowed: 1 <= least <= most <= 9")
+            raise InputError("", f"{value} is not a range of LEDs on a 3x3 board", "1 <= least <= most <= 9")
         return value
 
     @model_validator(mode="after")
     def check_spacing(self) -> PatchBoardsConfig:
         if self.spacing_m is None and not self.boards:
-            raise ValueError("patch_boards takes spacing, or boards by list")
+            raise InputError("", "patch_boards takes spacing, or boards by list")
         if self.spacing_m is not None and self.spacing_m < 3 * self.pitch_m:
-            raise ValueError(f"spacing {self.spacing_m:g} m: boards of three LEDs at {self.pitch_m:g} m would overlap")
+            raise InputError(
+                "spacing", f"{self.spacing_m:g} m: boards of three LEDs at {self.pitch_m:g} m would overlap"
+            )
         return self
 
 
@@ -113,11 +116,9 @@ class DimmedConfig(ConfigModel):
     @model_validator(mode="after")
     def check_brightness(self) -> Self:
         if self.levels is not None and self.magnitudes is not None:
-            raise ValueError("a layout takes either levels or magnitudes")
+            raise InputError("", "a layout takes either levels or magnitudes")
         if self.unique_neighbors and len(set(self.dimming)) < 2:
-            raise ValueError(
-                "unique_neighbors: all LEDs are equally bright; allowed: two levels or magnitudes, or more"
-            )
+            raise InputError("unique_neighbors", "all LEDs are equally bright", "two levels or magnitudes, or more")
         return self
 
 
@@ -138,7 +139,7 @@ class PoissonDiskConfig(DimmedConfig):
     @model_validator(mode="after")
     def check_density(self) -> Self:
         if (self.spacing_m is None) == (self.count is None):
-            raise ValueError("poisson_disk takes either spacing or count")
+            raise InputError("", "poisson_disk takes either spacing or count")
         return self
 
 
@@ -176,7 +177,7 @@ class GeodesicConfig(LitConfig):
     @model_validator(mode="after")
     def check_frequency(self) -> GeodesicConfig:
         if self.class_ == "II" and self.frequency % 2:
-            raise ValueError(f"frequency: {self.frequency} is odd; allowed with class: II: even")
+            raise InputError("frequency", f"{self.frequency} is odd, with class: II", "even")
         return self
 
 
@@ -252,9 +253,9 @@ class CelestialConfig(ConfigModel):
     @model_validator(mode="after")
     def check_star_selection(self) -> CelestialConfig:
         if (self.count is None) == (self.limit_mag is None):
-            raise ValueError("celestial takes either count or limit_mag")
+            raise InputError("", "celestial takes either count or limit_mag")
         if not 1900 <= self.epoch.year <= 2100:
-            raise ValueError(f"epoch: {self.epoch.isoformat()} is outside 1900 to 2100")
+            raise InputError("epoch", f"{self.epoch.isoformat()} is outside 1900 to 2100")
         return self
 
 
@@ -275,14 +276,14 @@ class ListedConfig(DimmedConfig):
     def check_positions(self) -> ListedConfig:
         lists = [each for each in (self.positions_m, self.directions_deg, self.file) if each is not None]
         if len(lists) != 1:
-            raise ValueError("listed takes one of positions, directions_deg, file")
+            raise InputError("", "listed takes one of positions, directions_deg, file")
         dimmed = len(self.levels or self.magnitudes or ())
         if self.unique_neighbors:
-            raise ValueError("unique_neighbors: a list has its own levels; allowed: none")
+            raise InputError("unique_neighbors", "a list has its own levels", "none")
         if dimmed and self.file is not None:
-            raise ValueError("levels and magnitudes of a file belong in its columns")
+            raise InputError("", "levels and magnitudes of a file belong in its columns")
         if dimmed and dimmed != len(lists[0]):
-            raise ValueError(f"{len(lists[0])} LEDs, but {dimmed} levels or magnitudes")
+            raise InputError("", f"{len(lists[0])} LEDs, but {dimmed} levels or magnitudes")
         return self
 
 
@@ -332,9 +333,10 @@ class FibersConfig(ConfigModel):
     def check_aiming(self) -> FibersConfig:
         laser = self.aiming
         if laser and not (self.radius_variation or laser.pointing_sigma_arcsec or laser.orientation_sigma_arcsec):
-            raise ValueError(
-                "aiming: the laser's place has no effect; allowed: an error of its pointing or orientation, or a"
-                " radius_variation"
+            raise InputError(
+                "aiming",
+                "the laser's place has no effect",
+                "an error of its pointing or orientation, or a radius_variation",
             )
         return self
 
@@ -363,7 +365,7 @@ class PixelsConfig(ConfigModel):
     @model_validator(mode="after")
     def check_block(self) -> Self:
         if self.block > min(self.pixels):
-            raise ValueError(f"block {self.block} is wider than the display; allowed: up to {min(self.pixels)} pixels")
+            raise InputError("block", f"{self.block} is wider than the display", f"up to {min(self.pixels)} pixels")
         return self
 
 
@@ -420,11 +422,11 @@ class ProjectorConfig(PixelsConfig):
     def check_lens(self) -> ProjectorConfig:
         sight = [end - start for start, end in zip(self.position_m, self.aim_m, strict=True)]
         if not any(sight[1:]):
-            raise ValueError("aim: straight along x from the position; allowed: any other direction")
+            raise InputError("aim", "straight along x from the position", "any other direction")
         corner = math.hypot(*self.pixels) * self.pitch_m / 2 / self.focal_length_m
         # t (1 + k t^2) has its maximum 2 t / 3 at t^2 = -1 / (3 k).
         if self.distortion < 0 and 2 / 3 / math.sqrt(-3 * self.distortion) <= corner:
-            raise ValueError(f"distortion: {self.distortion:g} folds the picture's corners back; allowed: nearer to 0")
+            raise InputError("distortion", f"{self.distortion:g} folds the picture's corners back", "nearer to 0")
         return self
 
 

@@ -7,9 +7,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
 
+from skysim.core.errors import InputError
 from skysim.core.paths import DATA
-from skysim.core.quantities.tolerance import LengthError, NumberError, Tolerance
-from skysim.core.quantities.units import (
+from skysim.core.tolerance import LengthError, NumberError, Tolerance
+from skysim.core.units import (
     Ascending,
     ConfigModel,
     Intensity,
@@ -41,7 +42,7 @@ class LobeTableConfig(ConfigModel):
     def check_columns(self) -> LobeTableConfig:
         check_table(self.angle_deg, self.intensity, "intensity")
         if self.angle_deg[0] != 0 or abs(self.intensity[0] - 1) > 1e-6:
-            raise ValueError("the table does not begin with an intensity of 1 at 0 deg")
+            raise InputError("", "the table does not begin with an intensity of 1 at 0 deg")
         return self
 
 
@@ -136,7 +137,7 @@ class TriggeredCodeConfig(CodeConfig):
     @model_validator(mode="after")
     def check_levels(self) -> Self:
         if self.levels > 2 and self.depth == 1:
-            raise ValueError(f"levels: {self.levels} with depth 1, equally spaced in magnitude; allowed: depth below 1")
+            raise InputError("levels", f"{self.levels} with depth 1, equally spaced in magnitude", "depth below 1")
         return self
 
 
@@ -186,7 +187,7 @@ class AgingConfig(ConfigModel):
     @classmethod
     def check_scatter(cls, value: float) -> float:
         if isinstance(value, Tolerance) and value.half_width >= 1:
-            raise ValueError(f"a tolerance of {value.half_width:g} makes light; allowed: below 1")
+            raise InputError("", f"a tolerance of {value.half_width:g} makes light", "below 1")
         return value
 
 
@@ -203,12 +204,10 @@ class WarmUpConfig(ConfigModel):
 
 
 def spectrum_file(spectrum: str) -> Path:
-    """The file of an LED's spectrum: data/led/white.csv, or a path. Raises ValueError if there is none."""
+    """The file of an LED's spectrum: data/led/white.csv, or a path. Raises InputError if there is none."""
     path = DATA / "led" / "white.csv" if spectrum == "white" else Path(spectrum)
     if not path.is_file():
-        raise ValueError(
-            f"no file {spectrum!r}; allowed: white, a CSV file of wavelength_nm and power, or a wavelength"
-        )
+        raise InputError("", f"no file {spectrum!r}", "white, a CSV file of wavelength_nm and power, or a wavelength")
     return path
 
 
@@ -267,22 +266,23 @@ class LedConfig(ConfigModel):
     @model_validator(mode="after")
     def check_intensity(self) -> LedConfig:
         if (self.intensity_cd is None) == (self.radiant_intensity_w_sr is None):
-            raise ValueError("an LED takes either intensity or radiant_intensity")
+            raise InputError("", "an LED takes either intensity or radiant_intensity")
         return self
 
     @model_validator(mode="after")
     def check_color(self) -> LedConfig:
         if isinstance(self.spectrum, str) and (self.fwhm_m is not None or self.color_scatter_m):
             key = "color_scatter" if self.fwhm_m is None else "fwhm"
-            raise ValueError(f"{key}: {self.spectrum} is a whole spectrum; allowed: a wavelength as spectrum")
+            raise InputError(key, f"{self.spectrum} is a whole spectrum", "a wavelength as spectrum")
         return self
 
     @model_validator(mode="after")
     def check_code(self) -> LedConfig:
         if self.code and self.code.kind != "cyclic" and self.code.bit_time_s != "frame":
-            raise ValueError(
-                f"code.bit_time: a {self.code.kind} code cannot be read without the camera's trigger;"
-                " allowed: frame, or kind cyclic"
+            raise InputError(
+                "code.bit_time",
+                f"a {self.code.kind} code cannot be read without the camera's trigger",
+                "frame, or kind cyclic",
             )
         return self
 
@@ -290,5 +290,5 @@ class LedConfig(ConfigModel):
     @classmethod
     def check_scatter(cls, value: float) -> float:
         if isinstance(value, Tolerance) and value.half_width >= 1:
-            raise ValueError(f"a tolerance of {value.half_width:g} leaves no light; allowed: below 1")
+            raise InputError("", f"a tolerance of {value.half_width:g} leaves no light", "below 1")
         return value

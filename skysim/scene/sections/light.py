@@ -9,8 +9,9 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, field_validator, model_validator
 
 from skysim.core.constants import SUN_V_MAG
-from skysim.core.quantities.tolerance import LengthError
-from skysim.core.quantities.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
+from skysim.core.errors import InputError
+from skysim.core.tolerance import LengthError
+from skysim.core.units import Ascending, ConfigModel, Fraction, Length, Number, SemiAxis, check_table
 from skysim.scene.sections.air import AirConfig
 from skysim.scene.sections.layouts import Layout, PixelsConfig
 from skysim.scene.sections.leds import LedConfig
@@ -53,9 +54,9 @@ class RimmedConfig(SurfaceConfig):
     @model_validator(mode="after")
     def check_rim(self) -> Self:
         if self.rim_height_m is not None and self.rim_deg is not None:
-            raise ValueError("rim_height and rim_deg conflict; allowed: one of the two")
+            raise InputError("", "rim_height and rim_deg conflict", "one of the two")
         if self.rim_height_m is not None and self.rim_height_m >= getattr(self, "apex_m", math.inf):
-            raise ValueError(f"rim_height {self.rim_height_m:g} m is not below the apex; allowed: less than apex")
+            raise InputError("rim_height", f"{self.rim_height_m:g} m is not below the apex", "less than apex")
         return self
 
 
@@ -84,7 +85,7 @@ class SphereSurfaceConfig(RimmedConfig):
     def check_wall(self) -> Self:
         thickest = max(self.wall.thickness_apex_m, self.wall.thickness_base_m) if self.wall else 0.0
         if thickest > 0.1 * self.radius_m:
-            raise ValueError(f"a wall of {thickest:g} m is too thick; allowed: up to a tenth of the radius")
+            raise InputError("", f"a wall of {thickest:g} m is too thick", "up to a tenth of the radius")
         return self
 
 
@@ -118,9 +119,9 @@ class CylinderSurfaceConfig(SurfaceConfig):
     @model_validator(mode="after")
     def check_extent(self) -> Self:
         if self.axis == "z" and self.length_m is None:
-            raise ValueError("a cylinder about z requires length, from apex down")
+            raise InputError("", "a cylinder about z requires length, from apex down")
         if self.rim_height_m is not None and self.rim_height_m >= self.apex_m:
-            raise ValueError(f"rim_height {self.rim_height_m:g} m is not below the apex; allowed: less than apex")
+            raise InputError("rim_height", f"{self.rim_height_m:g} m is not below the apex", "less than apex")
         return self
 
 
@@ -141,7 +142,7 @@ class SurveyedSurfaceConfig(RimmedConfig):
     @classmethod
     def check_file(cls, value: str) -> str:
         if not value.endswith(".csv") or not Path(value).is_file():
-            raise ValueError(f"{value!r} is not a file; allowed: a .csv file of x, y, z")
+            raise InputError("", f"{value!r} is not a file", "a .csv file of x, y, z")
         return value
 
 
@@ -194,9 +195,9 @@ class RoomConfig(ConfigModel):
     @model_validator(mode="after")
     def check_limits(self) -> RoomConfig:
         if self.height_m is not None and self.bearing_height_m is None:
-            raise ValueError("height requires bearing_height, the bearing's center above the floor")
+            raise InputError("", "height requires bearing_height, the bearing's center above the floor")
         if self.segments > 1 and self.door_m is None:
-            raise ValueError("segments: have no effect without a door; allowed: door, or no segments")
+            raise InputError("segments", "have no effect without a door", "door, or no segments")
         return self
 
 
@@ -231,13 +232,11 @@ class ReflectionConfig(ConfigModel):
     @model_validator(mode="after")
     def check_shares(self) -> Self:
         if self.specular and self.refractive_index is not None:
-            raise ValueError("specular and refractive_index conflict; allowed: one of the two")
+            raise InputError("", "specular and refractive_index conflict", "one of the two")
         if self.diffuse + self.specular >= 1:
-            raise ValueError(f"diffuse {self.diffuse:g} and specular {self.specular:g} leave no loss; allowed: below 1")
+            raise InputError("", f"diffuse {self.diffuse:g} and specular {self.specular:g} leave no loss", "below 1")
         if not (self.diffuse or self.mirrors or self.floor):
-            raise ValueError(
-                "nothing reflects; allowed: diffuse, specular, refractive_index or floor, or no reflection"
-            )
+            raise InputError("", "nothing reflects", "diffuse, specular, refractive_index or floor, or no reflection")
         return self
 
     @property
@@ -265,9 +264,7 @@ class DomeConfig(ConfigModel):
     @model_validator(mode="after")
     def check_controller(self) -> DomeConfig:
         if getattr(self.led.drive, "controller", None) == "board" and self.layout.kind != "patch_boards":
-            raise ValueError(
-                f"led.drive.controller: {self.layout.kind} has no boards; allowed: dome, or a number of LEDs"
-            )
+            raise InputError("led.drive.controller", f"{self.layout.kind} has no boards", "dome, or a number of LEDs")
         return self
 
     @model_validator(mode="after")
@@ -275,12 +272,12 @@ class DomeConfig(ConfigModel):
         layout, drive = self.layout.kind, self.led.drive.kind
         display = layout in ("lcd", "projector")
         if layout == "lcd" and self.surface.kind != "flat":
-            raise ValueError(f"layout: lcd does not fit a surface of kind {self.surface.kind}; allowed: flat")
+            raise InputError("layout", f"lcd does not fit a surface of kind {self.surface.kind}", "flat")
         if display and drive not in ("direct", "refresh"):
             article = "an" if layout == "lcd" else "a"
-            raise ValueError(f"led.drive: {drive} cannot drive {article} {layout}; allowed: direct, refresh")
+            raise InputError("led.drive", f"{drive} cannot drive {article} {layout}", "direct, refresh")
         if not display and drive == "refresh":
-            raise ValueError(f"led.drive: refresh requires a layout of kind lcd or projector, not {layout}")
+            raise InputError("led.drive", f"refresh requires a layout of kind lcd or projector, not {layout}")
         return self
 
 
@@ -298,7 +295,7 @@ class BodiesConfig(ConfigModel):
     @model_validator(mode="after")
     def check_any(self) -> Self:
         if not (self.sun or self.moon or self.planets):
-            raise ValueError("no body is left; allowed: sun, moon or planets, or no bodies")
+            raise InputError("", "no body is left", "sun, moon or planets, or no bodies")
         return self
 
 

@@ -6,8 +6,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
+from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import existing_file
-from skysim.core.quantities.units import ConfigModel, Momentum, NotNegative, Number, Positive, Spin, Time
+from skysim.core.units import ConfigModel, Momentum, NotNegative, Number, Positive, Spin, Time
 from skysim.scene.sections.vehicle import ActuatorsName
 
 Duration = Annotated[Time, Field(gt=0)]
@@ -71,7 +72,7 @@ class JitterBandConfig(ConfigModel):
     @model_validator(mode="after")
     def check_frequencies(self) -> JitterBandConfig:
         if self.from_hz >= self.to_hz:
-            raise ValueError(f"from_hz {self.from_hz:g} is not below to_hz {self.to_hz:g}")
+            raise InputError("from_hz", f"{self.from_hz:g} is not below to_hz {self.to_hz:g}")
         return self
 
 
@@ -142,11 +143,12 @@ class ChirpConfig(ConfigModel):
     @model_validator(mode="after")
     def check_frequencies(self) -> ChirpConfig:
         if self.from_hz == self.to_hz:
-            raise ValueError(f"from_hz and to_hz are both {self.from_hz:g}; allowed: different ones, or kind: sine")
+            raise InputError("", f"from_hz and to_hz are both {self.from_hz:g}", "different ones, or kind: sine")
         if self.duration_s < 1 / self.from_hz + 1 / self.to_hz:
-            raise ValueError(
-                f"duration {self.duration_s:g} s is shorter than a period of from_hz and one of to_hz,"
-                f" {1 / self.from_hz + 1 / self.to_hz:g} s"
+            raise InputError(
+                "duration",
+                f"{self.duration_s:g} s is shorter than a period of from_hz and one of to_hz,"
+                f" {1 / self.from_hz + 1 / self.to_hz:g} s",
             )
         return self
 
@@ -193,7 +195,7 @@ class BumpConfig(ConfigModel):
     @model_validator(mode="after")
     def check_catch_time(self) -> BumpConfig:
         if self.caught_after_s is not None and self.caught_after_s < self.duration_s:
-            raise ValueError(f"caught_after {self.caught_after_s:g} s is before the impulse ends")
+            raise InputError("caught_after", f"{self.caught_after_s:g} s is before the impulse ends")
         return self
 
 
@@ -225,7 +227,7 @@ class DesaturationConfig(ConfigModel):
     @model_validator(mode="after")
     def check_thresholds(self) -> DesaturationConfig:
         if self.stop_nms >= self.start_nms:
-            raise ValueError(f"stop {self.stop_nms:g} N m s is not below start {self.start_nms:g} N m s")
+            raise InputError("stop", f"{self.stop_nms:g} N m s is not below start {self.start_nms:g} N m s")
         return self
 
 
@@ -263,7 +265,7 @@ class ControlConfig(ConfigModel):
             unused = tuple(name for name in type(self).model_fields if name not in ("law", "rate_hz"))
         given = [name.removesuffix("_s") for name in unused if getattr(self, name) != default_of(self, name)]
         if given:
-            raise ValueError(f"{given[0]} has no effect with law {self.law}; allowed: none")
+            raise InputError("", f"{given[0]} has no effect with law {self.law}", "none")
         return self
 
 
@@ -303,9 +305,7 @@ class MotionConfig(ConfigModel):
     def check_controller(self) -> MotionConfig:
         driven = any(leg.kind not in ("bump", "hold", "jitter") for leg in self.maneuver)
         if driven and self.control is None:
-            raise ValueError(
-                "a maneuver requires a controller, such as control: pid; allowed without one: maneuver: []"
-            )
+            raise InputError("", "a maneuver requires a controller, such as control: pid", "maneuver: [] without one")
         return self
 
     @model_validator(mode="after")
@@ -313,7 +313,7 @@ class MotionConfig(ConfigModel):
         """A prescribed motion has no dynamics: nothing can hit the vehicle, and its attitude cannot jump."""
         refused = [leg.kind for leg in self.maneuver if leg.kind in ("bump", "step")]
         if self.is_prescribed and refused:
-            raise ValueError(f"maneuver: {refused[0]} is not possible with control: prescribed; allowed: control: pid")
+            raise InputError("maneuver", f"{refused[0]} is not possible with control: prescribed", "control: pid")
         return self
 
     @model_validator(mode="after")
@@ -321,7 +321,7 @@ class MotionConfig(ConfigModel):
         if self.start != "profile":
             return self
         if not self.maneuver or self.maneuver[0].kind != "profile":
-            raise ValueError("start: profile requires a first maneuver of kind profile")
+            raise InputError("start", "profile requires a first maneuver of kind profile")
         if any(self.rate_deg_s):
-            raise ValueError("rate_deg_s: has no effect with start: profile, which gives the rate; allowed: [0, 0, 0]")
+            raise InputError("rate_deg_s", "has no effect with start: profile, which gives the rate", "[0, 0, 0]")
         return self

@@ -6,8 +6,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
+from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import existing_file
-from skysim.core.quantities.units import ConfigModel, Fraction, Length, Number
+from skysim.core.units import ConfigModel, Fraction, Length, Number
 
 ElementsFile = Annotated[str, AfterValidator(existing_file)]
 Magnitude = Annotated[Number, Field(ge=-30, le=30)]
@@ -33,7 +34,7 @@ class RandomSatellitesConfig(ConfigModel):
         for name in ("rate_deg_s", "v_mag"):
             low, high = getattr(self, name)
             if low > high:
-                raise ValueError(f"{name}: {low:g} is above {high:g}; allowed: the least, then the greatest")
+                raise InputError(name, f"{low:g} is above {high:g}", "the least, then the greatest")
         return self
 
 
@@ -52,7 +53,7 @@ class SatellitesConfig(ConfigModel):
     @model_validator(mode="after")
     def check_any(self) -> Self:
         if self.file is None and self.random is None:
-            raise ValueError("no satellite is left; allowed: file or random, or no satellites")
+            raise InputError("", "no satellite is left", "file or random, or no satellites")
         return self
 
 

@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from skysim.core.quantities.units import Ascending, ConfigModel, Length, Number, Time, check_table
+from skysim.core.errors import InputError
+from skysim.core.units import Ascending, ConfigModel, Length, Number, Time, check_table
 
 Temperature = Annotated[Number, Field(ge=-150, le=150)]
 Coefficient = Annotated[Number, Field(ge=-10_000, le=10_000)]
@@ -85,7 +86,7 @@ class ThermalConfig(ConfigModel):
     @model_validator(mode="after")
     def check_effect(self) -> ThermalConfig:
         if not self.has_effect:
-            raise ValueError(
-                "nothing depends on the temperature; allowed: dome_ppm_k, mount_arcsec_k or lens_ppm_k, or no thermal"
+            raise InputError(
+                "", "nothing depends on the temperature", "dome_ppm_k, mount_arcsec_k or lens_ppm_k, or no thermal"
             )
         return self

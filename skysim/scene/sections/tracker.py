@@ -6,9 +6,10 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import existing_file
-from skysim.core.quantities.tolerance import LengthError, NumberError
-from skysim.core.quantities.units import ConfigModel, Length, NotNegative, Number, Positive, Spin, Time
+from skysim.core.tolerance import LengthError, NumberError
+from skysim.core.units import ConfigModel, Length, NotNegative, Number, Positive, Spin, Time
 
 
 class TotalStationConfig(ConfigModel):
@@ -83,7 +84,7 @@ class ExposureControlConfig(ConfigModel):
     @model_validator(mode="after")
     def check_limits(self) -> ExposureControlConfig:
         if self.shortest_s > self.longest_s:
-            raise ValueError(f"shortest {self.shortest_s:g} s is above longest {self.longest_s:g} s")
+            raise InputError("shortest", f"{self.shortest_s:g} s is above longest {self.longest_s:g} s")
         return self
 
 
@@ -152,9 +153,9 @@ class TrackerConfig(ConfigModel):
     @model_validator(mode="after")
     def check_assumed(self) -> TrackerConfig:
         if self.assumed_camera_body_m is not None and self.survey.lever_sigma_m:
-            raise ValueError("survey.lever_sigma: conflicts with assumed_camera_body; allowed: 0, or the survey alone")
+            raise InputError("survey.lever_sigma", "conflicts with assumed_camera_body", "0, or the survey alone")
         if self.assumed_focal_length_m is not None and self.survey.focal_length_sigma_m:
-            raise ValueError("survey.focal_length_sigma: conflicts with assumed_focal_length; allowed: one of the two")
+            raise InputError("survey.focal_length_sigma", "conflicts with assumed_focal_length", "one of the two")
         return self
 
     @model_validator(mode="after")
@@ -170,7 +171,7 @@ class TrackerConfig(ConfigModel):
         }
         conflicts = [key for key, value in values.items() if value]
         if self.map and conflicts:
-            raise ValueError(f"{conflicts[0]}: conflicts with tracker.map, which contains it; allowed: 0, or no map")
+            raise InputError(conflicts[0], "conflicts with tracker.map, which contains it", "0, or no map")
         return self
 
 
@@ -231,5 +232,5 @@ class FilterConfig(ConfigModel):
     @model_validator(mode="after")
     def check_drift(self) -> FilterConfig:
         if self.mounting_drift_arcsec_sqrt_h and not self.mounting_arcsec:
-            raise ValueError("mounting_drift_arcsec_sqrt_h: requires mounting_arcsec above 0")
+            raise InputError("mounting_drift_arcsec_sqrt_h", "requires mounting_arcsec above 0")
         return self

@@ -6,8 +6,9 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from skysim.core.quantities.tolerance import NumberError
-from skysim.core.quantities.units import (
+from skysim.core.errors import InputError
+from skysim.core.tolerance import NumberError
+from skysim.core.units import (
     Angles,
     ConfigModel,
     Damping,
@@ -58,7 +59,7 @@ class WheelsConfig(ActuatorsConfig):
     @model_validator(mode="after")
     def check_speeds(self) -> WheelsConfig:
         if any(abs(rpm) > self.speed_limit_rpm for rpm in self.start_rpm):
-            raise ValueError(f"start_rpm: beyond speed_limit_rpm {self.speed_limit_rpm:g}")
+            raise InputError("start_rpm", f"beyond speed_limit_rpm {self.speed_limit_rpm:g}")
         return self
 
 
@@ -104,7 +105,7 @@ class TrimConfig(ConfigModel):
     @model_validator(mode="after")
     def check_positions(self) -> TrimConfig:
         if any(abs(position_m) > self.travel_m for position_m in self.position_m):
-            raise ValueError(f"position: beyond travel {1e3 * self.travel_m:g} mm")
+            raise InputError("position", f"beyond travel {1e3 * self.travel_m:g} mm")
         return self
 
 
@@ -221,19 +222,19 @@ class VehicleConfig(ConfigModel):
     @classmethod
     def check_inertia(cls, value: Triple | None) -> Triple | None:
         if value and (min(value) <= 0 or 2 * max(value) > sum(value)):
-            raise ValueError(
-                f"{value} is not possible for a rigid body; allowed: positive, none above the sum of the others"
+            raise InputError(
+                "", f"{value} is not possible for a rigid body", "positive, none above the sum of the others"
             )
         return value
 
     @model_validator(mode="after")
     def check_free_mount(self) -> VehicleConfig:
         if self.mount == "free" and self.disturbances != DisturbancesConfig():
-            raise ValueError("disturbances: a free vehicle has none; allowed: mount: air_bearing")
+            raise InputError("disturbances", "a free vehicle has none", "mount: air_bearing")
         if self.mount == "free" and self.imu and self.imu.earth_rate != "none":
-            raise ValueError("imu.earth_rate: a free vehicle is not on the Earth; allowed: none")
+            raise InputError("imu.earth_rate", "a free vehicle is not on the Earth", "none")
         if self.mount == "free" and self.trim:
-            raise ValueError("trim: a free vehicle rotates about its center of mass; allowed: mount: air_bearing")
+            raise InputError("trim", "a free vehicle rotates about its center of mass", "mount: air_bearing")
         return self
 
 

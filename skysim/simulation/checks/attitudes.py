@@ -67,13 +67,12 @@ def check_stop(scene: Scene, t_s: Floats, tilt_deg: Floats) -> None:
     """Raise InputError for a start or a maneuver beyond the tilt stop, as a run would."""
     stop_deg, beyond = scene.vehicle.tilt_stop_deg, np.flatnonzero(tilt_deg > scene.vehicle.tilt_stop_deg)
     if len(beyond) == len(tilt_deg):
-        raise InputError(
-            f"motion.start: tilt of {tilt_deg[0]:.1f} deg; allowed: up to vehicle.tilt_stop_deg {stop_deg:g}"
-        )
+        raise InputError("motion.start", f"tilt of {tilt_deg[0]:.1f} deg", f"up to vehicle.tilt_stop_deg {stop_deg:g}")
     if len(beyond) and scene.motion.control is not None:
         raise InputError(
-            f"motion.maneuver: tilt of {tilt_deg[beyond[0]]:.3g} deg at {t_s[beyond[0]]:.3g} s; allowed: up to"
-            f" vehicle.tilt_stop_deg {stop_deg:g}"
+            "motion.maneuver",
+            f"tilt of {tilt_deg[beyond[0]]:.3g} deg at {t_s[beyond[0]]:.3g} s",
+            f"up to vehicle.tilt_stop_deg {stop_deg:g}",
         )
 
 

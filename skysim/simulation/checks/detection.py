@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import special
 
 from estimator.trackers.pipeline import SATURATED_SIGMA_PX, Settings
@@ -30,6 +31,7 @@ MAX_PULSES = 500  # in an exposure; with more the mean time of the light does no
 class Context(NamedTuple):
     """What all checks share: the lab, the tracker's settings and beliefs, the camera, and the dome's surface.
 
+    known_id, known_row : (N,) ascending numbers of the lights that the tracker knows, and their rows in its beliefs
     timing_s : (N,) standard deviation of the mean time of each light that the tracker knows within an exposure
     """
 
@@ -38,7 +40,16 @@ class Context(NamedTuple):
     beliefs: Beliefs
     camera: CameraModel
     surface: Surface | None
+    known_id: NDArray[np.int64]
+    known_row: NDArray[np.int64]
     timing_s: Floats
+
+    def rows_of(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(M,) rows in the tracker's beliefs of lights by their numbers; -1 for those that it does not know."""
+        if not len(self.known_id):
+            return np.full(len(ids), -1)
+        at = np.minimum(np.searchsorted(self.known_id, ids), len(self.known_id) - 1)
+        return np.where(self.known_id[at] == ids, self.known_row[at], -1)
 
 
 def context_of(lab: Lab) -> Context:
@@ -48,7 +59,8 @@ def context_of(lab: Lab) -> Context:
     light, lights = lab.scene.light, believed.lights
     surface = build_surface(light.surface) if isinstance(light, DomeConfig) else None
     timing_s = timing_sigma_s(lights.period_s, lights.on_s, lab.scene.exposure.time_s)
-    return Context(lab, assumed_settings(lab.scene), believed, camera, surface, timing_s)
+    row = np.argsort(lights.id, kind="stable")
+    return Context(lab, assumed_settings(lab.scene), believed, camera, surface, lights.id[row], row, timing_s)
 
 
 def threshold_e(context: Context) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,10 +15,9 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, beliefs
-from skysim.simulation.checks.attitudes import Attitudes
 from skysim.simulation.checks.detection import Context, full_scale_e
-from skysim.simulation.checks.expected_error import Expected, mean_root
-from skysim.simulation.checks.views import View
+from skysim.simulation.checks.expected_error import mean_root
+from skysim.simulation.checks.sampling import Sampled, Samples
 from skysim.sources.dome.layouts.led_list import max_tilt_deg
 from skysim.sources.dome.shell.room import fit
 
@@ -31,33 +31,6 @@ TRACKER_KNOWS = "tracker knows"
 def short(value: float, digits: int = 3) -> str:
     """A number with some significant digits and without an exponent."""
     return f"{float(f'{value:.{digits}g}'):.10g}"
-
-
-class Sampled(NamedTuple):
-    """Some attitudes, what the camera sees there, and the expected errors.
-
-    seen : the lights on the chip that the tracker knows;  used : those that it also detects
-    """
-
-    attitudes: Attitudes
-    seen: list[View]
-    used: list[View]
-    error: Expected
-
-    def counts(self) -> Floats:
-        """(A,) number of lights that the tracker uses."""
-        return np.array([len(view) for view in self.used])
-
-    def joined(self, name: str) -> Floats:
-        """A column of the views of all attitudes end to end."""
-        return np.concatenate([getattr(view, name) for view in self.seen])
-
-
-class Samples(NamedTuple):
-    """The two sets of attitudes: those of the frames, and all that the motion could reach."""
-
-    frames: Sampled
-    reach: Sampled
 
 
 class Fact(NamedTuple):
@@ -85,9 +58,27 @@ def lights_in_field(context: Context, samples: Samples) -> Fact:
         limit = context.settings.max_blobs
         cut = f"; the tracker uses the {limit} brightest" if (counts == limit).any() else ""
         missed = f" (of {seen.mean():.1f} on the chip{cut})" if seen.mean() > counts.mean() + 0.5 else ""
-        lines.append(f"{what}: mean {counts.mean():.1f}{missed}, least {counts.min()} at {where}")
+        hidden = {name: count / len(counts) for name, count in sum(sampled.hidden, Counter[str]()).most_common()}
+        behind = "".join(f"; {count:.1f} more are behind {name}" for name, count in hidden.items())
+        lines.append(f"{what}: mean {counts.mean():.1f}{missed}, least {counts.min()} at {where}{behind}")
         values[key] = {"mean": counts.mean(), "least": counts.min(), "least_at": where, "on_chip": seen.mean()}
+        values[key] |= {"hidden": hidden} if hidden else {}
     return Fact("lights in the field", lines, values)
+
+
+def other_lights(context: Context, samples: Samples) -> Fact | None:
+    """Lights at the frames that the tracker detects and does not know, by their names; None if there are none."""
+    others = samples.frames.others
+    most = {name: max(len(one.get(name, ())) for one in others) for name in {name for one in others for name in one}}
+    if not most:
+        return None
+    frames = {name: sum(name in one for one in others) for name in most}
+    lines = [
+        f"{name}: up to {most[name]} at {frames[name]} of {len(others)} frames, which the tracker does not know"
+        for name in sorted(most)
+    ]
+    values = {name: {"most": most[name], "share": frames[name] / len(others)} for name in sorted(most)}
+    return Fact("other lights", lines, values)
 
 
 def reached(context: Context, samples: Samples) -> str:
@@ -131,7 +122,7 @@ def smear(context: Context, samples: Samples) -> Fact:
     """Path of the images during an exposure at the rates of the frames."""
     frames = samples.frames
     rate_deg_s = np.degrees(np.linalg.norm(frames.attitudes.rate_body_rad_s, axis=1))
-    length_px = np.array([np.median(view.streak_length_px) if len(view) else 0.0 for view in frames.seen])
+    length_px = np.array([np.median(view.streak_length_px) if len(view) else 0.0 for view in frames.known])
     fastest = int(rate_deg_s.argmax())
     text = (
         f"{length_px[fastest]:.2g} px at {rate_deg_s[fastest]:.3g} deg/s, the fastest frame; median"
@@ -139,7 +130,7 @@ def smear(context: Context, samples: Samples) -> Fact:
     )
     values = {"largest_px": length_px[fastest], "median_px": np.median(length_px), "rate_deg_s": rate_deg_s[fastest]}
     if length_px[fastest] > 0:
-        width_px = GAUSSIAN_WIDTH * float(np.median(frames.joined("sigma_px")))
+        width_px = GAUSSIAN_WIDTH * float(np.median(np.concatenate([view.sigma_px for view in frames.known])))
         values["width_rate_deg_s"] = rate_deg_s[fastest] * width_px / length_px[fastest]
         text += f"; as long as the image is wide at {short(values['width_rate_deg_s'])} deg/s"
     return Fact("smear", [text], values)
@@ -334,6 +325,7 @@ def cause_text(sampled: Sampled, angle: str) -> str:
 FACTS: tuple[Callable[[Context, Samples], Fact | None], ...] = (
     field_of_view,
     lights_in_field,
+    other_lights,
     spot,
     peak,
     smear,

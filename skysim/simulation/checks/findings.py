@@ -9,8 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.camera import thermal
+from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig, TwoStopsConfig
 from skysim.scene.sections.layouts import Layout, OnPoints
@@ -24,8 +25,10 @@ from skysim.simulation.checks.detection import (
     threshold_e,
 )
 from skysim.simulation.checks.expected_error import Independent, believed_sigma_px, gains, mismatch
-from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, Samples, cap_margin, fill, short
+from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, cap_margin, fill, short
+from skysim.simulation.checks.sampling import Samples
 from skysim.simulation.checks.views import View
+from skysim.simulation.lights.background import BACKGROUND
 
 MAX_SATURATED = 0.25  # fraction of saturated lights that gives no warning: a bright star or LED now and then
 TARGET_FILL = 0.7  # of full well, for the light that a fraction MAX_SATURATED exceeds
@@ -89,9 +92,11 @@ def bright_background(context: Context, samples: Samples) -> str:
     if camera.background_e < MAX_BACKGROUND * full_e:
         return ""
     shorter_ms = 1e3 * scene.exposure.time_s * MAX_BACKGROUND / 2 * full_e / camera.background_e
+    most = max(camera.glow_e, key=lambda name: camera.glow_e[name], default=BACKGROUND)
+    cause = "" if most == BACKGROUND else f", most of it from {most}"
     return (
-        f"background: {camera.background_e:.0f} electrons in a pixel without a light, of {full_e:.0f} at saturation;"
-        f" lower it, or change exposure.time to {short(shorter_ms, 2)} ms"
+        f"background: {camera.background_e:.0f} electrons in a pixel without a light{cause}, of {full_e:.0f} at"
+        f" saturation; lower it, or change exposure.time to {short(shorter_ms, 2)} ms"
     )
 
 
@@ -111,14 +116,15 @@ def few_lights(context: Context, samples: Samples) -> str:
     """Warn where the tracker has too few lights: at the frames, or in reach."""
     scene, mount = context.lab.scene, context.lab.camera.mount
     needed = least_lights(scene)
-    if cap_too_small(context, samples) or dark_corners(context, samples):
-        return ""  # more LEDs where there are some would not help
+    if any(find(context, samples) for find in (cap_too_small, dark_corners, bright_background)):
+        return ""  # more lights where there are some would not help
     if scene.tracker.brightest is not None and scene.tracker.brightest < needed:
         return f"tracker.brightest: the tracker uses {scene.tracker.brightest} lights; change it to {needed} or more"
     in_reach = MAX_FEW_SKY if scene.vehicle.mount == "free" else MAX_FEW
     for sampled, allowed in ((samples.frames, 0.0), (samples.reach, in_reach)):
         counts = sampled.counts()
-        few = float((counts < needed).mean())
+        unhidden = counts + sampled.hidden_counts()  # `hidden_lights` says what hides them
+        few = float((unhidden < needed).mean())
         if few > allowed:
             break
     else:
@@ -137,6 +143,24 @@ def few_lights(context: Context, samples: Samples) -> str:
     if sky_mag is not None and sky_mag < scene.tracker.limit_mag:
         return f"light.limit_mag: {text}; change it to {scene.tracker.limit_mag:g}, the tracker's limit"
     return f"tracker.limit_mag: {text}; change it to {fainter:g}, or take a shorter camera.focal_length"
+
+
+def hidden_lights(context: Context, samples: Samples) -> str:
+    """Warn where something hides so many lights that the tracker has too few: at the frames."""
+    frames, scene, mount = samples.frames, context.lab.scene, context.lab.camera.mount
+    counts, hidden = frames.counts(), frames.hidden_counts()
+    few = (counts < least_lights(scene)) & (counts + hidden >= least_lights(scene))
+    if not few.any():
+        return ""
+    n = int(np.where(few, hidden, -1).argmax())
+    (name, behind), *others = frames.hidden[n].most_common()
+    expected = int(counts[n] + hidden[n])
+    what = f"all behind {name}" if behind == expected else f"{behind} of them behind {name}"
+    what += "".join(f", {count} behind {other}" for other, count in others)
+    return (
+        f"motion.start: {expected} lights expected at {attitudes.describe(frames.attitudes, n, scene, mount)},"
+        f" {what}; so at {100 * few.mean():.0f} % of the frames; point elsewhere, or change the time"
+    )
 
 
 def least_lights(scene: Scene) -> int:
@@ -359,22 +383,30 @@ def thermal_drift(context: Context, samples: Samples) -> str:
 def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context) -> Floats:
     """(3,) rotation in camera axes by which a solution errs, to first order, after the hardware's drift with the
     temperature; NaN with too few lights."""
-    lab, config = context.lab, context.lab.scene.thermal
+    config = context.lab.scene.thermal
     assert config is not None
-    hardware = thermal.Hardware(context.beliefs.lights.take(view.row), lab.camera.mount, context.camera.optics)
-    sources, mount, optics = thermal.at_time(config, hardware, t_s)
     if len(view) < MIN_LIGHTS:
         return np.full(3, np.nan)
     sigma_px = believed_sigma_px(view, Independent(centroid_variance(view, context)), context)
+    lights, mount, optics = context.beliefs.lights.take(view.row), context.lab.camera.mount, context.camera.optics
+    surveyed_px = image_px(lights, mount, optics, lab_from_body)
+    moved = thermal.camera_at(config, mount, optics, t_s)
+    drifted_px = image_px(thermal.leds_at(config, lights, t_s), *moved, lab_from_body)
+    return np.asarray(np.einsum("nij,nj->i", gains(view, sigma_px), drifted_px - surveyed_px))
+
+
+def image_px(lights: Sources, mount: Mount, optics: Optics, lab_from_body: Rotation) -> Floats:
+    """(n, 2) pixels of lights at an attitude."""
     camera_m = lab_from_body.apply(mount.camera_body_m)
-    offset_m = (mount.cam_from_body * lab_from_body.inv()).apply(sources.place[:, :3] - sources.place[:, 3:] * camera_m)
-    return np.asarray(np.einsum("nij,nj->i", gains(view, sigma_px), optics.project(offset_m) - view.xy_px))
+    offset_m = lights.place[:, :3] - lights.place[:, 3:] * camera_m
+    return optics.project((mount.cam_from_body * lab_from_body.inv()).apply(offset_m))
 
 
 FINDINGS: tuple[Callable[[Context, Samples], str], ...] = (
     bright_background,
     saturation,
     dark_corners,
+    hidden_lights,
     few_lights,
     undetected,
     cap_too_small,

@@ -15,18 +15,17 @@ from skysim.dynamics import guidance
 from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.attitudes import Attitudes
-from skysim.simulation.checks.detection import Context, context_of, usable
+from skysim.simulation.checks.detection import Context, context_of
 from skysim.simulation.checks.dome import assumptions, lookalike, reflections
-from skysim.simulation.checks.expected_error import expected
-from skysim.simulation.checks.facts import ARCSEC, FACTS, Fact, Sampled, Samples, short
+from skysim.simulation.checks.facts import ARCSEC, FACTS, Fact, short
 from skysim.simulation.checks.findings import FINDINGS
+from skysim.simulation.checks.sampling import Samples, sampled
 from skysim.simulation.checks.sky import air, bodies, claims, depth, stray
-from skysim.simulation.checks.views import views
 from skysim.simulation.lab import Lab
 from skysim.simulation.reference_limits import check_reference
 from skysim.sources.dome.placement.ambiguity import Ambiguity
 
-OWN_KEYS = ("camera.", "tracker.", "exposure.")  # of a head; a finding about any other key is one about the scene
+OWN_KEYS = ("camera.", "tracker.", "exposure.", "rotation_deg:")  # of a head; other findings are about the scene
 LEAST_ALIKE, MAP_WORK = 0.3, 60_000  # of an ambiguity map: least fraction sought, fields times LEDs in a field
 SKY_FINDINGS = (depth.sky_too_shallow, depth.tracker_too_shallow, claims.floor_too_small, air.refraction)
 
@@ -92,7 +91,7 @@ def ambiguity_map(lab: Lab) -> tuple[Ambiguity, float]:
     context = context_of(lab)
     samples = samples_of(context, attitudes.of_frames(lab), None)
     if reason := lookalike.why_not_compared(context, samples):
-        raise InputError(reason)
+        raise InputError("", reason)
     return lookalike.compared(context, samples, LEAST_ALIKE, MAP_WORK)
 
 
@@ -100,13 +99,6 @@ def samples_of(context: Context, frames: Attitudes, tilt_deg: float | None) -> S
     """What the camera sees at the frames and within reach."""
     reach = attitudes.within_reach(context.lab.scene, context.lab.camera.mount, frames, tilt_deg)
     return Samples(sampled(frames, context), sampled(reach, context))
-
-
-def sampled(at: Attitudes, context: Context) -> Sampled:
-    """What the camera sees at some attitudes, and the expected errors there."""
-    seen = views(context.lab, context.beliefs.lights, at, context.camera)
-    used = [usable(view, context) for view in seen]
-    return Sampled(at, seen, used, expected(used, at, context))
 
 
 def broken_assumptions(lab: Lab) -> list[str]:
@@ -171,4 +163,6 @@ def errors_text(cross: float, roll: float) -> str:
 
 def head_findings(n: int, own: Sequence[str], main: Sequence[str]) -> list[str]:
     """The warnings of head n that are not those of the main camera, with the key of the head."""
-    return [f"heads.{n}.{line}" for line in own if line.startswith(OWN_KEYS) and line not in main]
+    # A head is pointed elsewhere by its mount.
+    lines = [line.replace("motion.start:", "rotation_deg:", 1) if line not in main else line for line in own]
+    return [f"heads.{n}.{line}" for line in lines if line.startswith(OWN_KEYS) and line not in main]

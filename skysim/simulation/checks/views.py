@@ -17,29 +17,27 @@ sqrt(2 pi) S erf(L / (2 sqrt 2 S)) / L with S = 1 / sqrt(2 pi peak).
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
-from scipy.spatial.transform import Rotation
 
-from skysim.camera.glow import background
-from skysim.camera.glow.air_glow import sky_light
 from skysim.camera.optics import Optics
 from skysim.camera.psf.kernel import build_kernel
 from skysim.camera.psf.otf import blur_radius_px, chromatic_sigma_px, field_sigma_px
-from skysim.camera.render import Poses, project
-from skysim.core.types import Floats, Sources
-from skysim.dynamics import multibody
-from skysim.simulation.checks.attitudes import Attitudes
-from skysim.simulation.exposure import stray_light_e_s
-from skysim.simulation.lab import Lab, bodies_during, sky_during
-from skysim.sources.dome.led import irradiance_e_s_m2
+from skysim.camera.render import in_view, project, rates_e_s
+from skysim.core.types import Floats
+from skysim.simulation.exposure import expected_exposure
+from skysim.simulation.lab import Lab
+from skysim.simulation.lights.lens import STRAY_LIGHT
+from skysim.simulation.lights.light import Beam, Exposure, Lit, Occluder, beam_of
 
 STEP = 1e-6  # relative displacement of a light, for the numerical derivative of its image
 NO_ACCELERATION = np.zeros(3)
-FIELD_MARGIN = 1.02  # of the cone in which lights are projected
+VISIBLE = -1
 
 
 class View(NamedTuple):
@@ -56,6 +54,7 @@ class View(NamedTuple):
     streak_px   : (n, 2) path during the exposure
     peak_e      : mean electrons in the brightest pixel, background included
     bend_px     : (n, 2) mean of the path minus its middle, by the angular acceleration
+    behind      : number of the occluder that hides the light; VISIBLE for none
     """
 
     row: NDArray[np.int64]
@@ -71,6 +70,7 @@ class View(NamedTuple):
     streak_px: Floats
     peak_e: Floats
     bend_px: Floats
+    behind: NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.row)
@@ -104,7 +104,7 @@ class CameraModel(NamedTuple):
     optics       : lens and chip geometry
     lens_px      : standard deviation of the Gaussian that has the peak of the lens's image, pixel included
     background_e : mean electrons in a pixel, of extended light and dark current
-    stray_e      : of them those that come past the baffle
+    glow_e       : of them those of each light, by name; of light with edges its median over the chip
     noise_e      : standard deviation of a pixel without light: of that charge, of the read-out, of the converter, and
                    of the fixed pattern (without hot pixels)
     exposure_s   : exposure time
@@ -113,79 +113,81 @@ class CameraModel(NamedTuple):
     optics: Optics
     lens_px: float
     background_e: float
-    stray_e: float
+    glow_e: dict[str, float]
     noise_e: float
     exposure_s: float
 
+    @property
+    def stray_e(self) -> float:
+        """Mean electrons in a pixel that come past the baffle."""
+        return self.glow_e.get(STRAY_LIGHT, 0.0)
+
     @classmethod
     def of(cls, lab: Lab) -> CameraModel:
-        """The camera of a lab, with the background at its initial attitude."""
+        """The main camera of a lab, with the background at its initial attitude."""
         camera, detector = lab.scene.camera, lab.scene.camera.detector
-        cam_from_lab = lab.camera.mount.cam_from_body * lab.start.inv()
-        first_s, glows = lab.scene.exposure.first_s, lab.scene.background
-        lit = sky_light(sky_during(lab.camera, first_s))
-        stray_e_s = sum(stray_light_e_s(lab.camera, bodies_during(lab.camera, first_s), cam_from_lab, first_s).values())
-        glow_e_s = (
-            float(background.glow_map(glows, lab.camera.optics, cam_from_lab, lab.camera.band, lit).mean()) + stray_e_s
-        )
+        exposure_s = lab.scene.exposure.time_s
+        exposure = expected_exposure(lab.camera, lab.start, np.zeros(3), math.nan)
+        glow_e = glow_by_light_e(beam_of(lab.camera.lights, exposure), exposure_s)
         dark_e_s = detector.dark_e_s * 2.0**detector.doublings
-        background_e = (glow_e_s + dark_e_s) * lab.scene.exposure.time_s
-        pattern_e2 = (detector.dsnu * dark_e_s * lab.scene.exposure.time_s) ** 2 + detector.column_offset_e**2
+        background_e = sum(glow_e.values()) + dark_e_s * exposure_s
+        pattern_e2 = (detector.dsnu * dark_e_s * exposure_s) ** 2 + detector.column_offset_e**2
         read_e2 = detector.read_noise_e**2 + detector.reset_noise_e**2 + detector.gain_e_dn**2 / 12 + pattern_e2
         lens_px = float(1 / np.sqrt(2 * np.pi * build_kernel(camera.psf, camera).peak))
         noise_e = float(np.sqrt(background_e + read_e2))
-        exposure_s = lab.scene.exposure.time_s
-        return cls(lab.camera.optics, lens_px, background_e, stray_e_s * exposure_s, noise_e, exposure_s)
+        return cls(lab.camera.optics, lens_px, background_e, glow_e, noise_e, exposure_s)
 
 
-def views(lab: Lab, lights: Sources, attitudes: Attitudes, camera: CameraModel) -> list[View]:
-    """The view at each attitude, of the lights that no obstacle hides."""
-    rows = zip(attitudes.lab_from_body, attitudes.rate_body_rad_s, attitudes.accelerations(), strict=True)
-    return [view(lab, lights, at, rate, camera, acceleration) for at, rate, acceleration in rows]
+def glow_by_light_e(beam: Beam, exposure_s: float) -> dict[str, float]:
+    """Electrons in a pixel that each light gives it, see `CameraModel`."""
+    found: dict[str, float] = {}
+    for lit in beam.lits:
+        smooth = float(np.mean(lit.glow())) if lit.glow else 0.0
+        found[lit.name] = found.get(lit.name, 0.0) + exposure_s * (smooth + before_lights_e_s(lit))
+    return found
+
+
+def before_lights_e_s(lit: Lit) -> float:
+    """Electrons s^-1 px^-1 of light with edges behind which lights are seen: none of what hides them."""
+    glow = lit.edged.e_s() if lit.edged and lit.hides is None else None
+    return 0.0 if glow is None or lit.edged is None else lit.edged.share * float(np.median(glow))
 
 
 def view(
-    lab: Lab,
-    lights: Sources,
-    lab_from_body: Rotation,
-    rate_body_rad_s: Floats,
+    lit: Lit,
+    exposure: Exposure,
     camera: CameraModel,
+    occluders: Sequence[Occluder] = (),
     acceleration_body_rad_s2: Floats = NO_ACCELERATION,
 ) -> View:
-    """The view at one attitude while the vehicle rotates at a rate and an acceleration, (3,) each in body axes.
+    """The points of a light on the chip in an exposure, also those that one of the occluders hides.
 
-    At the time t from mid-exposure the lights are rotated by -(rate t + acceleration t^2 / 2); the mean over the
-    exposure T is -acceleration T^2 / 24.
+    At the time t from mid-exposure the lights are rotated by -(rate t + acceleration t^2 / 2), with the vehicle's rate
+    and its acceleration (3,) in body axes; the mean over the exposure T is -acceleration T^2 / 24.
     """
-    mount, optics, exposure_s = lab.camera.mount, camera.optics, lab.scene.exposure.time_s
-    cam_from_lab = mount.cam_from_body * lab_from_body.inv()
-    camera_m = lab_from_body.apply(mount.camera_body_m)
-    near = np.flatnonzero(in_cone(lights, cam_from_lab.inv().apply([0.0, 0.0, 1.0]), camera_m, optics.field_rad))
-    poses = Poses(cam_from_lab.as_matrix()[None], camera_m[None])
-    xy_px, distance_m, cos_out, cos_in = (one[0] for one in project(lights.take(near), optics, poses))
+    assert lit.points is not None
+    mount, optics, exposure_s = exposure.mount, exposure.optics, camera.exposure_s
+    near = in_view(lit.points, optics, exposure.pose, reach=0.0)
+    xy_px, distance_m, cos_out, cos_in = (one[0] for one in project(lit.points.take(near), optics, exposure.pose))
     size = np.array([optics.camera.width_px, optics.camera.height_px])
     on_chip = ((xy_px > -0.5) & (xy_px < size - 0.5)).all(axis=1)
-    if lab.camera.obstacles is not None:
-        seen = np.flatnonzero(on_chip)
-        on_chip[seen[multibody.occluded(lab.camera.obstacles, lab_from_body, lights.place[near[seen]])]] = False
     row = near[on_chip]
-    chosen, is_led = lights.take(row), lights.place[row, 3] > 0
+    chosen, is_led = lit.points.take(row), lit.points.place[row, 3] > 0
     xy_px, distance_m, cos_out, cos_in = (one[on_chip] for one in (xy_px, distance_m, cos_out, cos_in))
-    throughput = optics.throughput(cos_in)
-    rate_e_s = optics.collecting_m2 * np.where(
-        is_led,
-        irradiance_e_s_m2(chosen.strength, lab.camera.emitter, cos_out, throughput, distance_m),
-        chosen.strength * throughput,
-    )
+    rate_e_s = rates_e_s(chosen, optics, lit.emitter, distance_m, cos_out, cos_in)
     electrons = rate_e_s * np.minimum(chosen.on_s / chosen.period_s, 1.0) * exposure_s
-    arm_m = cam_from_lab.apply(chosen.place[:, :3])
+    arm_m = exposure.cam_from_lab.apply(chosen.place[:, :3])
     offset_m = arm_m - chosen.place[:, 3:] * mount.cam_from_body.apply(mount.camera_body_m)
     gradient = image_gradient(optics, offset_m)
     jacobian = np.cross(arm_m[:, None, :], gradient)
+    rate_body_rad_s = exposure.trajectory.rate_at(exposure.t_s)
     streak_px, bend_px = (
         -factor * np.einsum("nij,j->ni", jacobian, mount.cam_from_body.apply(body))
         for factor, body in ((exposure_s, rate_body_rad_s), (exposure_s**2 / 24, acceleration_body_rad_s2))
     )
+    if chosen.motion is not None:
+        motion_cam = exposure.cam_from_lab.apply(chosen.motion[:, 0])
+        streak_px = streak_px + exposure_s * np.einsum("nij,nj->ni", gradient, motion_cam)
     depth_m = np.where(is_led, offset_m[:, 2], np.inf)
     disk_px = np.where(is_led, optics.camera.focal_px * chosen.radius_m / distance_m, 0.0)
     lens2_px2 = camera.lens_px**2 + field_sigma_px(optics.camera.psf, optics.camera, xy_px) ** 2
@@ -210,14 +212,16 @@ def view(
         streak_px,
         electrons * share + camera.background_e,
         bend_px,
+        hiding(occluders, chosen.place),
     )
 
 
-def in_cone(lights: Sources, boresight: Floats, camera_m: Floats, field_rad: float) -> NDArray[np.bool_]:
-    """(N,) whether the direction from the camera to a light is within the field's circle about the boresight."""
-    offset = lights.place[:, :3] - lights.place[:, 3:] * camera_m
-    cosine = np.cos(min(FIELD_MARGIN * field_rad, np.pi))
-    return np.asarray(offset @ boresight > cosine * np.sqrt(np.einsum("nj,nj->n", offset, offset)))
+def hiding(occluders: Sequence[Occluder], place: Floats) -> NDArray[np.int64]:
+    """(N,) number of the occluder that hides each of N places, the last one that does; VISIBLE for none."""
+    found = np.full(len(place), VISIBLE)
+    for number, occluder in enumerate(occluders):
+        found[occluder.hides(place)] = number
+    return found
 
 
 def image_gradient(optics: Optics, offset_m: Floats) -> Floats:

@@ -51,9 +51,10 @@ class Air:
         """The sky at a time."""
         return Sky(self, time, topocentric_axes(time, self.site))
 
-    def star_b_v(self, ids: NDArray[np.int64]) -> Floats:
-        """(M,) B-V of stars by their numbers."""
-        return self.b_v[np.searchsorted(self.star_id, ids)]
+    def b_v_of(self, ids: NDArray[np.int64]) -> Floats:
+        """(M,) B-V of lights by their numbers: of the catalog's stars, and for all others the Sun's."""
+        row = np.minimum(np.searchsorted(self.star_id, ids), len(self.star_id) - 1)
+        return np.where(self.star_id[row] == ids, self.b_v[row], SUN[0])
 
     def extinction_mag(self, b_v: float | Floats) -> float | Floats:
         """k' + k'' (B-V): magnitudes for each air mass."""
@@ -86,19 +87,16 @@ class Sky:
         limit_rad = horizon_rad(self.air.config.horizon, np.arctan2(east, north))
         return np.asarray(up < np.sin(limit_rad))
 
-    def stars_seen(self, stars: Sources) -> Sources:
-        """The stars raised and dimmed by the air, in their order."""
-        return self.lights_seen(stars, self.air.star_b_v(stars.id))
-
-    def lights_seen(self, lights: Sources, b_v: float | Floats) -> Sources:
-        """Lights at infinity of these colors raised and dimmed; their motion is as without air."""
+    def points_seen(self, lights: Sources) -> Sources:
+        """Lights at infinity raised and dimmed, in their order; their motion is as without air."""
+        b_v = self.air.b_v_of(lights.id)
         directions = self.air.refraction.apparent(lights.place[:, :3], self.zenith)
         passed = starlight.transmission(self.air_mass(directions), self.air.extinction_mag(b_v))
         place = np.column_stack([directions, lights.place[:, 3]])
         return replace(lights, place=place, strength=lights.strength * passed)
 
     def twinkling(self, seen: Sources, aperture_m: float, exposure_s: float, rng: np.random.Generator) -> Sources:
-        """The stars of `stars_seen` with the scintillation of one exposure through an aperture of this diameter."""
+        """The stars of `points_seen` with the scintillation of one exposure through an aperture of this diameter."""
         air_masses = self.air_mass(seen.place[:, :3])
         optics = aperture_m, exposure_s, self.air.site.height_m, self.air.wavelength_m
         variances = scintillation.variance(air_masses, *optics)

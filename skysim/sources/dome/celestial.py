@@ -46,7 +46,7 @@ def project_stars(config: layouts.CelestialConfig, surface: Surface, led: leds.L
     if not surface.inside(camera_m):
         distance_m = np.linalg.norm(camera_m)
         raise InputError(
-            f"light.layout.camera: {distance_m:g} m from the bearing's center, outside of the dome; allowed: inside"
+            "light.layout.camera", f"{distance_m:g} m from the bearing's center, outside of the dome", "inside"
         )
     stars = catalog.read_for("light.layout.catalog", config.catalog)
     lab_from_icrs = star_sources.cam_from_icrs(config.zenith_ra_deg, config.zenith_dec_deg, config.roll_deg)
@@ -116,7 +116,7 @@ def select_brightest(stars: ProjectedStars, config: layouts.CelestialConfig, sep
         count = int(np.sum(stars.v_mag <= config.limit_mag))
         if not count:
             raise InputError(
-                f"light.layout.limit_mag: no star to {config.limit_mag:g} mag on the dome; allowed: a fainter limit"
+                "light.layout.limit_mag", f"no star to {config.limit_mag:g} mag on the dome", "a fainter limit"
             )
         return merge_close_stars(stars, count, separation_m)
     wanted = config.count or 1
@@ -127,8 +127,7 @@ def select_brightest(stars: ProjectedStars, config: layouts.CelestialConfig, sep
         merged = merge_close_stars(stars, count, separation_m)
     if len(merged.hip) < wanted:
         raise InputError(
-            f"light.layout.count: {wanted} LEDs, but the catalog gives {len(merged.hip)} on the dome; allowed: at most"
-            " that"
+            "light.layout.count", f"{wanted} LEDs, but the catalog gives {len(merged.hip)} on the dome", "at most that"
         )
     return merged
 
@@ -149,7 +148,7 @@ def led_levels(config: layouts.CelestialConfig, stars: ProjectedStars, normal: F
     gain = irradiance_e_s_m2(ones, Emitter.from_config(led), cos_emission, ones, distance_m)
     if not np.all(gain > 0):
         raise InputError(
-            f"light.led.lobe: the LED of HIP {stars.hip[gain <= 0][0]} does not reach the camera; allowed: a wider lobe"
+            "light.led.lobe", f"the LED of HIP {stars.hip[gain <= 0][0]} does not reach the camera", "a wider lobe"
         )
     shown_mag = np.maximum(stars.shown_mag, -np.inf if config.brightest_mag is None else config.brightest_mag)
     needed = 10 ** (-0.4 * shown_mag) / gain

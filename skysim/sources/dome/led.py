@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.jit import jit
-from skysim.core.quantities.tolerance import Tolerance, scaled_errors
+from skysim.core.tolerance import Tolerance, scaled_errors
 from skysim.core.types import Floats
 from skysim.scene.sections.leds import (
     AgingConfig,

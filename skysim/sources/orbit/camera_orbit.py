@@ -79,7 +79,7 @@ class TleOrbit:
             time = self.start + datetime.timedelta(seconds=middle_s)
             place, velocity, errors = gcrs_states(self.elements, time, after_s[rows] - middle_s)
             if errors.any():
-                raise InputError(f"orbit.file: SGP4 has no place of this satellite at {time}; allowed: newer elements")
+                raise InputError("orbit.file", f"SGP4 has no place of this satellite at {time}", "newer elements")
             position_m[rows], velocity_m_s[rows] = place[0], velocity[0]
         return GcrsState(position_m, velocity_m_s)
 
@@ -105,7 +105,7 @@ def tle(config: TleOrbitConfig, start: datetime.datetime) -> TleOrbit:
     if len(rows) != 1:
         listed = ", ".join(map(str, elements.numbers[:5])) + ", ..." * (len(elements.numbers) > 5)
         raise InputError(
-            f"orbit.number: {config.number}: {len(rows)} satellites of {config.file}; allowed: one of {listed}"
+            "orbit.number", f"{config.number}: {len(rows)} satellites of {config.file}", f"one of {listed}"
         )
     return TleOrbit(elements.take(rows), start)
 

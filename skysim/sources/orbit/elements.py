@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.constants import DAY_S
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, Where
 from skysim.core.io.text import excerpt, read_lines
 from skysim.core.time import J2000_JD, tt_jd, ut1_jd, utc_days
 from skysim.core.types import Floats
@@ -58,14 +58,14 @@ def read_elements(path: str) -> Elements:
     """The satellites of a file, told by its content: TLE, or OMM as CSV, XML or JSON. Raises InputError."""
     lines = read_lines(Path(path))
     if not lines:
-        raise InputError(f"{path}: empty; allowed: a TLE or an OMM")
+        raise InputError(path, "empty", "a TLE or an OMM")
     text = "\n".join(line for _, line in lines)
     if text[0] in "<[{" or "NORAD_CAT_ID" in lines[0][1]:
         satellites = [satellite(path, n, fields) for n, fields in enumerate(messages(path, text), 1)]
     else:
         satellites = list(read_tle(path, lines))
     if not 0 < len(satellites) <= MAX_SATELLITES:
-        raise InputError(f"{path}: {len(satellites)} satellites; allowed: 1 to {MAX_SATELLITES}")
+        raise InputError(path, f"{len(satellites)} satellites", f"1 to {MAX_SATELLITES}")
     return Elements(*map(tuple, zip(*satellites, strict=True)))
 
 
@@ -83,15 +83,17 @@ def read_tle(path: str, lines: list[tuple[int, str]]) -> Iterator[tuple[int, str
         pair = line[: TLE_LENGTHS[1]], second[: TLE_LENGTHS[1]]
         for begin, one in zip("12", pair, strict=True):
             if not one.startswith(f"{begin} ") or len(one) not in TLE_LENGTHS:
-                raise InputError(f"{path}, line {n}: {excerpt(one)} is not line {begin} of a TLE")
+                raise InputError(path, f"{excerpt(one)} is not line {begin} of a TLE", where=Where(path, n))
             if len(one) == TLE_LENGTHS[1] and checksum(one) != one[-1]:
                 raise InputError(
-                    f"{path}, line {n}: the checksum of line {begin} is {one[-1]}; it should be {checksum(one)}"
+                    path,
+                    f"the checksum of line {begin} is {one[-1]}; it should be {checksum(one)}",
+                    where=Where(path, n),
                 )
         try:
             record = Satrec.twoline2rv(*pair)
         except (ValueError, IndexError) as error:
-            raise InputError(f"{path}, line {n}: not a TLE: {excerpt(error)}") from None
+            raise InputError(path, f"not a TLE: {excerpt(error)}", where=Where(path, n)) from None
         yield usable(path, n, name, record)
 
 
@@ -115,7 +117,7 @@ def messages(path: str, text: str) -> Iterator[Mapping[str, Any]]:
         else:
             yield from csv.DictReader(io.StringIO(text))
     except (ElementTree.ParseError, ValueError, csv.Error, RecursionError) as error:
-        raise InputError(f"{path}: not an OMM: {excerpt(error)}") from None
+        raise InputError(path, f"not an OMM: {excerpt(error)}") from None
 
 
 def satellite(path: str, n: int, fields: Mapping[str, Any]) -> tuple[int, str, Any]:
@@ -126,14 +128,14 @@ def satellite(path: str, n: int, fields: Mapping[str, Any]) -> tuple[int, str, A
     record, texts = Satrec(), {key: str(value) for key, value in fields.items() if value not in (None, "")}
     missing = [key for key in REQUIRED if key not in texts]
     if missing:
-        raise InputError(f"{path}, message {n}: {missing[0]} is missing")
+        raise InputError(path, f"{missing[0]} is missing", where=Where(path, n, "message"))
     epoch = texts["EPOCH"].rstrip("Z")
     if not EPOCH.fullmatch(epoch):
-        raise InputError(f"{path}, message {n}: EPOCH {excerpt(epoch)}; allowed: 2012-06-22T21:00:00.123456")
+        raise InputError(path, f"EPOCH {excerpt(epoch)}", "2012-06-22T21:00:00.123456", where=Where(path, n, "message"))
     try:
         omm.initialize(record, {**OPTIONAL, **texts, "EPOCH": epoch if "." in epoch else f"{epoch}.0"})
     except (ValueError, OverflowError) as error:
-        raise InputError(f"{path}, message {n}: {excerpt(error)}") from None
+        raise InputError(path, excerpt(error), where=Where(path, n, "message")) from None
     return usable(path, n, texts.get("OBJECT_NAME", ""), record)
 
 
@@ -144,7 +146,7 @@ def usable(path: str, n: int, name: str, record: Any) -> tuple[int, str, Any]:
     error, place_km, _ = record.sgp4(record.jdsatepoch, record.jdsatepochF)
     if error or not np.isfinite(place_km).all():
         what = SGP4_ERRORS.get(error, "elements that are not numbers")
-        raise InputError(f"{path}, satellite {n}: SGP4 refuses these elements: {what}")
+        raise InputError(path, f"SGP4 refuses these elements: {what}", where=Where(path, n, "satellite"))
     return int(record.satnum), name or str(record.satnum), record
 
 

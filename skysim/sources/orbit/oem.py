@@ -15,9 +15,8 @@ import numpy as np
 from scipy.interpolate import BPoly
 
 from skysim.core.constants import EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
-from skysim.core.errors import InputError
-from skysim.core.io.ccsds import Segment, check_version, keyword_value, one_of
-from skysim.core.io.text import read_lines, seconds_since, to_numbers
+from skysim.core.errors import InputError, Where
+from skysim.core.io.text import Segment, check_version, keyword_value, one_of, read_lines, seconds_since, to_numbers
 from skysim.core.time import J2000_JD, SCALES
 from skysim.core.types import Floats
 
@@ -45,7 +44,8 @@ class Ephemeris(NamedTuple):
         if after_s.min() < first or after_s.max() > last:
             worst = after_s.min() if after_s.min() < first else after_s.max()
             raise InputError(
-                f"orbit.file: {self.source} is from {first:.6g} to {last:.6g} s after start_time, not at {worst:.6g} s"
+                "orbit.file",
+                f"{self.source} is from {first:.6g} to {last:.6g} s after start_time, not at {worst:.6g} s",
             )
         return self.path(after_s), self.path.derivative()(after_s)
 
@@ -58,7 +58,7 @@ def read_oem(path: str, start: datetime.datetime) -> Ephemeris:
     """
     segments = split_segments(path)
     if not segments:
-        raise InputError(f"{path}: no segment; allowed: META_START ... META_STOP, then lines of an epoch and numbers")
+        raise InputError(path, "no segment", "META_START ... META_STOP, then lines of an epoch and numbers")
     parts = [segment_samples(path, segment, start) for segment in segments]
     t_s, samples = parts[0]
     for t, more in parts[1:]:
@@ -66,7 +66,7 @@ def read_oem(path: str, start: datetime.datetime) -> Ephemeris:
             t, more = t[1:], more[1:]
         t_s, samples = np.concatenate([t_s, t]), np.concatenate([samples, more])
     if len(t_s) < 2 or (np.diff(t_s) <= 0).any():
-        raise InputError(f"{path}: the epochs of {len(t_s)} samples; allowed: two or more, in order of time")
+        raise InputError(path, f"the epochs of {len(t_s)} samples", "two or more, in order of time")
     missing = np.isnan(samples[:, 6])
     samples[missing, 6:] = gravity_m_s2(samples[missing, :3])
     return Ephemeris(path, t_s, BPoly.from_derivatives(t_s, samples.reshape(-1, 3, 3)))
@@ -93,7 +93,7 @@ def split_segments(path: str) -> list[Segment]:
             if word == "META_START":
                 segments.append(Segment({}, []))
             elif not segments:
-                raise InputError(f"{path}, line {n}: {word} before META_START")
+                raise InputError(path, f"{word} before META_START", where=Where(path, n))
         elif section in ("", "META_START"):
             key, value = keyword_value(path, n, line)
             if section:
@@ -114,7 +114,7 @@ def segment_samples(path: str, segment: Segment, start: datetime.datetime) -> tu
     one_of(path, metadata, "CENTER_NAME", ("EARTH",))
     system = one_of(path, metadata, "TIME_SYSTEM", SCALES)
     if not segment.data:
-        raise InputError(f"{path}: a segment without data; allowed: lines of an epoch, a position and a velocity")
+        raise InputError(path, "a segment without data", "lines of an epoch, a position and a velocity")
     lines, rows = [n for n, _ in segment.data], [words[1:] for _, words in segment.data]
     width = 9 if len(rows[0]) == 9 else 6
     numbers = 1e3 * to_numbers(path, lines, rows, width)

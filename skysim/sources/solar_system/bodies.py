@@ -70,6 +70,11 @@ class BodyLight:
         return BODIES[self.name].id
 
     @property
+    def title(self) -> str:
+        """Its name in a sentence."""
+        return {"sun": "the Sun", "moon": "the Moon"}.get(self.name, self.name.capitalize())
+
+    @property
     def surface(self) -> Surface:
         return Surface(BODIES[self.name].law, self.place.phase_rad, self.earthshine)
 

@@ -13,7 +13,7 @@ from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report, Settings
 from skysim.core.errors import InputError
-from skysim.core.plugins.program import ProgramError, host_command
+from skysim.core.plugins import ProgramError, host_command
 from skysim.core.types import Floats, Frame
 from skysim.scene import scene as scenes
 from skysim.scene.sections.light import StarsConfig
@@ -56,7 +56,7 @@ class ExternalTracker:
 
     def solve_centroids(self, centroids: Centroids) -> Attitude:
         """Not supported by external trackers. Raises InputError."""
-        raise InputError(f"tracker.name: {self.program.name} solves frames, not centroids; allowed: {OWN}")
+        raise InputError("tracker.name", f"{self.program.name} solves frames, not centroids", OWN)
 
 
 def build_setup(scene: scenes.Scene, camera: Camera, settings: Settings, lights: Stars | Leds) -> Setup:

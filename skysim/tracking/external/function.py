@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report
 from skysim.core.errors import InputError
-from skysim.core.plugins.host import describe_error
+from skysim.core.plugins import describe_error
 from skysim.core.types import Frame
 from skysim.tracking.external.adapter import to_report
 from skysim.tracking.external.interface import FAILED, OWN, SOLVED, Answer, check_answer
@@ -44,7 +44,7 @@ class FunctionTracker:
 
     def solve_centroids(self, centroids: Centroids) -> Attitude:
         """Not supported: a function takes an image. Raises InputError."""
-        raise InputError(f"tracker.name: {self.name} solves frames, not centroids; allowed: {OWN}")
+        raise InputError("tracker.name", f"{self.name} solves frames, not centroids", OWN)
 
 
 def to_answer(value: Any) -> Any:

@@ -13,7 +13,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from skysim.core.plugins.host import Respond, describe_error, serve
+from skysim.core.plugins import Respond, describe_error, serve
 from skysim.tracking.external.interface import FAILED, TRACKERS, Answer, Picture, Setup, Tracker, check_answer
 
 

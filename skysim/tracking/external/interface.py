@@ -16,9 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import printable
-from skysim.core.plugins.kind import PluginKind
-from skysim.core.plugins.messages import finite_array, to_lists
-from skysim.core.plugins.program import MAX_STATUS_CHARS
+from skysim.core.plugins import MAX_STATUS_CHARS, PluginKind, finite_array, to_lists
 
 OWN = "own"  # the name of skysim's own estimator
 TRACKERS = PluginKind("tracker", "skysim.trackers", "tracker.name", (OWN,))

@@ -1,4 +1,4 @@
-"""Programs of the command line, and the one that is an external tracker: it answers each frame with a line of JSON.
+"""Programs, and the one that is an external tracker: it answers each frame with a line of JSON.
 
 Commands come only from the user's command line; no file can name one.
 """
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from skysim.core.errors import InputError
-from skysim.core.plugins.program import FOLDER, Program, ProgramError
+from skysim.core.plugins import FOLDER, Program, ProgramError
 from skysim.dynamics.controllers.interface import CONTROLLERS
 from skysim.tracking.external import interface
 from skysim.tracking.external.interface import TRACKERS, Answer, Picture, Setup
@@ -27,15 +27,15 @@ NAME = re.compile(r"[a-z][a-z0-9_-]*")
 
 
 def program_commands(options: Sequence[str] | None) -> dict[str, str]:
-    """Parse the options `--program NAME=COMMAND` (trackers, controllers) to commands by name. Raises InputError."""
+    """Parse texts `NAME=COMMAND` (trackers, controllers) to commands by name. Raises InputError."""
     programs: dict[str, str] = {}
     for option in options or ():
         name, equals, command = option.partition("=")
         if not equals or not NAME.fullmatch(name) or not command.strip():
-            raise InputError(f"--program {option}: allowed: NAME=COMMAND, NAME of lower-case letters, digits, _ and -")
+            raise InputError("programs", option, "NAME=COMMAND, NAME of lower-case letters, digits, _ and -")
         taken = {*programs, *(known for kind in (TRACKERS, CONTROLLERS) for known in (*kind.own, *kind.entry_points()))}
         if name in taken:
-            raise InputError(f"--program {name}: name already in use; allowed: another one")
+            raise InputError(f"programs.{name}", "name already in use", "another one")
         split_command(name, command)
         programs[name] = command
     return programs
@@ -46,10 +46,10 @@ def split_command(name: str, command: str) -> tuple[list[str], str | None]:
     try:
         arguments = shlex.split(command)
     except ValueError as error:
-        raise InputError(f"--program {name}: {error}") from None
+        raise InputError(f"programs.{name}", error) from None
     formats = {image_format or "png" for image_format in FOLDER.findall(command)}
     if formats - set(WRITERS) or len(formats) > 1:
-        raise InputError(f"--program {name}: allowed: {{folder}}, or one of {{folder:{'}, {folder:'.join(WRITERS)}}}")
+        raise InputError(f"programs.{name}", "", f"{{folder}}, or one of {{folder:{'}, {folder:'.join(WRITERS)}}}")
     return arguments, formats.pop() if formats else None
 
 

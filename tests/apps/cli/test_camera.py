@@ -98,7 +98,7 @@ def test_questions_are_asked_again_after_a_wrong_answer(camera: Command, tmp_pat
     done = camera("new", answers="\n".join(answers) + "\n")
     assert done.stderr.splitlines()[:2] == [
         "skysim: pixels: required",
-        "skysim: --pitch: '5.86': allowed: a length with its unit, such as \"5.86 um\"",
+        "skysim: --pitch: '5.86'; allowed: a length with its unit, such as \"5.86 um\"",
     ]
     assert "row-time" not in done.stdout
     assert "blur" not in done.stdout

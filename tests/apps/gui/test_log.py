@@ -15,7 +15,7 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from skysim.apps.gui.page import log
 from skysim.apps.gui.shared import forms
-from skysim.apps.gui.shared.csv_table import csv_table
+from skysim.apps.gui.shared.texts import csv_table
 from skysim.apps.gui.worker.tasks import Worker
 from skysim.core.errors import InputError
 from skysim.scene import loader

@@ -14,7 +14,7 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 from skysim.apps.gui.page.actions import Command, matching
 from skysim.apps.gui.page.tab import PANELS
 from skysim.apps.gui.shared import style
-from skysim.apps.gui.shared.wording import for_page
+from skysim.apps.gui.shared.texts import for_page
 from skysim.apps.gui.views import overlay
 from skysim.apps.gui.worker.study_process import MAX_STUDIES, StudyProcess
 from skysim.apps.gui.worker.workbench import Workbench

@@ -81,7 +81,7 @@ def test_exposure_and_temperature_of_names_and_headers(
     tmp_path: Path, name: str, header: dict[str, float], expected: Setting
 ) -> None:
     write(tmp_path / name, np.full((8, 9), 100, np.uint16), **header)
-    ((path, setting, pixels),) = read_frames(tmp_path, "darks")
+    ((path, setting, pixels),) = read_frames(tmp_path)
     assert (path, setting) == (tmp_path / name, expected)
     assert pixels.shape == (8, 9)
 
@@ -90,13 +90,13 @@ def test_a_table_beside_the_frames_comes_first(tmp_path: Path) -> None:
     write(tmp_path / "a_3s.png", np.full((8, 9), 100, np.uint16))
     write(tmp_path / "b_3s.png", np.full((8, 9), 100, np.uint16))
     (tmp_path / "frames.csv").write_text("file,exposure_s,temperature_c,lens\na_3s.png,0.004,-3,none\n")
-    settings = [setting for _, setting, _ in read_frames(tmp_path, "darks")]
+    settings = [setting for _, setting, _ in read_frames(tmp_path)]
     assert settings == [Setting(0.004, -3.0), Setting(3.0, None)]
 
 
 def test_numbers_in_the_upper_bits_are_shifted_back(tmp_path: Path, good: Path) -> None:
     lab(tmp_path, shift=4, suffix=".tif")
-    plain, padded = (read_stack(folder / "flats", "flats", SHAPE, BITS) for folder in (good, tmp_path))
+    plain, padded = (read_stack(folder / "flats", SHAPE, BITS) for folder in (good, tmp_path))
     for one, other in zip(plain.levels, padded.levels, strict=True):
         np.testing.assert_array_equal(one.first_dn, other.first_dn)
         assert one.greatest_dn == other.greatest_dn <= 4095
@@ -215,13 +215,13 @@ BAD: list[tuple[Callable[[Path], None], str]] = [
     (cut_off, "% of the pixels at 0 DN; allowed: a higher black level"),
     (vignette, "not flat: "),
     (lamp, "the flats of 0.05 s at 20 °C differ by 9.5 % from frame to frame; allowed: 3 %: a steady lamp"),
-    (small, "flat_50000us_20C_1.png: 64 x 32 pixels; allowed: 64 x 64, as --camera has them"),
+    (small, "flat_50000us_20C_1.png: 64 x 32 pixels; allowed: 64 x 64, as the camera has them"),
     (unnamed, "flat.png: no exposure time; allowed: EXPTIME in a FITS header, a row of frames.csv beside it"),
     (no_temperature, "flat_50000us_0.png: no temperature, which other frames have; allowed: of all frames, or of none"),
     (color, "flat_50000us_20C_1.png: a color image; allowed: monochrome frames, raw"),
     (jpeg, "flat_50000us_20C_9.jpg: JPEG changes the noise; allowed: raw frames in FITS, PNG or TIFF"),
     (average, "flat_50000us_20C_9.fits: numbers that are not whole, as of an average; allowed: raw frames"),
-    (beyond, "flat_50000us_20C_9.png: 4097 DN; allowed: up to 4095, the 12 bits of --camera"),
+    (beyond, "flat_50000us_20C_9.png: 4097 DN; allowed: up to 4095, the 12 bits of the camera"),
 ]
 
 
@@ -253,13 +253,13 @@ def test_a_table_of_exposures_is_refused_in_one_line(tmp_path: Path, text: str, 
     write(tmp_path / "a.png", np.full((8, 9), 100, np.uint16))
     (tmp_path / "frames.csv").write_text(text)
     with pytest.raises(InputError, match=message):
-        list(read_frames(tmp_path, "darks"))
+        list(read_frames(tmp_path))
 
 
 def test_a_folder_without_images(tmp_path: Path) -> None:
     for folder, message in ((tmp_path, "no images"), (tmp_path / "x", "no such folder")):
         with pytest.raises(InputError, match=message):
-            read_stack(folder, "darks", SHAPE, BITS)
+            read_stack(folder, SHAPE, BITS)
 
 
 def test_hot_pixels_are_no_stars(tmp_path: Path) -> None:
@@ -270,7 +270,7 @@ def test_hot_pixels_are_no_stars(tmp_path: Path) -> None:
         for n in range(2):
             image = frame(rng, hot * exposure_s / 100, exposure_s)
             write(tmp_path / f"dark_{exposure_s:g}s_{n}.png", image)
-    checks.check_darks(read_stack(tmp_path, "darks", SHAPE, BITS))
+    checks.check_darks(read_stack(tmp_path, SHAPE, BITS))
 
 
 # The command

@@ -18,7 +18,7 @@ from skysim.experiments.dome_survey.procedure import Errors
 
 def test_a_survey_that_fails_does_not_lose_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first of three fails; the rms of the others is that of their mean squares."""
-    found = iter([InputError("survey: too few"), Errors(1e-8, 4e-8, 1.0, 90, 0), Errors(3e-8, 4e-8, 9.0, 92, 1)])
+    found = iter([InputError("survey", "too few"), Errors(1e-8, 4e-8, 1.0, 90, 0), Errors(3e-8, 4e-8, 9.0, 92, 1)])
 
     def run_survey(*_: object) -> Errors:
         one = next(found)

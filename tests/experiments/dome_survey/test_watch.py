@@ -56,10 +56,10 @@ def test_every_image_is_read_once_and_bad_ones_are_a_line_each(tmp_path: Path, d
     news = list(folder.arrivals(12, poll_s=0.005))
     dropping.join()
     read = [name for one in news for name in one.read if name != ATTITUDES]
-    complaints = [line for one in news for line in one.complaints]
+    complaints = [error for one in news for error in one.complaints]
     assert sorted(read) == [f"{n:02d}.png" for n in range(12)]
-    assert [sorted(line.split(": ")[0].rsplit("/")[-1] for line in complaints)] == [["bad.png", "small.png"]]
-    assert not any("\n" in line for line in complaints)
+    assert [sorted(Path(error.key).name for error in complaints)] == [["bad.png", "small.png"]]
+    assert not any("\n" in str(error) for error in complaints)
     for _ in range(2):  # the attitudes of the last image may be written after it
         folder.look()
     assert [picture.name for picture in folder.pictures] == sorted(read)
@@ -112,7 +112,7 @@ def test_attitudes_with_a_slip_are_a_line_and_the_watch_goes_on(tmp_path: Path) 
     folder.look()
     read, complaints = folder.look()
     assert read == ["a.png"]
-    assert ["3 values; allowed: 4" in line for line in complaints] == [True]
+    assert [(error.problem, error.allowed) for error in complaints] == [("3 values", "4, as the first line has")]
     (tmp_path / ATTITUDES).write_text(HEAD + "a.png,1,2,3\n")
     folder.look()
     assert folder.look().read == [ATTITUDES]

@@ -139,5 +139,5 @@ def test_the_same_seed_gives_the_same_numbers() -> None:
 
 def test_a_lab_under_the_air_gathers_thirty_per_cent_less() -> None:
     """What the shutter lets in for 50 ms there, it lets in for 35 here."""
-    on_ground = optics.star_image(optics.ground_testbed(), 0.05).sum()
+    on_ground = optics.star_image(optics.ground_lab(), 0.05).sum()
     assert on_ground == pytest.approx(optics.star_image(shefex_lab(), 0.035).sum(), rel=1e-6)

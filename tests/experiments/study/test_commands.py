@@ -65,7 +65,7 @@ def test_a_study_that_ran_out_of_its_budget_is_resumed(typed):
     assert "within the budget; continue: skysim study resume question.yaml" in err
     code, _, err = typed("study", "run", "question.yaml", "--engine", "serial")
     assert code == 2
-    assert "trials; allowed: skysim study resume" in err
+    assert "trials; allowed: to resume the study, or another store" in err
     code, out, _ = typed("study", "resume", "question.yaml", "--engine", "serial")
     assert code == 0
     assert "of 60 trials" in out
@@ -143,7 +143,7 @@ def test_a_store_of_an_earlier_skysim_is_refused_in_one_line(typed, tmp_path):
         assert code == 2
         assert err == (
             "skysim: out/question/study.sqlite: written by an earlier skysim, without the attitudes of the trials;"
-            " allowed: run the study again, with another --out\n"
+            " allowed: run the study again, to another store\n"
         )
 
 
@@ -155,7 +155,7 @@ def test_a_store_of_an_earlier_skysim_is_refused_in_one_line(typed, tmp_path):
             "--engine: unknown engine 'ray'; allowed: pool, serial, dask",
         ),
         (("run", "question.yaml", "--engine", "dask"), "--scheduler: required with --engine dask"),
-        (("run", "question.yaml", "--set", "replicates"), "--set replicates: allowed: path.to.key=value"),
+        (("run", "question.yaml", "--set", "replicates"), "--set: replicates; allowed: path.to.key=value"),
         (("run", "question.yaml", "--set", "replicates=0"), "replicates: 0 is not allowed"),
         (("run", "nothing"), "nothing: no such study; allowed: a .yaml file or one of dome_"),
         (("run", "question"), "question: no such study; did you mean question.yaml?"),
@@ -165,7 +165,7 @@ def test_a_store_of_an_earlier_skysim_is_refused_in_one_line(typed, tmp_path):
         ),
         (
             ("status", "question.yaml"),
-            "out/question/study.sqlite: no such store; allowed: a store written by skysim study run",
+            "out/question/study.sqlite: no such store; allowed: a store of a study's trials",
         ),
         (("resume", "question.yaml", "--engine", "serial"), "no such store"),
         (

@@ -20,7 +20,7 @@ from skysim.experiments.study.designs import Point
 from skysim.experiments.study.execution import engines, runner, store
 from skysim.experiments.study.execution.outcomes import FAILED, Outcome
 from skysim.experiments.study.execution.setups import code_version, seed_of
-from skysim.experiments.study.execution.trials import Row, TrialJob
+from skysim.experiments.study.execution.trials import REFUSED, Row, TrialJob
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.report.study_report import front_table
 from skysim.results.files.builder.parts import parts_list
@@ -73,8 +73,7 @@ class Law:
         try:
             return Row(trial, segment.point, k, seed, "s", code, self.law(segment.settings), None, 0.0)
         except InputError as error:
-            why = f"Traceback\nskysim.types.InputError: {error}\n"
-            return Row(trial, segment.point, k, seed, "", code, FAILED, why, 0.0)
+            return Row(trial, segment.point, k, seed, REFUSED, code, FAILED, str(error), 0.0)
         except ArithmeticError as error:
             return Row(trial, segment.point, k, seed, "s", code, FAILED, f"ArithmeticError: {error}", 0.0)
 
@@ -180,7 +179,7 @@ def test_a_refused_candidate_is_infeasible_and_the_rest_goes_on(tmp_path: Path) 
     def law(settings: Settings) -> Outcome:
         asked.append(settings["trial.noise_px"])
         if settings["trial.noise_px"] > 0.8:
-            raise InputError("light.layout: no room")
+            raise InputError("light.layout", "no room")
         return bowl(settings)
 
     told = loaded(tmp_path, STUDY | {"budget": {"failures": 1}})
@@ -203,7 +202,7 @@ def test_a_refused_candidate_is_never_the_best(tmp_path: Path) -> None:
 
     def law(settings: Settings) -> Outcome:
         if settings["trial.noise_px"] < 0.5:
-            raise InputError("light.layout: no room")
+            raise InputError("light.layout", "no room")
         return bowl(settings)
 
     told = changed(objectives=[{"response": "cost"}], cost={"per": {"x": 1}}, candidates=20)
@@ -262,7 +261,7 @@ def test_killed_and_resumed_it_leaves_the_same_store(tmp_path: Path, every: int)
 
     def law(settings: Settings) -> Outcome:
         if settings["trial.magnitude_sigma"] > 0.9:
-            raise InputError("light.layout: no room")
+            raise InputError("light.layout", "no room")
         return bowl(settings)
 
     told = changed(

@@ -141,7 +141,7 @@ def test_another_study_or_other_code_is_refused(
 ) -> None:
     path = tmp_path / "kept.sqlite"
     done(told, path)
-    with pytest.raises(InputError, match="contains 120 trials; allowed: skysim study resume"):
+    with pytest.raises(InputError, match="contains 120 trials; allowed: to resume the study"):
         done(told, path)
     for key, value in {"seed": "2", "replicates": "39", "set": "{light.limit_mag: 5.5}"}.items():
         with pytest.raises(InputError, match="another study"):

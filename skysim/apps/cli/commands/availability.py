@@ -37,12 +37,12 @@ def availability(
     """Fraction of an orbit or a year in which the tracker is outside its exclusion angles and sees enough stars."""
     config = load(scene, None, None, overrides)
     if config.orbit is None or config.orbit.exclusion is None:
-        raise InputError("orbit.exclusion: the scene has none; allowed: a scene with a section orbit with exclusion")
+        raise InputError("orbit.exclusion", "the scene has none", "a scene with a section orbit with exclusion")
     for value, allowed, name in ((law, LAWS, "law"), (span, tuple(SPANS_S), "span")):
         if value not in allowed:
-            raise InputError(f"--{name} {value}: allowed: {', '.join(allowed)}")
+            raise InputError(f"--{name} {value}", "", ", ".join(allowed))
     if law == "inertial" and (off_deg or around_deg):
-        raise InputError("--off-deg, --around-deg: have no effect with --law inertial; allowed: --law zenith")
+        raise InputError("--off-deg, --around-deg", "have no effect with --law inertial", "--law zenith")
     with progress_callback("availability", quiet=json) as watch:
         found = computed(config, pointing_of(config, law, off_deg, around_deg), SPANS_S[span], samples, watch)
     fractions = fractions_of(found, config)
@@ -72,7 +72,7 @@ def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Po
     if law == "zenith":
         return Pointing("zenith", np.zeros(3), math.radians(off_deg), math.radians(around_deg))
     if not isinstance(start, PointingConfig):
-        raise InputError("--law inertial: requires motion.start with ra_deg and dec_deg")
+        raise InputError("--law inertial", "requires motion.start with ra_deg and dec_deg")
     return Pointing("inertial", direction(start.ra_deg, start.dec_deg))
 
 
@@ -91,7 +91,7 @@ def computed(scene: Scene, pointing: Pointing, span_s: float | None, samples: in
         first = orbit.states(np.zeros(1))
         energy = np.sum(first.velocity_m_s**2) / 2 - EARTH_MU_M3_S2 / np.linalg.norm(first.position_m)
         if energy >= 0:
-            raise InputError("--span orbit: this orbit is not closed; allowed: day, year")
+            raise InputError("--span orbit", "this orbit is not closed", "day, year")
         span_s = float(2 * np.pi * EARTH_MU_M3_S2 / (-2 * energy) ** 1.5)
     t_s = np.asarray((np.arange(samples) + 0.5) * (span_s / samples), float)
     known = catalog.read_for("tracker.catalog", scene.tracker.catalog).to_limit(scene.tracker.limit_mag)

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from skysim.apps.cli.option_names import OPTIONS, as_typed
 from skysim.apps.cli.options import Json, Overrides, complete_scene
 from skysim.apps.cli.terminal import print_error, print_json, print_list
 from skysim.core.errors import InputError, printable, unknown_name
 from skysim.results.report.as_text import terminal_width
 from skysim.scene.data_sheet.questions import QUESTIONS
-from skysim.scene.data_sheet.sheet import PLACEHOLDER_LENS, option
+from skysim.scene.data_sheet.sheet import PLACEHOLDER_LENS
 
 if TYPE_CHECKING:
     from skysim.scene.data_sheet.sheet import Sheet
@@ -111,7 +112,7 @@ def camera_show(
 
     lens, body = read_camera(file, set_)
     if lens is None and out:
-        raise InputError(f"--out {out}: {file} has no lens; allowed: --set camera.focal_length='16 mm'")
+        raise InputError(f"--out {out}", f"{file} has no lens", "--set camera.focal_length='16 mm'")
     if lens is not None and out:
         files.make_folder(out.parent)
         files.write_text(out, opencv_calibration.text(lens))
@@ -140,14 +141,13 @@ def read_camera(name: str, overrides: list[str] | None) -> tuple[Calibration | N
 
     if opencv_calibration.looks_like_calibration(Path(name)):
         if overrides:
-            raise InputError(
-                f"--set {overrides[0]}: has no effect: {name} is a calibration; allowed: a scene, a camera"
-            )
+            raise InputError(f"--set {overrides[0]}", f"has no effect: {name} is a calibration", "a scene, a camera")
         lens = opencv_calibration.read(Path(name))
         return lens, {"width_px": lens.width_px, "height_px": lens.height_px}
     values = parse_overrides(overrides)
     if not Path(name).suffix and name not in (known := loader.list_cameras() + loader.list_scenes()):
-        raise InputError(f"{unknown_name('camera', name, known)}, or a .yaml file")
+        problem, names = unknown_name("camera", name, known)
+        raise InputError("", problem, f"{names}, or a .yaml file")
     path = loader.preset_path(name) if name in loader.list_cameras() else loader.find(name)
     tree = loader.read(path)[0]
     alone = tree.keys() <= {"camera", "schema"} and isinstance(tree.get("camera"), dict)
@@ -162,7 +162,7 @@ def read_camera(name: str, overrides: list[str] | None) -> tuple[Calibration | N
 def sheet_option(name: str) -> Any:
     """The option of a question of the data sheet."""
     question = QUESTIONS[name]
-    return typer.Option(f"--{option(name)}", metavar="TEXT", help=f"{question.ask}: {question.where}.")
+    return typer.Option(OPTIONS[f"answers.{name}"], metavar="TEXT", help=f"{question.ask}: {question.where}.")
 
 
 Answer = str | None
@@ -199,7 +199,7 @@ def camera_new(
     from skysim.scene.data_sheet import sheet
 
     if out.suffix not in (".yaml", ".yml") or out.exists():
-        raise InputError(f"--out {out}: {'exists' if out.exists() else 'no .yaml file'}; allowed: a new .yaml file")
+        raise InputError(f"--out {out}", "exists" if out.exists() else "no .yaml file", "a new .yaml file")
     answers = {key: context.params[key] for key in QUESTIONS if context.params[key] is not None}
     if not answers:
         answers = ask_all()
@@ -225,16 +225,16 @@ def ask_all() -> dict[str, str]:
         assumed = "" if required else sheet.outstanding(answers)[name].assumed or "left out"
         print(f"\n{question.ask}\n  where: {question.where}" + (f"\n  not stated: {assumed}" if assumed else ""))
         while True:
-            text = typer.prompt(f"  {option(name)}", default="", show_default=False).strip()
+            text = typer.prompt(f"  {name.replace('_', '-')}", default="", show_default=False).strip()
             try:
                 if text:
                     sheet.outstanding(answers | {name: text})
                     answers[name] = text
                 elif required:
-                    raise InputError(f"{option(name)}: required")
+                    raise InputError(name.replace("_", "-"), "required")
                 break
             except InputError as error:
-                print_error(str(error))
+                print_error(str(as_typed(error)))
     return answers
 
 

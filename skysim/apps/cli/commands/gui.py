@@ -34,9 +34,9 @@ def gui(
 
     load(scene)
     if not folder.is_dir():
-        raise InputError(f"--folder {folder}: folder does not exist")
+        raise InputError(f"--folder {folder}", "folder does not exist")
     try:
         from skysim.apps.gui import server
     except ModuleNotFoundError as error:
-        raise InputError(f"skysim gui needs {error.name}: pip install 'skysim[gui]'") from None
+        raise InputError("", f"skysim gui needs {error.name}", "after pip install 'skysim[gui]'") from None
     server.serve(scene, host, port, token, folder.resolve(), out.resolve(), camera or [], workers, show)

@@ -30,7 +30,7 @@ def reproduce(
 ) -> None:
     """Repeat the experiments of papers and compare the published numbers with ours."""
     if open_ and not report:
-        raise InputError("--open: has no effect without --report; allowed: --report --open")
+        raise InputError("--open", "has no effect without --report", "--report --open")
     if not ids:
         from skysim.experiments.papers.published import experiments
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skysim.apps.cli import terminal
+from skysim.apps.cli.option_names import with_location
 from skysim.apps.cli.options import (
     LOADED,
     TRACKER_HELP,
@@ -30,7 +31,6 @@ from skysim.apps.cli.options import (
     scene_names,
     selected_stages,
     used_programs,
-    with_location,
 )
 
 if TYPE_CHECKING:

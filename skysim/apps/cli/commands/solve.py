@@ -69,7 +69,7 @@ def solve(
         paths.append(out / "live.png")
         files.write_image(paths[-1], grab_frame(live))
     if not paths:
-        raise InputError("no images; give files, folders, or --live CAMERA")
+        raise InputError("", "no images", "files, folders, or --live CAMERA")
     annotated = plate_solver.annotated_paths(out, paths)
     jobs = progress(list(zip(paths, annotated, strict=True)), len(paths), "solving", quiet=json or len(paths) == 1)
     results = [plate_solver.solve_file(path, settings, image) for path, image in jobs]

@@ -49,11 +49,11 @@ def stream(
     from skysim.simulation.flight import open_flight
 
     if folder is None and http is None and pipe is None:
-        raise InputError("skysim stream: no output; give --folder DIR, --http PORT or --pipe PATH")
+        raise InputError("", "no output", "--folder DIR, --http PORT or --pipe PATH")
     if http is None and host != HOST:
-        raise InputError(f"--host {host}: has no effect without --http; allowed: --http PORT --host {host}")
+        raise InputError(f"--host {host}", "has no effect without --http", f"--http PORT --host {host}")
     if endless and frames is not None:
-        raise InputError("skysim stream: give either --frames N or --endless")
+        raise InputError("--endless", "has no effect with --frames", "one of the two")
     flight = open_flight(load(scene, frames, seed, set_), endless=endless, keeps_history=False)
     sinks = []
     if folder is not None:
@@ -75,7 +75,7 @@ def stream(
     print(files.to_json(statistics) if json else summary(statistics), file=output)
     for sink in sinks:
         if sink.fault not in ("", READER_GONE):
-            raise InputError(f"--{sink.name}: {sink.fault}")
+            raise InputError(f"--{sink.name}", sink.fault)
 
 
 @contextmanager

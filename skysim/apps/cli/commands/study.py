@@ -83,9 +83,9 @@ def run(
     used_programs(program, study_names(plan) if program else ())
     search = context.info_name == "optimize"
     if search and plan.study.optimize is None:
-        raise InputError(f"{plan.path}: has no key optimize; allowed: skysim study run")
+        raise InputError(plan.path, "has no key optimize", "skysim study run")
     if not search and plan.study.optimize is not None:
-        raise InputError(f"{plan.path}: has the key optimize; allowed: skysim study optimize")
+        raise InputError(plan.path, "has the key optimize", "skysim study optimize")
     run_and_report(plan, study, out, create_engine(engine, workers, scheduler), overrides, json, open_)
 
 
@@ -222,13 +222,10 @@ def worst(
     plan, _ = load_stored_plan(study, out)
     name = response or plan.study.responses[0]
     if name not in metrics.QUANTITIES:
-        metrics.response(name, "--response")
+        metrics.response(name, "response")
     with open_store(study, out) as stored:
         points = stored.points()
-        try:
-            found = analysis.worst_of_levels(plan.study, stored, name, chosen_levels(where or []), count)
-        except InputError as error:
-            raise InputError(f"--{error}") from None
+        found = analysis.worst_of_levels(plan.study, stored, name, chosen_levels(where or []), count)
     rows = [one._asdict() | {"levels": points[one.point].levels} for one in found]
     repeat = command(study, out, "replay")
     if json:
@@ -242,7 +239,7 @@ def chosen_levels(words: list[str]) -> dict[str, Any]:
     """Levels by factor from FACTOR=LEVEL. Raises InputError."""
     from skysim.core.io.yaml_reader import parse_overrides, parse_yaml
 
-    return {key: parse_yaml(text)[1] for key, text in parse_overrides(words, "--where", "FACTOR=LEVEL").items()}
+    return {key: parse_yaml(text)[1] for key, text in parse_overrides(words, "where", "FACTOR=LEVEL").items()}
 
 
 # Registered last, so that it is the last in `skysim study --help`.
@@ -334,7 +331,7 @@ def located(study: str, out: Path | None) -> tuple[str, Path | None]:
     with store.open_store(Path(study) / store.STORE) as stored:
         file = stored.meta("file")
     if not Path(file).is_file():
-        raise InputError(f"{study}: no such file as its study, {file or 'not stored'}; allowed: STUDY --out {study}")
+        raise InputError(study, f"no such file as its study, {file or 'not stored'}", f"STUDY --out {study}")
     return file, Path(study)
 
 
@@ -359,7 +356,7 @@ def load_stored_plan(
         plan = loader.load(study, overrides, None if program is None else process.program_commands(program))
         kept, path = runner.stored_replicates(plan, stored), stored.path
     if not kept or (kept < plan.study.replicates and not grows):
-        raise InputError(f"{path}: contains another study or an earlier version of this one; allowed: another --out")
+        raise InputError(path, "contains another study or an earlier version of this one", "another store")
     return plan, overrides
 
 
@@ -376,11 +373,11 @@ def create_engine(name: str, workers: int | None, scheduler: str) -> Engine:
     from skysim.experiments.study.execution.runner import ENGINES
 
     if name not in ENGINES:
-        raise InputError(f"--engine: {unknown_name('engine', name, ENGINES)}")
+        raise InputError("--engine", *unknown_name("engine", name, ENGINES))
     if workers is not None and name != "pool":
-        raise InputError(f"--workers {workers}: has no effect with --engine {name}; allowed: --engine pool")
+        raise InputError(f"--workers {workers}", f"has no effect with --engine {name}", "--engine pool")
     if (name == "dask") != bool(scheduler):
-        raise InputError("--scheduler: required with --engine dask and only then; allowed: tcp://HOST:PORT")
+        raise InputError("--scheduler", "required with --engine dask and only then", "tcp://HOST:PORT")
     return ENGINES[name](workers, scheduler)
 
 

@@ -14,6 +14,7 @@ from typing import Annotated, NamedTuple
 
 import typer
 
+from skysim.apps.cli.option_names import with_location
 from skysim.apps.cli.options import (
     Json,
     Overrides,
@@ -23,7 +24,6 @@ from skysim.apps.cli.options import (
     scene_names,
     study_names,
     used_programs,
-    with_location,
 )
 from skysim.apps.cli.terminal import print_check, print_error, print_json
 from skysim.core.errors import InputError
@@ -59,11 +59,11 @@ def validate(
         from skysim.apps.cli import json_schema
 
         if schema not in KINDS:
-            raise InputError(f"--schema {schema}: allowed: {', '.join(KINDS)}")
+            raise InputError(f"--schema {schema}", "", ", ".join(KINDS))
         print_json(json_schema.json_schema(schema))
         return
     if not files:
-        raise InputError("no files; give files, or --schema scene")
+        raise InputError("", "no files", "files, or --schema scene")
     programs = {}
     if program:
         from skysim.tracking.external import process
@@ -116,9 +116,9 @@ def describe_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})
 
     path = path if path.suffix else find_shipped(path)
     if path.suffix not in (".yaml", ".yml", ".ecsv", ".xml"):
-        raise InputError(f"{path}: allowed: .yaml, .ecsv, .xml or the name of a scene, a study or a camera")
+        raise InputError(path, "", ".yaml, .ecsv, .xml or the name of a scene, a study or a camera")
     if not is_file(path):  # reading a named pipe would block
-        raise InputError(f"{path}: not a regular file")
+        raise InputError(path, "not a regular file")
     if path.suffix == ".ecsv":
         return describe_table(path), ()
     if path.suffix == ".xml":
@@ -179,11 +179,10 @@ def check_scene(path: Path, programs: Mapping[str, str]) -> tuple[str, tuple[str
         build_tracker(lab.camera, programs)
         findings = check_plan(lab).findings
     except InputError as error:
-        raise InputError(loader.with_location(str(error), str(path), {})) from None
+        raise loader.located(error, str(path), {}) from None
     count, frames = len(lab.camera.sources.id), scene.exposure.frames
-    return f"a scene of {count} lights and {frames} frames", tuple(
-        loader.with_location(finding, str(path), {}) for finding in findings
-    )
+    described = f"a scene of {count} lights and {frames} frames"
+    return described, tuple(with_location(finding, (str(path), {})) for finding in findings)
 
 
 def describe_table(path: Path) -> str:
@@ -195,7 +194,7 @@ def describe_table(path: Path) -> str:
         with path.open(encoding="utf-8", errors="replace") as file:
             first = file.read(4000)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        raise InputError(path, f"cannot be read: {error.strerror}") from error
     if "{name: hip," in first:
         return f"a catalog of {len(catalog.read(path).hip)} stars"
     return f"a map of {len(dome_map_file.read_dome_map(path).id)} LEDs"

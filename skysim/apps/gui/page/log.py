@@ -10,7 +10,7 @@ from nicegui import ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo
 from skysim.apps.gui.shared.context import Shown
-from skysim.apps.gui.shared.csv_table import csv_table
+from skysim.apps.gui.shared.texts import csv_table
 
 MAX_LINES = 500
 MAX_ROWS = 10_000

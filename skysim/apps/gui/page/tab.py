@@ -30,7 +30,7 @@ from skysim.apps.gui.panels.settings import ScenePanel, TrackerPanel
 from skysim.apps.gui.shared import forms, keys, style
 from skysim.apps.gui.shared.live import Contents
 from skysim.apps.gui.shared.state import View
-from skysim.apps.gui.shared.wording import for_page
+from skysim.apps.gui.shared.texts import for_page
 from skysim.apps.gui.views.sensor import Sensor
 from skysim.apps.gui.views.served import FRAMES
 from skysim.apps.gui.views.space import Scene3D
@@ -242,7 +242,7 @@ class Tab:
             if wanted:
                 await asyncio.to_thread(forms.validated_scene, wanted.scene, wanted.overrides)
         except InputError as error:
-            self.show_message(str(error))
+            self.show_message(for_page(error))
             return
         if wanted:
             await self.restore(wanted)
@@ -382,7 +382,6 @@ class Tab:
 
     def show_message(self, text: str, color: str = "warn") -> None:
         """Show a message in the head until the next action; warnings are also logged."""
-        text = for_page(text)
         if text == self.message_text:
             return
         self.head.set_message(text, color)
@@ -401,7 +400,7 @@ class Tab:
             result = await self.session.run(task, *arguments)
         except InputError as error:
             if self.is_open:
-                self.show_message(str(error))
+                self.show_message(for_page(error))
             return None
         except WorkerLost as error:
             if self.is_open and not self.restarting:

@@ -10,7 +10,7 @@ from nicegui import ui
 from skysim.apps.gui.messages import FrameView, SceneInfo, TrackerResult
 from skysim.apps.gui.shared.context import PageContext
 from skysim.apps.gui.shared.live import Contents, LiveInput, LiveText
-from skysim.apps.gui.shared.style import format_number
+from skysim.apps.gui.shared.texts import format_number
 from skysim.apps.gui.worker.photo import Photo
 
 ANGLES_JS = "() => emit([...document.querySelectorAll('.lab-angle')].map(field => field.value))"

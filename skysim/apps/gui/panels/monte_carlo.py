@@ -14,7 +14,8 @@ from pydantic import ValidationError
 
 from skysim.apps.gui.shared import forms, keys
 from skysim.apps.gui.shared.context import PageContext
-from skysim.apps.gui.shared.style import CURVE_COLORS, TOOLTIP, chart_color, format_number
+from skysim.apps.gui.shared.style import CURVE_COLORS, TOOLTIP, chart_color
+from skysim.apps.gui.shared.texts import for_page, format_number
 from skysim.apps.gui.worker.study_process import (
     PAGE_STUDY,
     RESPONSES,
@@ -113,7 +114,7 @@ class MonteCarloPanel:
         try:
             change = await run.io_bound(forms.field_override, state.scene, state.overrides, field_deg)
         except InputError as error:
-            self.page.show_message(str(error))
+            self.page.show_message(for_page(error))
             return
         await self.page.apply_overrides(change)
 
@@ -155,9 +156,9 @@ class MonteCarloPanel:
             path = await run.io_bound(self.study_file)
             study = await run.io_bound(loader.load, path)
             if study.study.optimize is not None:
-                raise InputError(f"{path.stem}: has the key optimize; allowed: studies with a design")
+                raise InputError(path.stem, "has the key optimize", "studies with a design")
         except InputError as error:
-            self.page.show_message(str(error))
+            self.page.show_message(for_page(error))
             return False
         self.process = StudyProcess(path.parent if not self.study_select.value else self.out / path.stem)
         self.process.total = study.trials
@@ -188,7 +189,7 @@ class MonteCarloPanel:
             trial |= {name: float(field.value or 0) * bool(self.with_noise.value) for name, field in noise.items()}
             trial |= {"false_lights": int(self.false_lights.value or 0)}
         if not (self.count.value and 1 <= self.count.value <= 100_000):
-            raise InputError("runs: allowed: 1 to 100000")
+            raise InputError("runs", "", "1 to 100000")
         scene = forms.absolute_path(self.page.state.scene)
         settings = scene, self.effective_overrides(scene, trial), trial, int(self.count.value)
         # A stopped run with unchanged settings is resumed from its own file.

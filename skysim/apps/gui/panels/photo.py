@@ -9,7 +9,6 @@ from typing import Any
 from nicegui import ui
 
 from skysim.apps.gui.shared.context import PageContext
-from skysim.apps.gui.shared.wording import for_page
 from skysim.apps.gui.worker.photo import SUFFIXES, Photo, Stages
 
 LIMIT_BYTES = 64 * 2**20
@@ -118,8 +117,7 @@ class PhotoPanel:
 
     def show(self, name: str, photo: Photo | None) -> None:
         if photo is None:
-            message = self.page.message_text
-            self.show_text(message if message.startswith(name) else f"{name}: {message}", "warn")
+            self.show_text(self.page.message_text, "warn")
             return
         self.page.show_photo(photo, kind="photo", photo=name)
         stages = "".join(f"; {stage} {algorithm}" for stage, algorithm in self.stages)
@@ -137,5 +135,5 @@ class PhotoPanel:
         self.show_text(f"{status_text}\n{pointing}\n{quality}", "good")
 
     def show_text(self, text: str, color: str) -> None:
-        self.result_text.set_text(for_page(text))
+        self.result_text.set_text(text)
         self.result_text.classes(remove="quiet good warn", add=color)

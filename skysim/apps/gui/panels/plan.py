@@ -19,6 +19,7 @@ from skysim.apps.gui.panels.run import RunPanel
 from skysim.apps.gui.shared import forms
 from skysim.apps.gui.shared.context import PageContext
 from skysim.apps.gui.shared.style import color_scale
+from skysim.apps.gui.shared.texts import for_page
 from skysim.apps.gui.views.space import Scene3D
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
@@ -231,7 +232,7 @@ class PlanPanel:
             try:
                 overrides = await run.io_bound(survey_flight, scene, self.page.state.overrides, self.plan.angles_deg)
             except InputError as error:
-                self.page.show_message(str(error))
+                self.page.show_message(for_page(error))
                 return
             if self.page.is_open and await self.page.open(scene, overrides):
                 self.page.show_panel("Run")

@@ -16,9 +16,9 @@ from skysim.apps.gui.messages import FlightStep, FrameRow, MotionLog
 from skysim.apps.gui.panels.strips import StripChart, rms_line, strips
 from skysim.apps.gui.shared import keys
 from skysim.apps.gui.shared.context import PageContext
-from skysim.apps.gui.shared.csv_table import csv_table
 from skysim.apps.gui.shared.forms import FEEDBACKS, loop_overrides
 from skysim.apps.gui.shared.live import Contents, LiveInput, LiveText
+from skysim.apps.gui.shared.texts import csv_table
 from skysim.apps.gui.views.sensor import Sensor
 
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}

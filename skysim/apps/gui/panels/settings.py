@@ -11,7 +11,7 @@ from nicegui import run, ui
 from skysim.apps.gui.panels.monte_carlo import MonteCarloPanel
 from skysim.apps.gui.shared import forms, keys
 from skysim.apps.gui.shared.context import PageContext
-from skysim.apps.gui.shared.wording import for_page
+from skysim.apps.gui.shared.texts import for_page
 from skysim.core.errors import InputError
 
 SENSOR = "sensor, F6"
@@ -141,7 +141,7 @@ class KeyForm:
         try:
             after = await run.io_bound(forms.with_value, self.page.state.scene, before, key, value)
         except InputError as error:
-            self.show_error(key, for_page(str(error)).removeprefix(f"{key}: "))
+            self.show_error(key, error.fault if error.key == key else for_page(error))
             return
         changed = {one: text for one, text in after.items() if before.get(one) != text}
         await self.page.apply_overrides(changed, before.keys() - after.keys())
@@ -218,7 +218,7 @@ class ScenePanel:
         try:
             path = await run.io_bound(forms.save, self.folder, name, state.scene, state.overrides, title)
         except InputError as error:
-            self.page.show_message(str(error))
+            self.page.show_message(for_page(error))
             return
         self.page.log(f"saved {path}")
         self.saved()

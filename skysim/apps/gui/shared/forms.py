@@ -16,7 +16,7 @@ from pydantic import BaseModel, ValidationError
 from skysim.core.errors import InputError
 from skysim.core.io.yaml_reader import read_yaml, set_key
 from skysim.core.paths import SCENES
-from skysim.core.quantities.units import SI_SUFFIX, si_unit
+from skysim.core.units import SI_SUFFIX, si_unit
 from skysim.scene import unused
 from skysim.scene.loader import file_names, find, load, read, with_overrides
 from skysim.scene.scene import NAME_ALIAS, Scene
@@ -285,7 +285,7 @@ def validated_scene(name: str, overrides: Mapping[str, str]) -> Scene:
     folder = find(name).resolve().parent
     for key, name in file_names(tree):
         if not any((at / name).resolve().is_relative_to(at) for at in (folder, SCENES)):
-            raise InputError(f"{key}: {name!r}: allowed: a file in the scene's own folder")
+            raise InputError(key, f"{name!r}", "a file in the scene's own folder")
     return scene
 
 
@@ -312,7 +312,7 @@ def field_override(name: str, overrides: Mapping[str, str], field_deg: float) ->
     Raises InputError.
     """
     if not 0.5 <= field_deg <= 120:
-        raise InputError("field: allowed: 0.5 to 120 deg")
+        raise InputError("field", "", "0.5 to 120 deg")
     camera = load(name, overrides).camera
     focal_m = camera.focal_length_m / camera.focal_px * camera.width_px / 2 / tan(radians(field_deg / 2))
     return {"camera.focal_length": f"{1e3 * focal_m:.5g} mm"}
@@ -335,10 +335,10 @@ def save(folder: Path, name: str, base: str, overrides: Mapping[str, str], title
     from skysim.core.io import files
 
     if not re.fullmatch(r"[A-Za-z0-9][\w-]{0,60}", name):
-        raise InputError(f"{name!r}: allowed: letters, digits, _ and -")
+        raise InputError(f"{name!r}", "", "letters, digits, _ and -")
     path = folder / f"{name}.yaml"
     if path.exists():
-        raise InputError(f"{path.name}: file exists; allowed: another name")
+        raise InputError(path.name, "file exists", "another name")
     validated_scene(base, overrides)
     files.write_text(path, scene_yaml(base_reference(base, folder), dict(overrides), title))
     return path

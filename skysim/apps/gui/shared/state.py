@@ -63,18 +63,18 @@ class View:
         if "scene" not in one:
             return None
         if one["scene"] not in scenes:
-            raise InputError(f"link: scene {one['scene']!r} is not offered here; choose one from the list")
+            raise InputError("link", f"scene {one['scene']!r} is not offered here; choose one from the list")
         kind = one.get("view", "live")
         if kind not in KINDS:
-            raise InputError(f"link: view {kind!r}: allowed: {', '.join(KINDS)}")
+            raise InputError("link", f"view {kind!r}", ", ".join(KINDS))
         try:
             angles = tuple(float(angle) for angle in one["at"].split(",")) if "at" in one else None
             t_s = float(one.get("t", 0))
             trial = int(one.get("trial", -1))
         except ValueError:
-            raise InputError("link: at, t, trial: allowed: numbers") from None
+            raise InputError("link", "at, t, trial", "numbers") from None
         if not all(map(math.isfinite, (*(angles or ()), t_s))) or (angles and len(angles) != 3):
-            raise InputError("link: at: allowed: three angles in degrees; t: seconds")
+            raise InputError("link", "at", "three angles in degrees; t: seconds")
         overrides = dict(value.partition("=")[::2] for key, value in pairs if key == "set")
         study = one.get("study", "")
         photo = one.get("photo", "")

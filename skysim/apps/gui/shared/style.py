@@ -62,11 +62,6 @@ def color_scale(values: Floats) -> Floats:
     return np.asarray(cv2.applyColorMap(levels[:, None], cv2.COLORMAP_CIVIDIS)[:, 0, ::-1] / 255)
 
 
-def format_number(value: float) -> str:
-    """Format with three significant digits, from 100 up as an integer."""
-    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
-
-
 CSS = f"""
 body.body--dark {{ {variables(DARK)} }}
 body.body--light {{ {variables(LIGHT)}; --q-primary: {LIGHT["accent"]} !important }}

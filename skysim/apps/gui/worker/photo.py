@@ -72,7 +72,7 @@ def photo_from_file(name: str, data: bytes, fov_deg: float | None, stages: Stage
     """Solve an uploaded file, as it is viewed. Raises InputError if it is no readable image."""
     suffix = images.image_suffix(name)
     if not suffix:
-        raise InputError(f"{Path(name).name}: allowed: {', '.join(images.IMAGE_SUFFIXES)}")
+        raise InputError(Path(name).name, "", ", ".join(images.IMAGE_SUFFIXES))
     solver = plate_solver.kept_solver(fov_deg, stages=stages)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"upload{suffix}"
@@ -80,7 +80,7 @@ def photo_from_file(name: str, data: bytes, fov_deg: float | None, stages: Stage
         try:
             picture = plate_solver.load_picture(path, solver)
         except InputError as error:
-            raise InputError(str(error).replace(str(path), Path(name).name)) from None
+            raise InputError(Path(name).name, error.problem, error.allowed) from None
     date_utc, _ = plate_solver.validated_date(picture.date_utc)
     outcome = plate_solver.solve_picture(picture, solver, date_utc)
     hint = plate_solver.outcome_fields(outcome, date_utc)["hint"]

@@ -69,18 +69,19 @@ class Playback:
             else:
                 if shot is not None and shot.camera is self.bench.lab.camera:
                     self.add(shot)
-        log = self.flight.telemetry()
         new = self.frames[self.reported :]
-        for frame in new:
-            frame.view = with_filter_errors(frame, log, self.bench.lab.camera.mount)
         self.reported = len(self.frames)
+        log = self.flight.telemetry() if is_done or new else None
+        if log is not None:
+            for frame in new:
+                frame.view = with_filter_errors(frame, log, self.bench.lab.camera.mount)
         views = [frame.view for frame in new]
         return FlightStep(
             is_done,
             self.flight.now_s,
             self.flight.duration_s,
             tuple(map(frame_row, views)),
-            curves(log) if is_done or views else None,
+            curves(log) if log is not None else None,
             tuple(row for view in views for row in light_residuals(view)),
         )
 

@@ -32,7 +32,7 @@ class WorkerLost(Exception):
 def serve(pipe: Connection) -> None:
     """Main loop of the worker, until the pipe closes.
 
-    It receives (task, arguments, display), and sends ("ok", result) or ("error", message).
+    It receives (task, arguments, display), and sends ("ok", result) or ("error", InputError).
     """
     worker = importlib.import_module(TEMPLATE).WORKER
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which closes the pipe
@@ -43,12 +43,14 @@ def serve(pipe: Connection) -> None:
             return
         try:
             pipe.send(("ok", getattr(worker, task)(*arguments)))
-        except (InputError, ImageError) as error:
-            pipe.send(("error", str(error)))
+        except InputError as error:
+            pipe.send(("error", error))
+        except ImageError as error:
+            pipe.send(("error", InputError("", error)))
         except MemoryError:
-            pipe.send(("error", "not enough memory"))
+            pipe.send(("error", InputError("", "not enough memory")))
         except Exception as error:  # a bug in one task must not end the tab
-            pipe.send(("error", f"{type(error).__name__}: {error}"))
+            pipe.send(("error", InputError("", f"{type(error).__name__}: {error}")))
 
 
 class Session:
@@ -92,7 +94,7 @@ class Session:
         except (EOFError, OSError) as error:
             raise WorkerLost(STOPPED) from error
         if status == "error":
-            raise InputError(reply)
+            raise reply
         return reply
 
     def close(self) -> None:

@@ -103,7 +103,7 @@ class StudyProcess:
         """Raise InputError if MAX_STUDIES run already."""
         cls.begun = {process for process in cls.begun if process.running}
         if len(cls.begun) >= MAX_STUDIES:
-            raise InputError(f"{MAX_STUDIES} of {MAX_STUDIES} studies are running; start again after one has ended")
+            raise InputError("", f"{MAX_STUDIES} of {MAX_STUDIES} studies are running; start again after one has ended")
 
     async def wait(self) -> str:
         """Wait for the process; return the last line of its standard error if it failed, else ""."""

@@ -62,7 +62,7 @@ class Worker:
     def workbench(self) -> Workbench:
         """The current workbench. Raises InputError if no scene is set up."""
         if self.current is None:
-            raise InputError("no scene is set up")
+            raise InputError("", "no scene is set up")
         return self.current
 
     def show_frame(self, view: FrameView, levels: pixels.Levels) -> FrameView:
@@ -86,14 +86,14 @@ class Worker:
     def survey_of_scene(self) -> survey.Survey:
         """The survey of the current scene. Raises InputError if none was planned."""
         if self.surveyed is None or not self.surveyed.is_of(self.workbench.scene):
-            raise InputError("no survey of this scene: plan one")
+            raise InputError("", "no survey of this scene: plan one")
         return self.surveyed
 
     @property
     def levels(self) -> pixels.Levels:
         """The newest frame of the workbench. Raises InputError if there is none."""
         if self.workbench.frame is None:
-            raise InputError("no frame has been rendered")
+            raise InputError("", "no frame has been rendered")
         return pixels.levels_of(self.workbench.frame.image_dn)
 
     # Tasks.
@@ -167,7 +167,7 @@ class Worker:
     def adjust_survey(self, frames: int) -> SurveyFound:
         """Adjust the dome to the frames flown so far, and plan further ones. Raises InputError if none are new."""
         if self.flight is None:
-            raise InputError("no flight: fly the survey's attitudes")
+            raise InputError("", "no flight: fly the survey's attitudes")
         views = [kept.view for kept in self.flight.frames]
         return self.survey_of_scene.adjust(self.flight.flight, views, frames)
 
@@ -183,13 +183,13 @@ class Worker:
     def advance_flight(self, budget_s: float) -> FlightStep:
         """Compute the flight for about a time. Raises InputError if none has begun."""
         if self.flight is None:
-            raise InputError("no flight has begun")
+            raise InputError("", "no flight has begun")
         return self.flight.advance(budget_s)
 
     def flight_frame(self, index: int) -> FrameView:
         """A kept frame of the flight. Raises InputError if it has not been computed."""
         if self.flight is None or not 0 <= index < len(self.flight.frames):
-            raise InputError(f"the flight has no frame {index}")
+            raise InputError("", f"the flight has no frame {index}")
         return self.show_frame(*self.flight.show(index))
 
     def replay(self, study: str, folder: str, trial: int) -> photo.Photo:

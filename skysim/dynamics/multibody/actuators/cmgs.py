@@ -151,9 +151,9 @@ class CmgSet:
         spin = unit_columns(self.spin_axes, "rotor axes")
         inertia = positive_values(self.rotor_inertia_kg_m2, gimbal.shape[1], "rotor_inertia_kg_m2")
         if spin.shape != gimbal.shape or np.abs((gimbal * spin).sum(axis=0)).max() > 1e-6:
-            raise InputError("rotor axes: allowed: one for each gimbal, at right angles to its axis")
+            raise InputError("rotor axes", "", "one for each gimbal, at right angles to its axis")
         if self.steering not in STEERING:
-            raise InputError(f"cmgs.steering: {unknown_name('steering law', self.steering, STEERING)}")
+            raise InputError("cmgs.steering", *unknown_name("steering law", self.steering, STEERING))
         arrays = {"gimbal_axes": gimbal, "spin_axes": spin, "rotor_inertia_kg_m2": inertia}
         for name, value in arrays.items():
             object.__setattr__(self, name, value)
@@ -253,9 +253,9 @@ def check_rotor_pairs(spec: Any, path: Path) -> None:
         suffix = gimbal.name.removeprefix(GIMBAL)
         rotor = spec.joint(ROTOR + suffix)
         if rotor is None or rotor.parent.parent != gimbal.parent:
-            raise InputError(f"{path}: joint {gimbal.name} has no joint {ROTOR}{suffix} on a child body of its own")
+            raise InputError(path, f"joint {gimbal.name} has no joint {ROTOR}{suffix} on a child body of its own")
     if len(joints(spec, ROTOR)) != len(joints(spec, GIMBAL)):
-        raise InputError(f"{path}: a joint {ROTOR}* has no joint {GIMBAL}* of the same suffix")
+        raise InputError(path, f"a joint {ROTOR}* has no joint {GIMBAL}* of the same suffix")
 
 
 def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:

@@ -94,5 +94,5 @@ def add_motor(
 def member_values(values: tuple[float, ...], count: int, key: str) -> Floats:
     """One value for each of `count` members; zeros if none are given. Raises InputError for another count."""
     if values and len(values) != count:
-        raise InputError(f"{key}: {len(values)} values; allowed: {count}, one for each, or none")
+        raise InputError(key, f"{len(values)} values", f"{count}, one for each, or none")
     return np.array(values or (0.0,) * count)

@@ -69,7 +69,7 @@ class FanSet:
     def __post_init__(self) -> None:
         axes, positions = unit_columns(self.force_axes, "fan axes"), np.asarray(self.positions_m, dtype=float)
         if positions.shape != axes.shape:
-            raise InputError(f"fan positions_m: shape {positions.shape}; allowed: {axes.shape}, as the axes")
+            raise InputError("fan positions_m", f"shape {positions.shape}", f"{axes.shape}, as the axes")
         arms = np.cross(positions, axes, axis=0)
         object.__setattr__(self, "torque_per_thrust_m", arms)
         object.__setattr__(self, "thrust_from_torque", np.linalg.pinv(arms, rcond=RANK_TOLERANCE))

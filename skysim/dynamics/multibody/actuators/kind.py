@@ -81,10 +81,10 @@ def unit_columns(axes: Floats, name: str) -> Floats:
     """(3, n) floats; raises InputError unless they are unit vectors."""
     columns = np.ascontiguousarray(axes, dtype=float)  # one layout, or numba compiles for each
     if columns.ndim != 2 or len(columns) != 3 or not columns.size:
-        raise InputError(f"{name}: shape {columns.shape}; allowed: (3, n), one column each")
+        raise InputError(name, f"shape {columns.shape}", "(3, n), one column each")
     norm = np.linalg.norm(columns, axis=0)
     if not np.all(np.abs(norm - 1) < 1e-6):
-        raise InputError(f"{name}: lengths {np.round(norm, 6).tolist()}; allowed: unit vectors")
+        raise InputError(name, f"lengths {np.round(norm, 6).tolist()}", "unit vectors")
     return columns
 
 
@@ -92,5 +92,5 @@ def positive_values(value: Floats, n: int, name: str) -> Floats:
     """(n,) positive floats; raises InputError otherwise."""
     values = np.asarray(value, dtype=float)
     if values.shape != (n,) or not np.all(values > 0):
-        raise InputError(f"{name}: {values.tolist()}; allowed: {n} positive numbers")
+        raise InputError(name, values.tolist(), f"{n} positive numbers")
     return values

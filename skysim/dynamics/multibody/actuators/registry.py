@@ -94,12 +94,11 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
         kind.check(spec, path)
         for prefix in kind.sites:
             if not sites(spec, prefix):
-                raise InputError(f"{path}: no site {prefix}*, which vehicle.{kind.key} needs")
+                raise InputError(path, f"no site {prefix}*, which vehicle.{kind.key} needs")
     for actuator in spec.actuators:
         if actuator.name in TORQUES or actuator.name.startswith(PREFIXES):
-            raise InputError(
-                f"{path}: actuator {actuator.name}: skysim adds an actuator of this name; remove it from the file"
-            )
+            problem = f"actuator {actuator.name}: an actuator of this name is added; remove it from the file"
+            raise InputError(path, problem)
     return locked
 
 
@@ -107,16 +106,18 @@ def check_joints(found: Sequence[Any], prefix: str, key: str, path: Path) -> Non
     """Raise InputError for missing joints of an actuator, and for joints of another type or with properties."""
     wanted = mujoco.mjtJoint.mjJNT_SLIDE if prefix == TRIM else mujoco.mjtJoint.mjJNT_HINGE
     if not found:
-        raise InputError(f"{path}: no joint {prefix}*, which vehicle.{key} needs")
+        raise InputError(path, f"no joint {prefix}*, which vehicle.{key} needs")
     if any(joint.type != wanted for joint in found):
-        raise InputError(f"{path}: joints {prefix}* must be {'slides' if prefix == TRIM else 'hinges'}")
+        raise InputError(path, f"joints {prefix}* must be {'slides' if prefix == TRIM else 'hinges'}")
     for joint in found:
         check_bare(joint, path)
 
 
-def locked_joint_hint(message: str, locked: dict[str, str]) -> str:
-    """An addition to MuJoCo's message about an unknown joint, if that joint was deleted."""
-    names = [name for name in locked if f"'{name}'" in message]
+def locked_joint_hint(spec: Any, locked: dict[str, str]) -> str:
+    """An addition to the problem of a model that does not compile, if it refers to a joint that was deleted."""
+    named = {sensor.objname for sensor in spec.sensors} | {actuator.target for actuator in spec.actuators}
+    named |= {name for equality in spec.equalities for name in (equality.name1, equality.name2)}
+    names = [name for name in locked if name in named]
     return f"; {locked[names[0]]} is off, which locks joint {names[0]}" if names else ""
 
 
@@ -125,9 +126,7 @@ def check_names(spec: Any, path: Path) -> None:
     for element in (*spec.joints, *spec.sites):
         prefix = next((p for p in PREFIXES if element.name.startswith(p[:-1])), None)
         if prefix and not element.name.startswith(prefix):
-            raise InputError(
-                f"{path}: {element.name}: allowed: {prefix}{element.name[len(prefix) - 1 :]}, or another word"
-            )
+            raise InputError(path, element.name, f"{prefix}{element.name[len(prefix) - 1 :]}, or another word")
 
 
 def check_bare(joint: Any, path: Path) -> None:
@@ -144,4 +143,4 @@ def check_bare(joint: Any, path: Path) -> None:
     }
     for name, value in attributes.items():
         if np.any(value):
-            raise InputError(f"{path}: joint {joint.name}: {name} is set by the scene; remove it from the file")
+            raise InputError(path, f"joint {joint.name}: {name} is set by the scene; remove it from the file")

@@ -57,7 +57,7 @@ def mjcf(vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: R
     spec, mount = vehicle.spec.copy(), camera_mount(vehicle)
     if spec.camera(LAB_CAMERA):
         raise InputError(
-            f"{scene.vehicle.model}: camera name {LAB_CAMERA!r} is reserved for the view of the laboratory; rename it"
+            scene.vehicle.model, f"camera name {LAB_CAMERA!r} is reserved for the view of the laboratory; rename it"
         )
     on_earth = vehicle.config.mount == "air_bearing"
     inside = surface.build_surface(scene.light.surface) if isinstance(scene.light, DomeConfig) else SKY

@@ -84,7 +84,7 @@ def write_film(pictures: Iterable[Picture], path: Path, fps: float) -> None:
     fps : pictures a second; a GIF counts in hundredths of a second, and browsers show 50 at most
     """
     if path.suffix not in ANIMATED:
-        raise InputError(f"{path}: {unknown_name('animation format', path.suffix, ANIMATED)}")
+        raise InputError(path, *unknown_name("animation format", path.suffix, ANIMATED))
     animation = cv2.Animation()
     animation.frames = [cv2.cvtColor(picture, cv2.COLOR_RGB2BGR) for picture in pictures]
     animation.durations = [round(1000 / fps)] * len(animation.frames)

@@ -60,20 +60,22 @@ class NightFrame(NamedTuple):
 
 def measure_night(config: CameraConfig, folder: Path, transfer: Transfer, saturation_dn: float) -> Night:
     """The lens from frames of the sky. Raises InputError for frames that do not tell."""
-    frames = [read_frame(path, config, transfer, saturation_dn) for path in image_files(folder, "night")]
+    frames = [read_frame(path, config, transfer, saturation_dn) for path in image_files(folder)]
     still = [without_trail(one.stars) for one in frames]
     stars = StarImages(*(np.concatenate(part) for part in zip(*still, strict=True)))
     if len(stars.chi2) < LEAST_STARS:
         raise InputError(
-            f"--night {folder}: {len(stars.chi2)} single stars of a signal to noise of {LEAST_SNR:g}, not saturated, in"
-            f" {len(frames)} frames; allowed: {LEAST_STARS} or more: more frames, or longer exposures"
+            folder,
+            f"{len(stars.chi2)} single stars of a signal to noise of {LEAST_SNR:g}, not saturated, in"
+            f" {len(frames)} frames",
+            f"{LEAST_STARS} or more: more frames, or longer exposures",
         )
     check_trails(frames)
     lens, remarks = find_lens(config, frames, transfer, saturation_dn)
     center_px = lens.camera.center_px if lens else config.center_px
     size = star_images.image_size(stars, center_px, config.corner_px)
     if size is None:
-        raise InputError(f"--night {folder}: no star's image is a Gaussian; allowed: stars in focus, not trailed")
+        raise InputError(folder, "no star's image is a Gaussian", "stars in focus, not trailed")
     if size.left_out > 0.5 * len(stars.chi2):
         remarks.append(f"psf: {size.left_out} of {len(stars.chi2)} star images are no Gaussians, and were left out")
     identified = int(lens.report.tied.sum()) if lens else 0
@@ -86,12 +88,12 @@ def read_frame(path: Path, config: CameraConfig, transfer: Transfer, saturation_
     numbers = raw_numbers(path, picture.pixels)
     if numbers.shape != (config.height_px, config.width_px):
         size = f"{numbers.shape[1]} x {numbers.shape[0]} pixels"
-        raise InputError(f"{path}: {size}; allowed: {config.width_px} x {config.height_px}, as --camera has them")
+        raise InputError(path, size, f"{config.width_px} x {config.height_px}, as the camera has them")
     numbers = np.right_shift(numbers, np.uint16(padding_bits(numbers, config.detector.bits)))
     try:
         centroids = detect_and_centroid(numbers, calibration(config), settings_of(transfer, saturation_dn), Clock())
     except ImageError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise InputError(path, error) from None
     signal = transfer.linear_dn(numbers - transfer.values[BLACK])
     chosen = measurable(numbers, centroids, transfer, saturation_dn)
     gain, read = float(transfer.values[GAIN]), float(transfer.values[READ])
@@ -150,8 +152,9 @@ def check_trails(frames: list[NightFrame]) -> None:
             trail_px = math.sqrt(12 * stretch)  # a uniform streak of length L has the variance L^2 / 12
             angle_deg = math.degrees(math.atan2(across, along)) / 2
             raise InputError(
-                f"{one.path}: stars trail by {trail_px:.2g} px at {angle_deg:.0f}° from the rows; allowed:"
-                f" {math.sqrt(12 * MAX_STRETCH * variance):.2g} px: a shorter exposure, or a mount that follows the sky"
+                one.path,
+                f"stars trail by {trail_px:.2g} px at {angle_deg:.0f}° from the rows",
+                f"{math.sqrt(12 * MAX_STRETCH * variance):.2g} px: a shorter exposure, or a mount that follows the sky",
             )
 
 
@@ -163,7 +166,7 @@ def find_lens(
         lacking = LEAST_FRAMES - len(frames)
         return None, [f"focal length, distortion: {len(frames)} frames of the night; allowed: {lacking} more elsewhere"]
     camera, settings = calibration(config), settings_of(transfer, saturation_dn)
-    stars = onboard_catalog("--night", CATALOG)
+    stars = onboard_catalog("characterize.night", CATALOG)
     narrow_sr = config.width_px * config.height_px / (camera.focal_px * (1 + FOCAL_UNCERTAINTY)) ** 2
     stars = stars.take(stars.v_mag <= catalog.limit_for_density(stars, narrow_sr, STARS_A_FIELD))
     dates = [one.date_utc for one in frames if one.date_utc is not None]
@@ -177,7 +180,7 @@ def find_lens(
     try:
         found = self_calibrate([one.centroids for one in frames], tracker, camera, FOCAL_UNCERTAINTY)
     except ValueError as error:
-        return None, [f"focal length, distortion: {error}; --camera states {camera.focal_px:.5g} px, to 5 %"]
+        return None, [f"focal length, distortion: {error}; the camera's file states {camera.focal_px:.5g} px, to 5 %"]
     return found, [] if dates else ["date: no frame has one; allowed: DATE-OBS in a FITS header, for aberration to 20″"]
 
 

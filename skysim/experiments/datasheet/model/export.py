@@ -24,7 +24,7 @@ def write_model(folder: Path, constants: dict[str, Any]) -> list[Path]:
 def require_fmu_builder() -> None:
     """Raise InputError if the package that builds the units is not installed."""
     if find_spec("pythonfmu3") is None:
-        raise InputError("--fmu: pythonfmu3 is not installed; allowed: after pip install 'skysim[fmu]'")
+        raise InputError("datasheet.fmu", "pythonfmu3 is not installed", "after pip install 'skysim[fmu]'")
 
 
 def write_fmu(folder: Path) -> Path:

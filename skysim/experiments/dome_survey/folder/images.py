@@ -49,14 +49,14 @@ def image_files(folder: Path) -> list[Path]:
     """The images of a folder by name, one of each stem. Raises InputError for too few, or no folder."""
     paths = best_images(folder)
     if len(paths) < MIN_IMAGES:
-        raise InputError(f"--images {folder}: {len(paths)} images; allowed: {MIN_IMAGES} or more, typically tens")
+        raise InputError(folder, f"{len(paths)} images", f"{MIN_IMAGES} or more, typically tens")
     return paths
 
 
 def best_images(folder: Path) -> list[Path]:
     """The images of a folder by name, of those of one stem the first of FORMATS. Raises InputError for no folder."""
     if not folder.is_dir():
-        raise InputError(f"--images {folder}: no such folder")
+        raise InputError(folder, "no such folder", "a folder of images")
     best: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         suffix = images.image_suffix(path.name)
@@ -79,7 +79,7 @@ def read_images(folder: Path, camera: Camera, settings: Settings) -> Iterator[Su
     names = {path.name for path in paths}
     for name in attitudes:
         if name not in names:
-            raise InputError(f"{folder / ATTITUDES}: {excerpt(name)} is no image of the folder")
+            raise InputError(folder / ATTITUDES, f"{excerpt(name)} is no image of the folder")
     for path in paths:
         yield SurveyImage(path.name, lights_of(path, camera, settings), attitudes.get(path.name))
 
@@ -94,15 +94,16 @@ def pixels_of(path: Path, camera: Camera) -> NDArray:
     pixels = images.monochrome(images.read_picture(path).pixels)
     if pixels.shape != (camera.height_px, camera.width_px):
         raise InputError(
-            f"{path}: {pixels.shape[1]} x {pixels.shape[0]} pixels; allowed: {camera.width_px} x {camera.height_px},"
-            " as --camera has them"
+            path,
+            f"{pixels.shape[1]} x {pixels.shape[0]} pixels",
+            f"{camera.width_px} x {camera.height_px}, as the camera has them",
         )
     return pixels
 
 
 def read_attitudes(path: Path) -> dict[str, Rotation]:
     """lab_from_body of each image by its name, from a CSV file. Raises InputError with one line."""
-    refusal = f"no attitudes; allowed: columns {', '.join(COLUMNS)}, and others, which are not used"
+    refusal = InputError(path, "no attitudes", f"columns {', '.join(COLUMNS)}, and others, which are not used")
     files, numbers = read_named_rows(path, COLUMNS[0], COLUMNS[1:], refusal)
     return dict(zip(files, stops.from_angles(numbers), strict=True))
 
@@ -145,4 +146,4 @@ def lost_in_space(model: CalibrationPrior, uncertainty: SurveyUncertainty, setti
     try:
         return DomeTracker(camera, leds, lever, settings)
     except ImageError as error:
-        raise InputError(f"light: the star tracker cannot use this dome: {error}") from None
+        raise InputError("light", f"the star tracker cannot use this dome: {error}") from None

@@ -32,10 +32,10 @@ Stamp = tuple[int, int]  # size in bytes, time of the last change in ns
 
 
 class News(NamedTuple):
-    """What a look found: names of the files that were read, and a line for each that cannot be used."""
+    """What a look found: names of the files that were read, and an error for each that cannot be used."""
 
     read: list[str]
-    complaints: list[str]
+    complaints: list[InputError]
 
 
 @dataclass
@@ -80,7 +80,7 @@ class WatchedFolder:
             try:
                 self._read(path)
             except InputError as error:
-                news.complaints.append(str(error))
+                news.complaints.append(error)
             else:
                 news.read.append(path.name)
             self._done[path.name] = stamp

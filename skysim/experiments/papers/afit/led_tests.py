@@ -181,7 +181,7 @@ def led_electrons(angle_deg: float, rng: np.random.Generator) -> float:
     lab = white_board([1000.0] * 9)
     direction = Rotation.from_euler("y", angle_deg, degrees=True).apply([0.0, 0.0, -1.0])
     single = lab.camera.sources.take(np.array([4]))
-    lab = with_exposure(lab.with_camera(sources=replace(single, normal=direction[None])), 9 * SLOT_S)
+    lab = with_exposure(lab.with_sources(replace(single, normal=direction[None])), 9 * SLOT_S)
     return float(render_at_attitude(lab, Rotation.identity(), rng)[1].sources.electrons[0])
 
 
@@ -189,7 +189,7 @@ def duty_cycles(rng: np.random.Generator) -> dict[str, RowResult]:
     """Eq. 37: light of each of nine multiplexed LEDs relative to one that is always on."""
     pulses_us = [1000.0, 500.0, 400.0, 200.0, 1.0, 1000.0, 1000.0, 1000.0, 1000.0]
     lab = with_exposure(white_board(pulses_us), 4 * 9 * SLOT_S)
-    always_on = lab.with_camera(sources=replace(lab.camera.sources, on_s=lab.camera.sources.period_s))
+    always_on = lab.with_sources(replace(lab.camera.sources, on_s=lab.camera.sources.period_s))
     pulsed, unpulsed = (render_at_attitude(board, Rotation.identity(), rng)[1].sources for board in (lab, always_on))
     fraction = pulsed.electrons[np.argsort(pulsed.id)] / unpulsed.electrons[np.argsort(unpulsed.id)]
     return {f"duty_{int(pulses_us[n])}": RowResult(exact(100 * fraction[n])) for n in range(5)}
@@ -261,7 +261,7 @@ def viewing_angles(images: int, rng: np.random.Generator) -> dict[str, RowResult
     narrow = color_board(lobe=NARROW_LOBE)
     misalignment = Rotation.from_euler("y", MISALIGNMENT_DEG, degrees=True)
     sources = narrow.camera.sources
-    misaligned = narrow.with_camera(sources=replace(sources, normal=misalignment.apply(sources.normal)))
+    misaligned = narrow.with_sources(replace(sources, normal=misalignment.apply(sources.normal)))
     directional = [area_variation(lab, 0.10, images, rng)[0][:, DIMMEST_LED] for lab in (narrow, misaligned)]
     areas, stray = area_variation(color_board(), 0.04, images, rng)
     test2_percent, intermediate_percent = (

@@ -31,7 +31,9 @@ from skysim.results.plots import INK
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import SlewConfig
-from skysim.simulation.lab import Lab, light_sources
+from skysim.simulation.lab import Lab
+from skysim.simulation.lights.known import known_light
+from skysim.simulation.lights.plan import Plan
 from skysim.tracking import onboard_model
 
 LEDS, POSITIONS = 9, 5
@@ -79,7 +81,8 @@ def table_2(options: ExperimentOptions) -> ExperimentResult:
         for stage, lab in enumerate(stands):
             # The same board with nine other LEDs, by another hardware seed.
             scene = with_config(lab.scene, "light.layout", hardware_seed=hardware_seed)
-            other_leds = lab.with_scene(scene).with_camera(sources=light_sources(scene, lab.camera.band))
+            plan = Plan(scene, lab.camera.band, lab.vehicle, lab.camera.viewpoint, None)
+            other_leds = lab.with_scene(scene).with_light(known_light(plan))
             rng = random_stream(options.seed, stage, n)
             runs[stage].append(take_board(other_leds, images, rng))
     found_arcsec = lattice_angles(stands[0], options.trials(20, 2), random_stream(options.seed, 2))

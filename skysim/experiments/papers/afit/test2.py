@@ -86,7 +86,7 @@ def place_pair(lab: Lab, place: Place) -> Lab:
     meridian = np.cross(normal, [0.0, 1.0, 0.0])
     positions_m = center_m + np.outer([-PAIR_M / 2, PAIR_M / 2], meridian / np.linalg.norm(meridian))
     pair, homogeneous = lab.camera.sources.take(np.arange(2)), np.column_stack([positions_m, np.ones(2)])
-    return lab.with_camera(sources=replace(pair, place=homogeneous, normal=np.tile(normal, (2, 1))))
+    return lab.with_sources(replace(pair, place=homogeneous, normal=np.tile(normal, (2, 1))))
 
 
 def point_at(place: Place) -> Rotation:

@@ -23,9 +23,9 @@ from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import Lab, build_lab, build_obstacles, light_sources
-from skysim.sources.dome.led import Emitter
-from skysim.sources.dome.timing.clocks import build_clocks
+from skysim.simulation.lab import Lab, build_lab
+from skysim.simulation.lights.plan import Plan
+from skysim.simulation.lights.registry import build_lights
 from skysim.tracking import onboard_model
 
 WHITE = 255  # white in the thesis's gray levels
@@ -51,14 +51,11 @@ def build_test_stand(scene: Scene) -> Lab:
     """Lab of a scene with other lights, lens or electronics; the detector's fixed pattern is computed only once."""
     lab = base_lab()
     assert isinstance(scene.light, DomeConfig)
-    sources = light_sources(scene, lab.camera.band)
+    plan = Plan(scene, lab.camera.band, lab.vehicle, lab.camera.viewpoint, None)
     return lab.with_scene(scene).with_camera(
-        sources=sources,
-        clocks=build_clocks(scene.light, sources, scene.seed),
-        emitter=Emitter.from_config(scene.light.led),
+        lights=build_lights(plan),
         optics=Optics.from_camera(scene.camera),
         detector=replace(lab.camera.detector, config=scene.camera.detector),
-        obstacles=build_obstacles(scene, lab.vehicle),
     )
 
 

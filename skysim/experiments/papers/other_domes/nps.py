@@ -80,7 +80,7 @@ def build_model(camera_m: Floats | None, seed: int, frames: int) -> OnboardModel
         position = lab.camera.sources.place + np.append(shift_m, 0.0)
         height_m += shift_m[2]
         sources, mount = replace(lab.camera.sources, place=position), replace(lab.camera.mount, camera_body_m=camera_m)
-        lab = lab.with_camera(sources=sources, mount=mount)
+        lab = lab.with_sources(sources).with_camera(mount=mount)
     no_leds = np.empty(0, np.int64), np.empty((0, 3))
     panel = LedMap(*no_leds, np.zeros(3), np.array([np.inf, np.inf, height_m]))
     rays_of_frames = [rays_body(lab, seed + n) for n in range(frames)]

@@ -27,6 +27,7 @@ from skysim.scene.loader import load
 from skysim.scene.sections.light import UniformGlowConfig
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.lab import StarCamera, build_lab
+from skysim.simulation.lights.background import Background
 from skysim.simulation.timing import exposure_window
 from skysim.tracking.exposure_control import ExposureController
 
@@ -129,9 +130,9 @@ class ExposureLoop:
         lab = self.lab
         if glare_e_s:
             glow = (*lab.scene.background, UniformGlowConfig(kind="uniform", e_s=glare_e_s))
-            lab = lab.with_scene(lab.scene.model_copy(update={"background": glow}))
+            lab = lab.with_light(Background(glow))
         if planets:
-            lab = lab.with_camera(sources=with_planets(lab.camera, self.rest, planets))
+            lab = lab.with_sources(with_planets(lab.camera, self.rest, planets))
         window = exposure_window(lab.scene, self.frames, self.controller.exposure_s)
         frame, _ = render_frame(lab.camera, self.rest, self.frames, window=window)
         self.frames += 1

@@ -58,7 +58,7 @@ def paper_catalog(name: str) -> StarCatalog:
 def lab_with(star_catalog: StarCatalog) -> Lab:
     """The scene's lab with the stars of a catalog only."""
     lab = shefex_lab()
-    return lab.with_camera(sources=lab.camera.sources.take(np.isin(lab.camera.sources.id, star_catalog.id)))
+    return lab.with_sources(lab.camera.sources.take(np.isin(lab.camera.sources.id, star_catalog.id)))
 
 
 def apparent(star_catalog: StarCatalog) -> Floats:

@@ -163,11 +163,11 @@ def check_levels(levels: Mapping[str, Value], study: Study, lines: Sequence[Poin
     """Raise InputError for an unknown factor, or a level at which there is no point."""
     for name, level in levels.items():
         if name not in study.factors:
-            raise InputError(f"where: {unknown_name('factor', name, study.factors)}")
+            raise InputError("where", *unknown_name("factor", name, study.factors))
         available = distinct(line.levels[name] for line in lines)
         if not any(same(level, one) for one in available):
             allowed = ", ".join(map(format_level, available[:20]))
-            raise InputError(f"where.{name}: unknown level {level!r}; allowed: {allowed}")
+            raise InputError(f"where.{name}", f"unknown level {level!r}", allowed)
 
 
 def points_at(lines: Sequence[PointRow], study: Study, levels: Mapping[str, Value]) -> list[PointRow]:

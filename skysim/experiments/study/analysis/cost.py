@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.quantities.units import in_si
+from skysim.core.units import in_si
 from skysim.experiments.study.designs import Point
 from skysim.experiments.study.factors import Factor, Levels, Range, Value, split_quantity
 from skysim.experiments.study.plan import Cost, Plan, resolve_point
@@ -26,32 +26,33 @@ def check_cost(factors: Mapping[str, Factor], config: Cost) -> None:
         try:
             for value in values if not isinstance(factor, Levels) else [values[0]]:
                 si(value)
-        except ValueError as error:
-            raise InputError(f"{where}: {error}; prices of named levels: optimize.cost.levels") from None
+        except InputError as error:
+            allowed = "numbers, or quantities with units; prices of named levels: optimize.cost.levels"
+            raise InputError(where, error.problem, allowed) from None
     for name, prices in config.levels.items():
         where = f"optimize.cost.levels.{name}"
         factor = require_factor(name, factors, where)
         named = [str(level) for level, _ in factor.options()] if not isinstance(factor, Range) else []
         if sorted(named) != sorted(prices):
             allowed = f"a price of each of {', '.join(named)}" if named else "optimize.cost.per, as it is a range"
-            raise InputError(f"{where}: prices {', '.join(prices) or 'nothing'}; allowed: {allowed}")
+            raise InputError(where, f"prices {', '.join(prices) or 'nothing'}", allowed)
 
 
 def check_parts(config: Cost, scene: Scene) -> None:
     """Raise InputError if a scene whose parts are to be priced has no dome."""
     if config.parts and not isinstance(scene.light, DomeConfig):
-        raise InputError(f"optimize.cost.parts: light of kind {scene.light.kind} has no parts; allowed: dome")
+        raise InputError("optimize.cost.parts", f"light of kind {scene.light.kind} has no parts", "dome")
 
 
 def require_factor(name: str, factors: Mapping[str, Factor], where: str) -> Factor:
     """The factor with a name. Raises InputError if there is none."""
     if name not in factors:
-        raise InputError(f"{where}: {unknown_name('factor', name, factors)}")
+        raise InputError(where, *unknown_name("factor", name, factors))
     return factors[name]
 
 
 def si(value: Value) -> float:
-    """A plain number unchanged, or a quantity in SI units: "48 in" is 1.2192. Raises ValueError."""
+    """A plain number unchanged, or a quantity in SI units: "48 in" is 1.2192. Raises InputError."""
     number, unit = split_quantity(value)
     return in_si(value) if unit else number
 

@@ -25,7 +25,7 @@ from skysim.experiments.study.execution.outcomes import FAILED
 from skysim.experiments.study.execution.runner import Progress, Watch, run_points
 from skysim.experiments.study.execution.setups import code_version, seed_of
 from skysim.experiments.study.execution.store import Store
-from skysim.experiments.study.execution.trials import Row
+from skysim.experiments.study.execution.trials import REFUSED, Row
 from skysim.experiments.study.factors import Distribution, Range, Value
 from skysim.experiments.study.plan import Constraint, Plan, Search, Study
 from skysim.results import metrics
@@ -84,20 +84,18 @@ def check(study: Study) -> None:
         check_response(objective.response, f"optimize.objectives.{n}.response")
     first, *others = (one.response for one in config.objectives)
     if first in others:
-        raise InputError(f"optimize.objectives: {first} occurs twice; allowed: different responses")
+        raise InputError("optimize.objectives", f"{first} occurs twice", "different responses")
     for n, limit in enumerate(config.constraints):
         check_response(limit.response, f"optimize.constraints.{n}.response")
         if limit.at_least is None and limit.at_most is None:
-            raise InputError(f"optimize.constraints.{n}: no bound; allowed: at_least, at_most or both")
+            raise InputError(f"optimize.constraints.{n}", "no bound", "at_least, at_most or both")
     for name, factor in study.factors.items():
         if isinstance(factor, Distribution):
-            raise InputError(
-                f"factors.{name}: a distribution cannot be optimized; allowed: levels, values, from and to"
-            )
+            raise InputError(f"factors.{name}", "a distribution cannot be optimized", "levels, values, from and to")
     check_cost(study.factors, config.cost)
     trials, budget = config.candidates * study.replicates, study.budget.trials
     if budget is not None and trials > budget:
-        raise InputError(f"budget.trials: {budget}; allowed: at least {trials}, the trials of the search")
+        raise InputError("budget.trials", budget, f"at least {trials}, the trials of the search")
 
 
 def check_response(response: str, where: str) -> None:
@@ -107,10 +105,10 @@ def check_response(response: str, where: str) -> None:
     try:
         metrics.response(response, where)
     except InputError as error:
-        raise InputError(f"{error}, or {COST}") from None
+        raise InputError(where, error.problem, f"{error.allowed}, or {COST}") from None
     if response.startswith("time_ms"):
         allowed = "responses that a resumed search reproduces"
-        raise InputError(f"{where}: {response} is not reproducible; allowed: {allowed}")
+        raise InputError(where, f"{response} is not reproducible", allowed)
 
 
 # Evaluation of a candidate.
@@ -127,8 +125,7 @@ def evaluate_candidate(plan: Plan, number: int, point: Point, columns: Columns) 
     violated = [one.response for one in config.constraints if violation(one, values[one.response]) > 0]
     violated += [f"no {one.response}" for one in config.objectives if math.isnan(values[one.response])]
     refused = scene_error(columns)
-    message = last_line(refused).partition(f"{InputError.__name__}: ")[2] if refused else unpriced
-    why = message or ", ".join(violated)
+    why = refused or unpriced or ", ".join(violated)
     return Candidate(number, point.levels, objectives, figures, price, not why, bool(refused), why)
 
 
@@ -142,18 +139,9 @@ def violation(limit: Constraint, value: float) -> float:
 
 
 def scene_error(columns: Columns) -> str:
-    """Traceback of the InputError with which a candidate's scene was rejected; empty if the scene is valid.
-
-    Trials of an invalid scene have an empty scene hash.
-    """
+    """Why a candidate's scene was rejected; empty if the scene is valid."""
     errors = zip(columns["scene"], columns["error"], strict=True)
-    refused = (error for scene, error in errors if not scene and error and InputError.__name__ in last_line(error))
-    return next(refused, "")
-
-
-def last_line(traceback: str) -> str:
-    """Last line of a traceback."""
-    return traceback.strip().splitlines()[-1]
+    return next((str(error) for scene, error in errors if scene == REFUSED), "")
 
 
 def front(config: Search, candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -224,8 +212,9 @@ def search(plan: Plan, store: Store, engine: Engine, watch: Watch | None = None)
             store.set_points([point], first=n)
         elif key_of(stored[n]) != key_of(point):
             raise InputError(
-                f"{store.path}: candidate {n} is {stored[n].levels}, the sampler now proposes {point.levels};"
-                " allowed: the version of optuna that started the search, or another --out"
+                store.path,
+                f"candidate {n} is {stored[n].levels}, the sampler now proposes {point.levels}",
+                "the version of optuna that started the search, or another store",
             )
         refused = study.replicates * sum(one.refused for one in evaluated.values())
         if not run_candidate(plan, store, engine, n, point, total, refused, watch):
@@ -244,7 +233,7 @@ def create_sampler(study: Study) -> Any:
     try:
         import optuna
     except ImportError:
-        raise InputError("optimize: optuna is not installed; allowed: after pip install 'skysim[optuna]'") from None
+        raise InputError("optimize", "optuna is not installed", "after pip install 'skysim[optuna]'") from None
     assert study.optimize is not None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     seed = int(np.random.SeedSequence(study.seed).generate_state(1)[0])
@@ -338,7 +327,7 @@ def failed_rows(plan: Plan, store: Store, number: int) -> list[Row]:
     """Rows for the remaining trials of a candidate with an invalid scene: failed, with the error of the first one."""
     columns, replicates = store.point_columns(number), plan.study.replicates
     missing = np.setdiff1d(np.arange(replicates), columns["replicate"]).tolist()
-    failed = Row(0, number, 0, 0, "", code_version(), FAILED, scene_error(columns), 0.0)
+    failed = Row(0, number, 0, 0, REFUSED, code_version(), FAILED, scene_error(columns), 0.0)
     return [
         failed._replace(trial=number * replicates + k, replicate=k, seed=seed_of(plan.spec, number, k)) for k in missing
     ]

@@ -45,7 +45,7 @@ def indices(plan: Plan, store: Store) -> list[Index]:
     """Indices of every factor for the cross-boresight and roll errors. Raises InputError for another design."""
     kind = plan.study.design.kind
     if kind != "saltelli" or plan.study.optimize:
-        raise InputError(f"design.kind: {kind}; allowed: saltelli, without optimize, for Sobol indices")
+        raise InputError("design.kind", kind, "saltelli, without optimize, for Sobol indices")
     return [index for response in AXES for index in response_indices(plan, store, response)]
 
 

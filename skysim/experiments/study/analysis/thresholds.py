@@ -143,12 +143,12 @@ def check(threshold: Threshold, where: str, study: Study, rows: Sequence[PointRo
     """Raise InputError for a threshold of no proportion, or along a factor without numeric levels."""
     name = threshold.response
     if not metrics.is_proportion(name):
-        raise InputError(f"{where}.response: {name} is no proportion; allowed: identified, coverage_4, ...")
+        raise InputError(f"{where}.response", f"{name} is no proportion", "identified, coverage_4, ...")
     if axes.is_sampled(study):
-        raise InputError(f"{where}: points are sampled, without levels; allowed: design factorial or one_at_a_time")
+        raise InputError(where, "points are sampled, without levels", "design factorial or one_at_a_time")
     axis = axes.axis(study, rows, threshold.along)
     if not axis.numeric or len(axis.levels) < 2:
-        raise InputError(f"{where}.along: {threshold.along} has no two numeric levels; allowed: a factor with numbers")
+        raise InputError(f"{where}.along", f"{threshold.along} has no two numeric levels", "a factor with numbers")
 
 
 def thresholds_of(curve: Curve, study: Study, lines: Sequence[PointRow]) -> list[Threshold]:

@@ -27,12 +27,12 @@ try:
     from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed
     from distributed.comm import CommClosedError, get_address_host_port
 except ImportError:
-    raise InputError("engine: dask is not installed; allowed: pip install 'skysim[dask]', or another engine") from None
+    raise InputError("engine", "dask is not installed", "pip install 'skysim[dask]', or another engine") from None
 
 WAIT_S = 10.0  # timeout for a reply
 POLL_S = 5.0  # interval between queries of the cluster's thread count, because workers join and leave
 Submission = tuple[Chunk, bool]  # a submitted chunk, and whether it is the only one in flight
-ALLOWED_ADDRESS = "allowed: a scheduler's address, such as tcp://10.0.0.1:8786"
+ADDRESS = "a scheduler's address, such as tcp://10.0.0.1:8786"
 
 
 def connect(scheduler: str) -> Client:
@@ -41,13 +41,13 @@ def connect(scheduler: str) -> Client:
         if get_address_host_port(scheduler)[1] > 65535:
             raise ValueError("port above 65535")
     except ValueError as error:
-        raise InputError(f"scheduler: {scheduler!r}: {error}; {ALLOWED_ADDRESS}") from None
+        raise InputError("scheduler", f"{scheduler!r}: {error}", ADDRESS) from None
     # Silence the long logs of distributed; errors are reported here in one line.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:
         client = Client(scheduler, timeout=WAIT_S, set_as_default=False, name="skysim")
     except (OSError, ImportError, RuntimeError):
-        raise InputError(f"scheduler: no reply from {scheduler} within {WAIT_S:.0f} s; {ALLOWED_ADDRESS}") from None
+        raise InputError("scheduler", f"no reply from {scheduler} within {WAIT_S:.0f} s", ADDRESS) from None
     try:
         check_workers(client, scheduler)
     except BaseException:
@@ -61,21 +61,21 @@ def check_workers(client: Client, scheduler: str) -> None:
 
     A worker that is lost meanwhile does not matter: if it comes back, `JobPlugin` checks its version.
     """
-    silent = f"scheduler: no worker of {scheduler} replies; allowed: one started with dask worker {scheduler}"
+    started = f"one started with dask worker {scheduler}"
+    silent = InputError("scheduler", f"no worker of {scheduler} replies", started)
     try:
         client.wait_for_workers(1, WAIT_S)
         versions = client.run(code_version, on_error="return")
     except OSError:
-        raise InputError(silent) from None
+        raise silent from None
     replies = {worker: code for worker, code in versions.items() if not isinstance(code, CommClosedError)}
     if not replies:
-        raise InputError(silent)
+        raise silent
     for worker, code in replies.items():
-        where = f"scheduler: worker {worker}"
         if isinstance(code, Exception):
-            raise InputError(f"{where} cannot run trials: {code}; allowed: a worker with this skysim")
+            raise InputError("scheduler", f"worker {worker} cannot run trials: {code}", "a worker with this skysim")
         if code != code_version():
-            raise InputError(f"{where} has skysim {code}; allowed: {code_version()}, the version here")
+            raise InputError("scheduler", f"worker {worker} has skysim {code}", f"{code_version()}, the version here")
 
 
 def thread_count(client: Client) -> int:
@@ -158,7 +158,7 @@ class JobPlugin(WorkerPlugin):
     def setup(self, worker: Any) -> None:
         """Store the job on the worker. Raises InputError if its code version differs from the run's."""
         if code_version() != self.code:
-            raise InputError(f"{worker.address} has skysim {code_version()}; allowed: {self.code}")
+            raise InputError("", f"{worker.address} has skysim {code_version()}", self.code)
         cv2.setNumThreads(1)
         JOBS[self.name] = self.job
 
@@ -170,7 +170,7 @@ class JobPlugin(WorkerPlugin):
 def run_encoded(name: str, text: str) -> tuple[list[Any], float]:
     """`run_timed` with the run's job on this worker. Raises InputError if `JobPlugin.setup` rejected it."""
     if name not in JOBS:
-        raise InputError(f"scheduler: a new worker has skysim {code_version()}; allowed: the version of the run")
+        raise InputError("scheduler", f"a new worker has skysim {code_version()}", "the version of the run")
     return run_timed(JOBS[name], decode_chunk(text))
 
 
@@ -197,8 +197,8 @@ class Dask:
             client.register_plugin(JobPlugin(name, job, code_version()), name)
             yield from collect_rows(client, name, job, chunks, in_flight)
         except (CancelledError, OSError):
-            message = "connection lost, finished trials are stored; allowed: skysim study resume"
-            raise InputError(f"scheduler: {message}") from None
+            problem = "connection lost, finished trials are stored"
+            raise InputError("scheduler", problem, "to resume the study") from None
         finally:
             # The connection itself may have failed, and a lost scheduler needs no cleanup.
             with suppress(CancelledError, OSError, RuntimeError, ValueError):

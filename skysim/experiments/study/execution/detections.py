@@ -8,6 +8,7 @@ its code and of its drive's pulses in the exposure, with photon noise and FLUX_N
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,13 +18,16 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Centroids
 from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.pipeline import Report
-from skysim.camera.render import Poses, in_view, project_each, rates_e_s
-from skysim.core.types import Floats
+from skysim.camera.render import OcclusionTest, Poses, Window, in_view, project_each, rates_e_s
+from skysim.core.types import Floats, Trajectory
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
-from skysim.simulation.exposure import occlusion_test
-from skysim.simulation.lab import Lab, sky_during
-from skysim.simulation.timing import exposure_window
+from skysim.simulation.exposure import exposure_of
+from skysim.simulation.lab import Lab, StarCamera
+from skysim.simulation.lights.air import Atmosphere
+from skysim.simulation.lights.dome import LedDome
+from skysim.simulation.lights.light import Exposure, Obstacle, any_of, find_light
+from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.sources.dome.led import lit_moments_s
 
 LEAST_SIGMA_PX = 1e-3
@@ -58,22 +62,30 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[View]:
     each_pose = (Poses(*(part[n : n + 1] for part in poses)) for n in range(len(R_lab_from_body)))
     rows = [in_view(lab.camera.sources, lab.camera.optics, pose, reach=0.0) for pose in each_pose]
     ends = np.cumsum([0, *map(len, rows)])
-    near, sky = lab.camera.sources.take(np.concatenate(rows)), sky_during(lab.camera, 0.0)
-    if sky:
-        near = sky.stars_seen(near)
+    near = lab.camera.sources.take(np.concatenate(rows))
+    atmosphere = find_light(lab.camera.lights, Atmosphere)
+    if atmosphere:
+        near = atmosphere.air.at(lab.scene.start_time).points_seen(near)
     xy_px, distance_m, cos_out, cos_in = project_each(near, lab.camera.optics, poses, ends)
-    rate_e_s = rates_e_s(near, lab.camera.optics, lab.camera.emitter, distance_m, cos_out, cos_in)
+    rate_e_s = rates_e_s(near, lab.camera.optics, lab.camera.known.emitter, distance_m, cos_out, cos_in)
     electrons = rate_e_s * np.minimum(near.on_s / near.period_s, 1.0) * lab.scene.exposure.time_s
     x, y = xy_px.T
     width_px, height_px = lab.camera.canvas.shape[::-1]
     visible = (x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5)
+    start = exposure_of(lab.camera, Trajectory.at_rest(lab.start, MARGIN_S), 0, Window(0.0, 0.0), None)
     views = []
     for n, (begin, end) in enumerate(itertools.pairwise(ends.tolist())):
         chosen = begin + np.flatnonzero(visible[begin:end])
-        if occludes := occlusion_test(lab.camera, lab_from_body[n], sky):
+        if occludes := occlusion(lab.camera, replace(start, lab_from_body=lab_from_body[n])):
             chosen = chosen[~occludes(near.place[chosen])]
         views.append(View(rows[n][chosen - begin], xy_px[chosen], electrons[chosen]))
     return views
+
+
+def occlusion(camera: StarCamera, exposure: Exposure) -> OcclusionTest | None:
+    """The test for places that something hides from a camera in an exposure; None if nothing can."""
+    obstacles = [light for light in camera.lights if isinstance(light, Obstacle)]
+    return any_of([occluder for light in obstacles if (occluder := light.during(exposure).hides)])
 
 
 def simulate_detections(
@@ -129,12 +141,10 @@ def brightness(lab: Lab, rows: NDArray[np.int64], frame: int) -> Floats:
     """(K,) light of LEDs in the exposure of a frame over their mean light: what code, pulses and filters leave."""
     window, steady = exposure_window(lab.scene, frame), lab.camera.sources.take(rows)
     begin_s, end_s = window.open_s, window.open_s + window.exposure_s
-    shown = lab.camera.sources
-    if lab.camera.clocks:
-        shown = lab.camera.clocks.lights_at(shown, (begin_s + end_s) / 2, window.exposure_s)
-    if lab.camera.codes:
-        shown = lab.camera.codes.shown(shown, begin_s, window.exposure_s, frame)
-    shown = shown.take(rows)
+    dome = lab.camera.known
+    assert isinstance(dome, LedDome)
+    middle_s = (begin_s + end_s) / 2
+    shown = dome.pulsed(dome.sources, lab.camera.run_seed, frame, window, middle_s).take(rows)
     pulses = zip(shown.period_s.tolist(), shown.start_s.tolist(), shown.on_s.tolist(), strict=True)
     lit_s = np.array([lit_moments_s(begin_s, end_s, *one)[0] for one in pulses])
     mean = steady.strength * np.minimum(steady.on_s / steady.period_s, 1.0)

@@ -200,7 +200,7 @@ def start_pool(count: int, job: Job) -> ProcessPoolExecutor:
         for future in [pool.submit(code_version) for _ in range(count)]:
             future.result()
     except BrokenProcessPool:
-        raise InputError(f"--workers: {count} processes do not start; allowed: fewer, or --engine serial") from None
+        raise InputError("workers", f"{count} processes do not start", "fewer, or engine serial") from None
     return pool
 
 

@@ -17,7 +17,7 @@ from skysim.core.types import Frame, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.setups import Setup, prepared_setup
 from skysim.experiments.study.execution.store import Store, to_sql
-from skysim.experiments.study.execution.trials import Row, Segment
+from skysim.experiments.study.execution.trials import REFUSED, Row, Segment
 from skysim.experiments.study.plan import CentroidTrial, FlightTrial, FrameTrial, Plan
 from skysim.results.annotate import annotate, visible
 from skysim.results.files import frames
@@ -39,7 +39,7 @@ def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
     """The segment with this trial alone. Raises InputError if the study has no such trial."""
     points, each = store.points(), plan.study.replicates
     if not 0 <= trial < len(points) * each:
-        raise InputError(f"trial {trial}: not in the study; allowed: 0 to {len(points) * each - 1}")
+        raise InputError(f"trial {trial}", "not in the study", f"0 to {len(points) * each - 1}")
     point, replicate = divmod(trial, each)
     settings = plan.spec.trial_settings(points[point].settings, replicate)
     return Segment(point, settings, trial, range(replicate, replicate + 1))
@@ -57,7 +57,7 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     now = {name: to_sql(getattr(row.outcome, name)) for name in row.outcome.__slots__}
     changed = [name for name, value in now.items() if stored and stored[name] != value]
     files, pictures = [], []
-    if row.scene:  # an invalid scene has no lab
+    if row.scene not in ("", REFUSED):  # an invalid scene has no lab
         setup = prepared_setup(plan.spec, segment.settings)
         frames.remove_results(file_io.make_folder(folder))
         try:

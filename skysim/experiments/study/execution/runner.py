@@ -116,19 +116,17 @@ def prepare_store(plan: Plan, store: Store, resume: bool, overrides: Mapping[str
 
     Raises InputError if the store holds another study or rows of another code version, or if `resume` does not fit.
     """
-    stored, done, fault = store.meta("digest"), store.counts()["done"], ""
+    stored, done = store.meta("digest"), store.counts()["done"]
     kept = stored_replicates(plan, store) if stored else plan.study.replicates
     if not kept:
-        fault = "contains another study, or an earlier version of this one; allowed: another --out"
-    elif resume and not stored:
-        fault = "contains no trials to resume; allowed: skysim study run"
-    elif done and not resume:
-        fault = f"already contains {done} trials; allowed: skysim study resume, or another --out"
-    elif done and store.meta("code") != code_version():
-        allowed = f"{code_version()}, the version here, or another --out"
-        fault = f"its {done} trials are of skysim {store.meta('code')}; allowed: {allowed}"
-    if fault:
-        raise InputError(f"{store.path}: {fault}")
+        raise InputError(store.path, "contains another study, or an earlier version of this one", "another store")
+    if resume and not stored:
+        raise InputError(store.path, "contains no trials to resume", "to run the study")
+    if done and not resume:
+        raise InputError(store.path, f"already contains {done} trials", "to resume the study, or another store")
+    if done and store.meta("code") != code_version():
+        problem = f"its {done} trials are of skysim {store.meta('code')}"
+        raise InputError(store.path, problem, f"{code_version()}, the version here, or another store")
     if done:
         check_scene(plan, store)
     if stored != plan.digest or not done:
@@ -167,8 +165,9 @@ def check_scene(plan: Plan, store: Store) -> None:
         now = scene_hash(resolve_point(plan.spec, settings)[0])
         if now != stored:
             raise InputError(
-                f"{store.path}: the scene of point {point} has changed (hash {stored} then, {now} now); allowed:"
-                " another --out, or the original scene"
+                store.path,
+                f"the scene of point {point} has changed (hash {stored} then, {now} now)",
+                "another store, or the original scene",
             )
 
 

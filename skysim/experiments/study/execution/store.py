@@ -274,7 +274,7 @@ class Store:
         """One row by column name. Raises InputError if the trial is not in the store."""
         rows = self._rows([(number, number + 1)])
         if not len(rows["trial"]):
-            raise InputError(f"trial {number}: not in {self.path}; allowed: {self.trial_range()}")
+            raise InputError(f"trial {number}", f"not in {self.path}", self.trial_range())
         return {name: to_sql(rows[name].tolist()[0]) for name in rows if name != "time_ms"}
 
     def trial_range(self) -> str:
@@ -362,7 +362,7 @@ class Store:
         values = tuple(row)
         if not all(map(isinstance, values, types)):
             allowed = ", ".join(dict.fromkeys(one.__name__ for one in types))
-            raise InputError(f"{self.path}: not a valid study store: {repr(values)[:80]}; allowed: {allowed}")
+            raise InputError(self.path, f"not a valid study store: {repr(values)[:80]}", allowed)
         return values
 
     @contextmanager
@@ -373,7 +373,7 @@ class Store:
         except InputError:
             raise
         except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
-            raise InputError(f"{self.path}: not a valid study store: {' '.join(str(error).split())[:120]}") from None
+            raise InputError(self.path, f"not a valid study store: {' '.join(str(error).split())[:120]}") from None
 
 
 def to_sql(value: Any) -> Any:
@@ -408,7 +408,7 @@ def ranges_of(points: Sequence[int], replicates: int) -> list[tuple[int, int]]:
 def open_store(path: Path) -> Iterator[Store]:
     """Open a store for reading; a run may write it at the same time. Raises InputError if it is missing or damaged."""
     if not path.is_file():
-        raise InputError(f"{path}: no such store; allowed: a store written by skysim study run")
+        raise InputError(path, "no such store", "a store of a study's trials")
     with (
         sqlite_errors_as_input_error(path, "not a valid study store: "),
         closing(sqlite3.connect(path, timeout=30)) as db,
@@ -423,11 +423,12 @@ def check_format(store: Store) -> None:
     stored = store.meta("format")
     if stored == "1":
         raise InputError(
-            f"{store.path}: written by an earlier skysim, without the attitudes of the trials; allowed: run the study"
-            " again, with another --out"
+            store.path,
+            "written by an earlier skysim, without the attitudes of the trials",
+            "run the study again, to another store",
         )
     if stored not in (str(FORMAT), str(FORMAT_OF_PARTS)):
-        raise InputError(f"{store.path}: format {stored!r}; allowed: {FORMAT}, {FORMAT_OF_PARTS}")
+        raise InputError(store.path, f"format {stored!r}", f"{FORMAT}, {FORMAT_OF_PARTS}")
 
 
 @contextmanager
@@ -437,8 +438,7 @@ def sqlite_errors_as_input_error(path: Path, what: str = "") -> Iterator[None]:
     try:
         yield
     except (sqlite3.DatabaseError, UnicodeDecodeError, MemoryError) as error:
-        message = " ".join(str(error).split()) or "not enough memory"
-        raise InputError(f"{path}: {what}{message}") from None
+        raise InputError(path, f"{what}{str(error) or 'not enough memory'}") from None
 
 
 @contextmanager
@@ -459,7 +459,7 @@ def writing(path: Path) -> Iterator[Store]:
         except sqlite3.OperationalError as error:
             if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
                 raise
-            raise InputError(f"{path}: in use by another run; allowed: one run at a time, or another --out") from None
+            raise InputError(path, "in use by another run", "one run at a time, or another store") from None
         with closing(sqlite3.connect(path, timeout=30)) as db:
             db.execute("PRAGMA journal_mode = WAL")
             db.execute("PRAGMA synchronous = NORMAL")

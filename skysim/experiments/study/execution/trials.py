@@ -24,6 +24,7 @@ from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import Health, TrackedReport, TrackingMode
 from skysim.camera.detector.added_charge import AddedCharge
 from skysim.core import quaternion
+from skysim.core.errors import InputError
 from skysim.core.paths import ROOT
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Frame, Mount, Trajectory, Truth
@@ -64,10 +65,15 @@ from skysim.tracking import factory
 GYRO_RAD_S = 1e-5  # standard deviation that a frame trial's gyro claims, 2 arcseconds a second
 KNOTS = 9  # samples of a frame trial's trajectory in each exposure
 BLOCK = 64  # centroid trials that run together
+REFUSED = "refused"  # in place of the hash of a scene that cannot be built
 
 
 class Row(NamedTuple):
-    """One trial as stored."""
+    """One trial as stored.
+
+    scene : its hash; REFUSED, with why in `error`, for a scene that is invalid; empty if its worker died
+    error : an InputError's line, or the traceback of another exception
+    """
 
     trial: int
     point: int
@@ -140,7 +146,7 @@ def divided(segment: Segment, size: int) -> Iterator[Segment]:
 def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
     """Run the trials of a segment together.
 
-    If one of them raises an exception, each runs by itself, and the row of that one stores the traceback.
+    If one of them raises an exception, each runs by itself, and the row of that one stores it.
     key : `setup_key` of the segment, if it is known
     """
     numbers = list(enumerate(segment.replicates, segment.first))
@@ -150,10 +156,13 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
         setup = prepared_setup(spec, segment.settings, key)
         scene, start_s = setup.scene_hash, time.perf_counter()
         outcomes = TRIALS[setup.trial.kind](setup, seeds)
-    except Exception:
+    except Exception as raised:
         if len(seeds) > 1:
             return [row for one in divided(segment, 1) for row in run_block(spec, one, key)]
-        error = traceback.format_exc().replace(f"{ROOT}/", "")  # independent of the installation path
+        if isinstance(raised, InputError):
+            scene, error = scene or REFUSED, str(raised)
+        else:
+            error = traceback.format_exc().replace(f"{ROOT}/", "")  # independent of the installation path
     seconds = (time.perf_counter() - start_s) / len(seeds)
     return [
         Row(trial, segment.point, replicate, seed, scene, code_version(), outcome, error, seconds)
@@ -162,7 +171,7 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
 
 
 def run_trial(spec: TrialSpec, segment: Segment, trial: int, replicate: int) -> Row:
-    """Run one trial of a segment's point; an exception is stored in its row as a traceback."""
+    """Run one trial of a segment's point; an exception is stored in its row."""
     return run_block(spec, segment._replace(first=trial, replicates=range(replicate, replicate + 1)))[0]
 
 

@@ -61,7 +61,7 @@ def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:
     try:
         import pyarrow.parquet
     except ImportError:
-        raise InputError(f"{path}: Parquet {EXTRA}") from None
+        raise InputError(path, f"Parquet {EXTRA}") from None
     levels, meta = level_columns(store), {key: store.meta(key) for key in ("title", "code", "study")}
     tables = (to_arrow(with_levels(block, levels)).replace_schema_metadata(meta) for block in store.blocks())
     first = next(tables)
@@ -83,7 +83,7 @@ def dataset(store: Store, responses: tuple[str, ...], path: Path) -> Any:
         import pandas
         import xarray
     except ImportError:
-        raise InputError(f"{path}: xarray {EXTRA}") from None
+        raise InputError(path, f"xarray {EXTRA}") from None
     lines = table(store, responses)
     frame = pandas.DataFrame(to_columns(lines))
     factors = list(lines[0].levels) if lines else []
@@ -114,6 +114,6 @@ EXPORTS: dict[str, Callable[[Store, tuple[str, ...], Path], None]] = {
 def export(store: Store, responses: tuple[str, ...], path: Path) -> None:
     """Write a study's results in the format given by the path's suffix. Raises InputError for an unknown suffix."""
     if path.suffix not in EXPORTS:
-        raise InputError(f"{path}: {unknown_name('file format', path.suffix, EXPORTS)}")
+        raise InputError(path, *unknown_name("file format", path.suffix, EXPORTS))
     files.make_folder(path.parent)
     EXPORTS[path.suffix](store, responses, path)

@@ -86,7 +86,7 @@ def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
         np.isfinite(columns[name]) if columns else np.zeros(0, bool) for name in ("body_tilt_deg", "boresight_dec_deg")
     )
     if in_dome.any() and in_sky.any():
-        raise InputError(f"map of {response}: trials under a dome and under the stars; allowed: where, to choose one")
+        raise InputError(f"map of {response}", "trials under a dome and under the stars", "where, to choose one")
     sky, known = bool(in_sky.any()), in_dome | in_sky
     if not known.any():
         return DirectionMap(label, sky, [], [])

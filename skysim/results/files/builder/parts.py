@@ -110,7 +110,7 @@ def build_design(scene: Scene) -> Design:
     """The scene's dome as designed. Raises InputError without a dome."""
     light = scene.light
     if not isinstance(light, DomeConfig):
-        raise InputError(f"light.kind: {light.kind} has no parts; allowed: dome")
+        raise InputError("light.kind", f"{light.kind} has no parts", "dome")
     surface = build_surface(light.surface)
     leds = design_leds(light, surface, Band.from_camera(scene.camera))
     return Design(light, surface, leds, max(light.layout.cap_deg, max_tilt_deg(leds.place[:, :3])))

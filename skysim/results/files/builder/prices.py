@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, Where
 from skysim.core.io.text import excerpt, read_lines
 from skysim.core.io.yaml_reader import suggestion
 from skysim.core.paths import DATA
@@ -48,7 +48,7 @@ class Prices(NamedTuple):
     def of(self, part: str) -> Price:
         """The price of a part. Raises InputError if the table lacks it."""
         if part not in self.parts:
-            raise InputError(f"{self.name}: no price of {part}; allowed: a line that begins with it")
+            raise InputError(self.name, f"no price of {part}", "a line that begins with it")
         return self.parts[part]
 
     def survey(self, sigma_m: float, leds: int) -> str:
@@ -60,8 +60,9 @@ class Prices(NamedTuple):
         }
         if not able:
             raise InputError(
-                f"{self.name}: no {SURVEY} reaches {1e3 * sigma_m:.3g} mm; allowed: a line {SURVEY}_NAME with a"
-                " sigma_mm of at most that"
+                self.name,
+                f"no {SURVEY} reaches {1e3 * sigma_m:.3g} mm",
+                f"a line {SURVEY}_NAME with a sigma_mm of at most that",
             )
         return min(able, key=lambda name: able[name])
 
@@ -78,17 +79,18 @@ def read_prices(path: Path) -> Prices:
     names = [cell.strip() for cell in lines[0][1].split(",")] if lines else []
     if {*NEEDED} - {*names} or {*names} - {*NEEDED, *FURTHER} or len({*names}) < len(names) or len(lines) < 2:
         raise InputError(
-            f"{path}: not a table of prices; allowed: columns {', '.join(NEEDED)}, optionally {', '.join(FURTHER)};"
-            " one part per line"
+            path,
+            "not a table of prices",
+            f"columns {', '.join(NEEDED)}, optionally {', '.join(FURTHER)}; one part per line",
         )
     parts = dict[str, Price]()
     for number, line in lines[1:]:
         try:
             part, price = parse_line(line, names)
             if part in parts:
-                raise InputError(f"{part} occurs twice; allowed: once")
+                raise InputError("", f"{part} occurs twice", "once")
         except InputError as error:
-            raise InputError(f"{path}, line {number}: {error}") from None
+            raise error.within(path).at(Where(path, number)) from None
         parts[part] = price
     return Prices(str(path), parts)
 
@@ -98,24 +100,23 @@ def parse_line(line: str, names: list[str]) -> tuple[str, Price]:
     try:
         cells = next(csv.reader([line], strict=True))
     except csv.Error as error:
-        raise InputError(f"{line[:80]!r} is no line of CSV ({error})") from None
+        raise InputError("", f"{line[:80]!r} is no line of CSV ({error})") from None
     if len(cells) != len(names):
-        raise InputError(f"{len(cells)} cells; allowed: {len(names)}, one a column")
+        raise InputError("", f"{len(cells)} cells", f"{len(names)}, one a column")
     cell = dict(zip(names, (one.strip() for one in cells), strict=True))
     part, unit = cell["part"], cell["unit"]
     survey = part.startswith(SURVEY)
     if part not in UNITS and not survey:
-        raise InputError(f"unknown part {excerpt(part)}{suggestion(part, [*UNITS, f'{SURVEY}_NAME'])}")
+        known = [*UNITS, f"{SURVEY}_NAME"]
+        raise InputError("", f"unknown part {excerpt(part)}{suggestion(part, known)}", ", ".join(known))
     if unit != UNITS.get(part, "each"):
-        raise InputError(f"unit of {part}: {unit!r}; allowed: {UNITS.get(part, 'each')}")
+        raise InputError(f"unit of {part}", f"{unit!r}", UNITS.get(part, "each"))
     if survey != bool(cell.get("sigma_mm")):
-        raise InputError(
-            f"sigma_mm of {part}: {cell.get('sigma_mm') or 'none'}; allowed: of a {SURVEY}, which needs it"
-        )
+        raise InputError(f"sigma_mm of {part}", cell.get("sigma_mm") or "none", f"of a {SURVEY}, which needs it")
     price, fixed = (number(cell, key, 0.0) for key in ("price", "fixed"))
     serves = number(cell, "serves", 1.0)
     if serves < 1 or serves % 1:
-        raise InputError(f"serves: {cell['serves']}; allowed: a whole number from 1")
+        raise InputError("serves", cell["serves"], "a whole number from 1")
     sigma_m = 1e-3 * number(cell, "sigma_mm", math.nan)
     return part, Price(unit, price, fixed, int(serves), sigma_m, cell.get("what", ""))
 
@@ -130,5 +131,5 @@ def number(cell: dict[str, str], key: str, default: float) -> float:
     except ValueError:
         value = math.nan
     if not 0 <= value <= LARGEST:
-        raise InputError(f"{key}: {text!r}; allowed: a number from 0 to {LARGEST:g}")
+        raise InputError(key, f"{text!r}", f"a number from 0 to {LARGEST:g}")
     return value

@@ -60,7 +60,7 @@ def template(lab: Lab, ending: str) -> str:
     """The text of a template for a scene's dome, by its file's ending. Raises InputError without a dome."""
     light = lab.scene.light
     if not isinstance(light, DomeConfig):
-        raise InputError(f"light.kind: {light.kind} has no {ending}; allowed: dome")
+        raise InputError("light.kind", f"{light.kind} has no {ending}", "dome")
     surface = build_surface(light.surface)
     leds = design_leds(light, surface, lab.camera.band)
     cap_deg = max(float(getattr(light.layout, "cap_deg", 0.0)), max_tilt_deg(leds.place[:, :3]))  # boards stand out

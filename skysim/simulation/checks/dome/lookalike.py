@@ -18,7 +18,8 @@ from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.expected_error import Independent, believed_sigma_px
-from skysim.simulation.checks.facts import Fact, Samples, short
+from skysim.simulation.checks.facts import Fact, short
+from skysim.simulation.checks.sampling import Samples
 from skysim.sources.dome.placement.ambiguity import Ambiguity, field_ambiguity
 
 ALIKE = 0.9  # fraction of coincident LEDs

@@ -9,8 +9,10 @@ import numpy as np
 from skysim.core.constants import ARCSEC_RAD
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context
-from skysim.simulation.checks.facts import Samples, short
-from skysim.simulation.lab import time_at
+from skysim.simulation.checks.facts import short
+from skysim.simulation.checks.sampling import Samples
+from skysim.simulation.lights.air import Atmosphere
+from skysim.simulation.lights.light import find_light
 from skysim.tracking.external.interface import OWN
 
 MIN_RAISED_ARCSEC = 1.0  # of a refraction that matters
@@ -23,15 +25,16 @@ def refraction(context: Context, samples: Samples) -> str:
     refractions at its two ends.
     """
     lab, at = context.lab, samples.frames.attitudes
-    if lab.camera.air is None or lab.scene.tracker.refraction:
+    atmosphere = find_light(lab.camera.lights, Atmosphere)
+    if atmosphere is None or lab.scene.tracker.refraction:
         return ""
     boresight = (at.lab_from_body * lab.camera.mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
-    zenith = np.array([lab.camera.air.at(time_at(lab.scene, t)).zenith for t in at.t_s.tolist()])
+    zenith = np.array([atmosphere.air.at(exposure.time).zenith for exposure in samples.frames.exposures])
     altitude_rad = np.arcsin(np.sum(boresight * zenith, axis=1))
     n = int(altitude_rad.argmin())
     zenith_rad, half_rad = math.pi / 2 - altitude_rad[n], context.camera.optics.field_rad
     around_rad = zenith_rad + np.array([0.0, half_rad, -half_rad])
-    middle, low, high = lab.camera.air.refraction.bending_rad(np.abs(around_rad)) * np.sign(around_rad) / ARCSEC_RAD
+    middle, low, high = atmosphere.air.refraction.bending_rad(np.abs(around_rad)) * np.sign(around_rad) / ARCSEC_RAD
     expected_arcsec = samples.frames.error.rms_arcsec()[0]
     if not middle > max(MIN_RAISED_ARCSEC, 0.0 if math.isnan(expected_arcsec) else expected_arcsec):
         return ""

@@ -11,9 +11,9 @@ from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context, full_scale_e
-from skysim.simulation.checks.facts import Samples, short
+from skysim.simulation.checks.facts import short
+from skysim.simulation.checks.sampling import Samples
 from skysim.simulation.checks.views import peak_share
-from skysim.simulation.lab import bodies_during
 from skysim.sources.solar_system.bodies import NAMES, BodyLight
 
 NEAR_DEG = {"sun": 60.0, "moon": 30.0}  # from the boresight, where their stray light would matter
@@ -24,8 +24,8 @@ def bodies_near(context: Context, samples: Samples) -> Iterator[str]:
     lab, at = context.lab, samples.frames.attitudes
     cam_from_lab = lab.camera.mount.cam_from_body * at.lab_from_body.inv()
     closest: dict[str, tuple[float, int, BodyLight]] = {}
-    for n, t_s in enumerate(at.t_s):
-        for body in bodies_during(lab.camera, float(t_s)):
+    for n, beam in enumerate(samples.frames.beams):
+        for body in beam.discs:
             z = float(cam_from_lab[n].apply(body.place.direction)[2])
             off = math.acos(max(min(z, 1.0), -1.0)), n, body
             closest[body.name] = min(closest.get(body.name, off), off, key=lambda found: found[0])

@@ -14,7 +14,8 @@ import numpy as np
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.expected_error import Independent, covariance, gains, star_places
-from skysim.simulation.checks.facts import Fact, Sampled, Samples, short
+from skysim.simulation.checks.facts import Fact, short
+from skysim.simulation.checks.sampling import Sampled, Samples
 
 MAX_FACTOR = 1.3  # by which claimed errors may be too small
 TRUE_NEES = 3.0

@@ -8,8 +8,9 @@ import numpy as np
 
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks.detection import BINOMIAL_VARIANCE_PX2, Context, threshold_e
-from skysim.simulation.checks.facts import Fact, Samples
+from skysim.simulation.checks.facts import Fact
 from skysim.simulation.checks.findings import few_lights
+from skysim.simulation.checks.sampling import Samples
 from skysim.simulation.checks.views import peak_share
 from skysim.sources.photometry import SUN, star_flux_e_s_m2
 
@@ -113,4 +114,4 @@ def snr_limit_mag(context: Context, samples: Samples) -> float:
 
 def least_streak_px(samples: Samples) -> float:
     """Path of the images at the slowest frame."""
-    return float(min((np.median(view.streak_length_px) for view in samples.frames.seen if len(view)), default=0.0))
+    return float(min((np.median(view.streak_length_px) for view in samples.frames.known if len(view)), default=0.0))

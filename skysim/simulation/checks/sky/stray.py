@@ -11,9 +11,9 @@ from skysim.camera.glow.background import angular_separation_deg
 from skysim.core.types import Floats
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context, full_scale_e
-from skysim.simulation.checks.facts import Samples, short
-from skysim.simulation.exposure import stray_light_e_s
-from skysim.simulation.lab import bodies_during, observer_during
+from skysim.simulation.checks.facts import short
+from skysim.simulation.checks.sampling import Samples
+from skysim.simulation.lights.lens import stray_e_s
 from skysim.sources.orbit.earth import limb_elevation_rad
 from skysim.sources.solar_system.places import place
 
@@ -30,11 +30,7 @@ def stray_light(context: Context, samples: Samples) -> Iterator[str]:
     lab, at = context.lab, samples.frames.attitudes
     if lab.scene.camera.baffle is None:
         return
-    cam_from_lab = lab.camera.mount.cam_from_body * at.lab_from_body.inv()
-    by_frame = [
-        stray_light_e_s(lab.camera, bodies_during(lab.camera, t), cam_from_lab[n], t)
-        for n, t in enumerate(at.t_s.tolist())
-    ]
+    by_frame = [stray_e_s(lab.camera.lights, exposure) for exposure in samples.frames.exposures]
     stray_e = context.camera.exposure_s * np.array([sum(one.values()) for one in by_frame])
     n, own_e2 = int(stray_e.argmax()), context.camera.noise_e**2 - context.camera.stray_e
     loss_mag = 1.25 * math.log10(1 + stray_e[n] / own_e2)
@@ -45,7 +41,7 @@ def stray_light(context: Context, samples: Samples) -> Iterator[str]:
     full_e = full_scale_e(lab.scene.camera.detector)
     yield (
         f"camera.baffle.pst: stray light of {short(stray_e[n])} electrons in a pixel, most of it of"
-        f" {NAMES.get(source, source.capitalize())}, of {full_e:.0f} at saturation,"
+        f" {source}, of {full_e:.0f} at saturation,"
         f" at {attitudes.describe(at, n, lab.scene, lab.camera.mount)}; the faintest star is {loss_mag:.1f} mag"
         f" brighter; change it to {short(allowed_e / stray_e[n], 2)} times as much, or point farther away"
     )
@@ -73,7 +69,7 @@ def exclusion(context: Context, samples: Samples) -> Iterator[str]:
 
 def beside_deg(context: Context, t_s: float, boresight: Floats) -> Floats:
     """(3,) angles of a boresight from the Sun's center, the Earth's limb and the Moon's center at a time."""
-    here = observer_during(context.lab.camera, t_s)
+    here = context.lab.camera.viewpoint.observer_at(t_s)
     sun, moon = (float(angular_separation_deg(boresight, place(name, here).direction)) for name in ("sun", "moon"))
     limb_deg = math.degrees(float(limb_elevation_rad(here.from_earth.position_m, boresight)))
     return np.array([sun, limb_deg, moon])

@@ -100,8 +100,9 @@ def panel_surface(config: layouts.LcdConfig, surface: Any) -> Plane:
     half_m = np.array(config.pixels) * config.pitch_m / 2
     if np.any(half_m > surface.half_m * (1 + 1e-9)):
         raise InputError(
-            f"light.layout.pixels: need {2 * half_m[0]:.4g} m by {2 * half_m[1]:.4g} m; allowed: the surface's"
-            f" {2 * surface.half_m[0]:.4g} m by {2 * surface.half_m[1]:.4g} m"
+            "light.layout.pixels",
+            f"need {2 * half_m[0]:.4g} m by {2 * half_m[1]:.4g} m",
+            f"the surface's {2 * surface.half_m[0]:.4g} m by {2 * surface.half_m[1]:.4g} m",
         )
     return dataclasses.replace(surface, half_m=half_m)
 
@@ -138,8 +139,9 @@ def visible_blocks(config: PanelConfig, position_m: Floats, level: Floats) -> Pi
     blocks = draw_blocks(config, position_m, level)
     if not np.all(blocks.level > 0):
         raise InputError(
-            f"light.layout.points: a star of level {level.min():.2g} is black on {config.gray_levels} gray levels;"
-            f" allowed: {min_level(config):.2g} or more"
+            "light.layout.points",
+            f"a star of level {level.min():.2g} is black on {config.gray_levels} gray levels",
+            f"{min_level(config):.2g} or more",
         )
     return blocks
 
@@ -211,16 +213,15 @@ def display_sources(
     within = np.all(np.abs(on_display_m) <= half_m, axis=1)
     stars, on_display_m = stars.take(within), on_display_m[within]
     if not len(stars):
-        raise InputError(
-            "light.limit_mag: no star of the catalog is on the display to this limit; allowed: a fainter one"
-        )
+        raise InputError("light.limit_mag", "no star of the catalog is on the display to this limit", "a fainter one")
     level = np.minimum(10 ** (-0.4 * (stars.v_mag - config.brightest_mag)), 1.0)
     blocks = draw_blocks(config, on_display_m, level)
     if not np.all(blocks.level > 0):
         darkest_mag = config.brightest_mag - 2.5 * np.log10(min_level(config))
         raise InputError(
-            f"light.limit_mag: stars of V {stars.v_mag.max():.3g} are black on {config.gray_levels} gray levels;"
-            f" allowed: to {darkest_mag:.3g}"
+            "light.limit_mag",
+            f"stars of V {stars.v_mag.max():.3g} are black on {config.gray_levels} gray levels",
+            f"to {darkest_mag:.3g}",
         )
     beam = np.column_stack([blocks.center_px * config.pitch_m, np.full(len(blocks.star), config.focal_length_m)])
     white_e_s_m2 = float(star_flux_e_s_m2(config.brightest_mag, *SUN, band))

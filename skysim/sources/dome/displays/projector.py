@@ -102,19 +102,20 @@ def projector_sources(config: ProjectorConfig, surface: Surface, led: LedConfig,
     """
     position_m = np.array(config.position_m)
     if not surface.inside(position_m):
-        raise InputError(f"light.layout.position: {config.position_m} m is outside of the dome; allowed: inside")
+        raise InputError("light.layout.position", f"{config.position_m} m is outside of the dome", "inside")
     chip_m, shown = on_chip_m(config, own_from_lab(config).apply(stars.place[:, :3] - position_m))
     if not shown.all():
         raise InputError(
-            f"light.layout.points: {np.sum(~shown)} of {len(shown)} stars are outside of the projector's picture;"
-            " allowed: a smaller cap_deg, a shorter focal_length, or another position"
+            "light.layout.points",
+            f"{np.sum(~shown)} of {len(shown)} stars are outside of the projector's picture",
+            "a smaller cap_deg, a shorter focal_length, or another position",
         )
     blocks = visible_blocks(config, chip_m, stars.strength / full_strength_e_s_sr(led, band))
     drawn_m = blocks.center_px * config.pitch_m
     ray = rays(config, drawn_m)
     place_m = surface.meet(position_m, ray)
     if np.isnan(place_m).any():
-        raise InputError("light.layout.points: a star's pixel is below the dome's rim; allowed: a smaller cap_deg")
+        raise InputError("light.layout.points", "a star's pixel is below the dome's rim", "a smaller cap_deg")
     normal = surface.inward(place_m)
     lens_disk_m = spot_radius_m(config, surface, drawn_m, place_m, normal)
     cos_axis = ray @ own_from_lab(config).as_matrix()[2]

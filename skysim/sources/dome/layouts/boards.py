@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import HOLES, PatchBoardsConfig
 from skysim.scene.sections.leds import LedConfig
@@ -117,8 +117,9 @@ def listed_boards(config: PatchBoardsConfig, surface: Surface) -> tuple[Boards, 
         first, second = min(close)
         distance_m = np.linalg.norm(center_m[first] - center_m[second])
         raise InputError(
-            f"light.layout.boards.{second}: overlaps board {first}, {distance_m:.3g} m away; allowed:"
-            f" {3 * config.pitch_m:.3g} m, three pitches"
+            f"light.layout.boards.{second}",
+            f"overlaps board {first}, {distance_m:.3g} m away",
+            f"{3 * config.pitch_m:.3g} m, three pitches",
         )
     boards = tangent_boards(surface, center_m, np.radians([board.rotation_deg for board in listed]))
     level = np.concatenate([board.levels or np.ones(len(board.leds)) for board in listed])

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import AimingConfig, FibersConfig
 from skysim.sources.dome.shell.surface import Surface, perpendicular
@@ -56,7 +56,7 @@ def marked_m(
     """
     laser_m = np.array(config.laser_m)
     if not surface.inside(laser_m):
-        raise InputError(f"light.layout.aiming.laser: {config.laser_m} m is outside of the dome; allowed: inside")
+        raise InputError("light.layout.aiming.laser", f"{config.laser_m} m is outside of the dome", "inside")
     sight_m = place_m - laser_m
     line = sight_m / np.linalg.norm(sight_m, axis=1, keepdims=True)
     common = scaled_errors(config.orientation_sigma_arcsec, rng.standard_normal(3)) * ARCSEC_RAD
@@ -65,7 +65,7 @@ def marked_m(
     line /= np.linalg.norm(line, axis=1, keepdims=True)
     mark_m = surface.meet(laser_m, line)
     if np.isnan(mark_m).any():
-        raise InputError("light.layout.aiming: the laser's line passes below the rim; allowed: a smaller cap_deg")
+        raise InputError("light.layout.aiming", "the laser's line passes below the rim", "a smaller cap_deg")
     normal = surface.inward(mark_m)
     mark_m += (-outward_m / np.sum(normal * line, axis=1))[:, None] * line
     drill_m = scaled_errors(config.drill_sigma_m, rng.standard_normal((len(line), 2)))

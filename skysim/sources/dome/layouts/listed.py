@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, Where
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import ListedConfig, relative_levels
@@ -67,9 +67,7 @@ def check_on_surface(key: str, surface: Surface, place_m: Floats) -> None:
     offset_m = np.linalg.norm(project_from_bearing(surface, directions) - place_m, axis=1)
     far = np.flatnonzero(~(offset_m <= MAX_SURFACE_OFFSET_M))
     if len(far):
-        raise InputError(
-            f"{key}.{far[0]}: {offset_m[far[0]]:.3g} m from the surface; allowed: {MAX_SURFACE_OFFSET_M:g} m"
-        )
+        raise InputError(f"{key}.{far[0]}", f"{offset_m[far[0]]:.3g} m from the surface", f"{MAX_SURFACE_OFFSET_M:g} m")
 
 
 def read_csv(path: Path) -> LedFile:
@@ -83,7 +81,7 @@ def read_csv(path: Path) -> LedFile:
         text = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            f"light.layout.file: {path} cannot be read: {getattr(error, 'strerror', None) or error}"
+            "light.layout.file", f"{path} cannot be read: {getattr(error, 'strerror', None) or error}"
         ) from None
     lines = [(n, line) for n, line in enumerate(text, 1) if line.strip() and not line.startswith("#")]
     names = split_row(lines[0][1]) if lines else []
@@ -92,8 +90,10 @@ def read_csv(path: Path) -> LedFile:
     known = {*BRIGHTNESS, *FURTHER, *COLUMNS[0], *COLUMNS[1]}
     if chosen is None or len(brightness) > 1 or len({*names}) < len(names) or {*names} - known or len(lines) < 2:
         raise InputError(
-            f"{path}: not a list of LEDs; allowed: columns {' or '.join(map(', '.join, COLUMNS))}; optionally"
-            f" {' or '.join(BRIGHTNESS)}, {', '.join(FURTHER)}; one LED per line"
+            path,
+            "not a list of LEDs",
+            f"columns {' or '.join(map(', '.join, COLUMNS))}; optionally {' or '.join(BRIGHTNESS)},"
+            f" {', '.join(FURTHER)}; one LED per line",
         )
     rows = [parse_row(path, n, line, names) for n, line in lines[1:]]
     column = dict(zip(names, np.array(rows).T, strict=True))
@@ -119,7 +119,7 @@ def led_numbers(path: Path, column: Floats | None) -> Ints | None:
     repeated[np.unique(number, return_index=True)[1]] = False
     found = np.flatnonzero(wrong | repeated)
     if len(found):
-        raise InputError(f"{path}: id {column[found[0]]:g}; allowed: whole numbers from 0, each once")
+        raise InputError(path, f"id {column[found[0]]:g}", "whole numbers from 0, each once")
     return number
 
 
@@ -132,7 +132,9 @@ def parse_row(path: Path, number: int, line: str, names: list[str]) -> list[floa
     level = dict(zip(names, row, strict=False)).get("level", 1.0)
     if len(row) != len(names) or not np.all(np.isfinite(row)) or not 0 < level <= 1:
         raise InputError(
-            f"{path}, line {number}: {line!r} is not an LED; allowed: {len(names)} numbers, a level above 0 and at most"
-            " 1"
+            path,
+            f"{line!r} is not an LED",
+            f"{len(names)} numbers, a level above 0 and at most 1",
+            where=Where(path, number),
         )
     return row

@@ -135,8 +135,9 @@ def check_cap(key: str, directions: Floats, cap_deg: float) -> None:
     beyond = np.flatnonzero(~((length > 0) & (tilt_deg <= cap_deg * (1 + 1e-12))))
     if len(beyond):
         raise InputError(
-            f"{key}.{beyond[0]}: {tilt_deg[beyond[0]]:.4g} deg from the zenith, seen from the bearing's center;"
-            f" allowed: light.layout.cap_deg, {cap_deg:g}"
+            f"{key}.{beyond[0]}",
+            f"{tilt_deg[beyond[0]]:.4g} deg from the zenith, seen from the bearing's center",
+            f"light.layout.cap_deg, {cap_deg:g}",
         )
 
 
@@ -145,6 +146,6 @@ def project_from_bearing(surface: Surface, directions: Floats) -> Floats:
     place_m = surface.meet(np.zeros(3), directions)
     if np.isnan(place_m).any():
         raise InputError(
-            "light.layout: exceeds the surface; allowed: a smaller cap_deg, a larger surface or rim, or kind listed"
+            "light.layout", "exceeds the surface", "a smaller cap_deg, a larger surface or rim, or kind listed"
         )
     return place_m

@@ -66,7 +66,7 @@ def poisson_disk(config: PoissonDiskConfig, surface: Surface, led: LedConfig, ba
     if not 0 < dart_count <= MAX_DARTS:
         min_spacing_m = config.spacing_m * np.sqrt(dart_count / MAX_DARTS) if dart_count > 0 else np.inf
         raise InputError(
-            f"light.layout.spacing: {config.spacing_m:g} m gives too many LEDs; allowed: {min_spacing_m:.3g} m or more"
+            "light.layout.spacing", f"{config.spacing_m:g} m gives too many LEDs", f"{min_spacing_m:.3g} m or more"
         )
     darts_m = project_from_bearing(surface, scattered_cap(max(int(dart_count), 1), half, rng))
     place_m = darts_m[optimize.thin(darts_m, config.spacing_m)]

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import StringConfig
 from skysim.scene.sections.leds import LedConfig
@@ -141,9 +141,10 @@ def check_length(length_m: float, turns: float, config: StringConfig) -> None:
     steps = length_m / config.pitch_m * STEPS_PER_PITCH + turns * STEPS_PER_TURN
     if not steps <= MAX_STEPS:
         raise InputError(
-            f"light.layout.pitch: {length_m:.4g} m of tape with an LED every {config.pitch_m:g} m are"
-            f" {length_m / config.pitch_m:.0f} LEDs in {turns:.0f} turns; allowed: up to"
-            f" {MAX_STEPS // STEPS_PER_PITCH}, a larger spacing or pitch"
+            "light.layout.pitch",
+            f"{length_m:.4g} m of tape with an LED every {config.pitch_m:g} m are {length_m / config.pitch_m:.0f}"
+            f" LEDs in {turns:.0f} turns",
+            f"up to {MAX_STEPS // STEPS_PER_PITCH}, a larger spacing or pitch",
         )
 
 

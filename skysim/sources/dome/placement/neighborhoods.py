@@ -24,7 +24,7 @@ def unique_levels(levels: int, nearest: int, position_m: Floats, rng: np.random.
     """(N,) number of the level of each LED at (N, 3) places. Raises InputError if no pattern is found."""
     count = len(position_m)
     if count <= nearest:
-        raise InputError(f"light.layout.unique_neighbors: {nearest} of {count} LEDs; allowed: fewer")
+        raise InputError("light.layout.unique_neighbors", f"{nearest} of {count} LEDs", "fewer")
     around = neighbors(position_m, nearest)
     level = rng.integers(0, levels, count)
     alike = alike_leds(level, around, levels)
@@ -38,8 +38,9 @@ def unique_levels(levels: int, nearest: int, position_m: Floats, rng: np.random.
         if len(after) <= len(alike):
             level, alike = tried, after
     raise InputError(
-        f"light.layout.unique_neighbors: {nearest} with {levels} levels leave some of {count} LEDs alike;"
-        " allowed: more levels or neighbors"
+        "light.layout.unique_neighbors",
+        f"{nearest} with {levels} levels leave some of {count} LEDs alike",
+        "more levels or neighbors",
     )
 
 

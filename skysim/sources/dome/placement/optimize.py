@@ -190,9 +190,10 @@ def optimize_places(
         even.append(sites_m[chosen])
     if not even:
         raise InputError(
-            f"light.layout.spacing: {len(chosen)} of {config.count} LEDs fit {config.spacing_m:.3g} m apart where the"
-            f" field reaches at a tilt of {config.tilt_deg:g} deg; allowed: fewer LEDs, less spacing, or a greater"
-            " cap_deg"
+            "light.layout.spacing",
+            f"{len(chosen)} of {config.count} LEDs fit {config.spacing_m:.3g} m apart where the field reaches at a"
+            f" tilt of {config.tilt_deg:g} deg",
+            "fewer LEDs, less spacing, or a greater cap_deg",
         )
     visible = visible_fraction(config, few_sites_m, rng)
     scorer = PlacementScore(config, options, sample_attitudes(config, options.score_attitudes, rng))

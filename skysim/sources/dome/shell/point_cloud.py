@@ -20,6 +20,7 @@ from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 
+KEY = "light.surface.file"  # names the file of points
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 1e-3, "in": INCH_M}
 POINTS_PER_TERM = 3  # fewer would leave too few degrees of freedom to judge the fit
 MAX_CONDITION = 1e3  # of the fit; points spread evenly over the disk have about 5
@@ -203,9 +204,7 @@ def read(file: str, unit: str) -> Floats:
         if points.shape[1] != 3 or not np.isfinite(points).all():
             raise ValueError("not three finite numbers in each line")
     except (OSError, ValueError) as error:
-        raise InputError(
-            f"light.surface.file: {file}: not a point file ({error}); allowed: a line of names, then lines of x,y,z"
-        ) from None
+        raise InputError(KEY, f"{file}: not a point file ({error})", "a line of names, then lines of x,y,z") from None
     return points * UNIT_M[unit]
 
 
@@ -218,13 +217,13 @@ def fit(points_m: Floats, degree: int, file: str) -> SurfaceFit:
     Raises InputError for too few points, for points in a plane, and if parts of the surface have no points.
     """
     terms = (degree + 1) * (degree + 2) // 2
-    prefix, needed = f"light.surface.file: {file}: ", max(POINTS_PER_TERM * terms, 8)
+    needed = max(POINTS_PER_TERM * terms, 8)
     if len(points_m) < needed:
-        raise InputError(f"{prefix}{len(points_m)} points; allowed: at least {needed} for degree {degree}")
+        raise InputError(KEY, f"{file}: {len(points_m)} points", f"at least {needed} for degree {degree}")
     try:
         sphere = fit_sphere(points_m)
     except ValueError as error:
-        raise InputError(f"{prefix}{error}; allowed: points of a dome (a panel is kind flat)") from None
+        raise InputError(KEY, f"{file}: {error}", "points of a dome (a panel is kind flat)") from None
     relative_m = points_m - sphere.center_m
     radius_m = np.linalg.norm(relative_m, axis=1)
     unit = relative_m / radius_m[:, None]
@@ -238,7 +237,7 @@ def fit(points_m: Floats, degree: int, file: str) -> SurfaceFit:
     # A large ratio of singular values means polynomials that the points do not determine: an area without points.
     if cover_rad < half_rad / 2 or singular[-1] * MAX_CONDITION < singular[0]:
         raise InputError(
-            f"{prefix}parts of the dome have no points; allowed: points all around +z, or a degree below {degree}"
+            KEY, f"{file}: parts of the dome have no points", f"points all around +z, or a degree below {degree}"
         )
     return SurfaceFit(
         sphere.center_m,

@@ -33,19 +33,22 @@ def check_room(room: RoomConfig, surface: Surface, cap_deg: float) -> None:
         top_m, bottom_m = room.bearing_height_m + high_m[2], room.bearing_height_m + low_m[2]
         if room.height_m is not None and top_m > room.height_m:
             raise InputError(
-                f"light.room.height: the dome's top is {top_m:.3f} m above the floor; allowed: {room.height_m:.3f} m,"
-                " the ceiling"
+                "light.room.height",
+                f"the dome's top is {top_m:.3f} m above the floor",
+                f"{room.height_m:.3f} m, the ceiling",
             )
         if bottom_m < 0:
             raise InputError(
-                f"light.room.bearing_height: {room.bearing_height_m:.3f} m puts the dome's rim {-bottom_m:.3f} m below"
-                f" the floor; allowed: {-low_m[2]:.3f} m or more, or a higher rim"
+                "light.room.bearing_height",
+                f"{room.bearing_height_m:.3f} m puts the dome's rim {-bottom_m:.3f} m below the floor",
+                f"{-low_m[2]:.3f} m or more, or a higher rim",
             )
     for axis, (key, limit_m) in enumerate((("width", room.width_m), ("length", room.length_m))):
         if limit_m is not None and high_m[axis] - low_m[axis] > limit_m:
             raise InputError(
-                f"light.room.{key}: the dome is {high_m[axis] - low_m[axis]:.3f} m wide along {'xy'[axis]}; allowed:"
-                f" {limit_m:.3f} m, the room"
+                f"light.room.{key}",
+                f"the dome is {high_m[axis] - low_m[axis]:.3f} m wide along {'xy'[axis]}",
+                f"{limit_m:.3f} m, the room",
             )
     if room.door_m is not None:
         check_door(room, room.door_m, surface, cap_deg)
@@ -78,8 +81,9 @@ def check_door(room: RoomConfig, door_m: tuple[float, float], surface: Surface, 
     sides = " x ".join(f"{side:.3f}" for side in box_m)
     whole = "the shell" if room.segments == 1 else f"a part of the shell in {room.segments} segments"
     raise InputError(
-        f"light.room.door: {whole} is {sides} m; allowed: two of its sides within {door_m[0]:.3f} x {door_m[1]:.3f} m"
-        + (f", or segments: {enough}" if enough else "")
+        "light.room.door",
+        f"{whole} is {sides} m",
+        f"two of its sides within {door_m[0]:.3f} x {door_m[1]:.3f} m" + (f", or segments: {enough}" if enough else ""),
     )
 
 
@@ -137,7 +141,7 @@ def shell_m(room: RoomConfig, surface: Surface, cap_deg: float, azimuth_rad: Flo
         edges.append(find_edges(surface, tilt_rad[inner], tilt_rad[outer], azimuth_rad[column]))
     points_m = np.concatenate([met[np.isfinite(met[:, 0])], *edges])
     if not len(points_m):
-        raise InputError("light.room: the dome has no shell within cap_deg; allowed: a surface over the bearing")
+        raise InputError("light.room", "the dome has no shell within cap_deg", "a surface over the bearing")
     return np.concatenate([points_m, points_m - room.thickness_m * surface.inward(points_m)])
 
 

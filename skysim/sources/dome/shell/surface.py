@@ -383,9 +383,10 @@ def surveyed(config: light.SurveyedSurfaceConfig) -> Surface:
     fit = point_cloud.fit(point_cloud.read(config.file, config.unit), config.degree, config.file)
     if fit.rms_m > config.rms_limit_m:
         raise InputError(
-            f"light.surface.file: {config.file}: the points are {fit.rms_m:.3g} m rms off a smooth surface"
-            f" (worst {fit.max_residual_m:.3g} m); allowed: rms_limit {config.rms_limit_m:g} m, a higher degree,"
-            " another unit"
+            "light.surface.file",
+            f"{config.file}: the points are {fit.rms_m:.3g} m rms off a smooth surface (worst {fit.max_residual_m:.3g}"
+            " m)",
+            f"rms_limit {config.rms_limit_m:g} m, a higher degree, another unit",
         )
     pose = pose_and_rim(config, 0.0)
     # The surface's frame has its origin at the best sphere's center; the scene's tilt and rim refer to the points'.
@@ -394,8 +395,9 @@ def surveyed(config: light.SurveyedSurfaceConfig) -> Surface:
     has_rim = config.rim_height_m is not None or config.rim_deg is not None
     if has_rim and pose["rim"].contains(fit.edge_m()).any():
         raise InputError(
-            f"light.surface: the points of {config.file} do not reach the rim; allowed: a rim within"
-            f" {np.degrees(fit.radius.cover_rad):.2f} deg about their best sphere's center"
+            "light.surface",
+            f"the points of {config.file} do not reach the rim",
+            f"a rim within {np.degrees(fit.radius.cover_rad):.2f} deg about their best sphere's center",
         )
     return Radial(radius=fit.radius, fit=fit, **pose)
 
@@ -418,7 +420,7 @@ def build_surface(config: light.SurfaceConfig) -> Surface:
     if not surface.inside(np.zeros(3)):
         check = "file, unit, offset" if config.kind == "surveyed" else "apex, sizes and offset"
         place = "not below the panel" if isinstance(surface, Plane) else "outside of the dome"
-        raise InputError(f"light.surface: the bearing's center is {place}; check {check}")
+        raise InputError("light.surface", f"the bearing's center is {place}; check {check}")
     if not len(surface.samples_m()):
-        raise InputError("light.surface: no part of it is above the bearing; check rim, width, height, length")
+        raise InputError("light.surface", "no part of it is above the bearing; check rim, width, height, length")
     return surface

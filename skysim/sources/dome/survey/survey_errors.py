@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
 from skysim.scene.sections.tracker import SurveyErrorsConfig
 from skysim.sources.dome.shell.surface import Surface
@@ -113,8 +113,9 @@ def assumed_ellipsoid(surface: Surface, config: SurveyErrorsConfig) -> tuple[Flo
     assumed_axes_m = semi_axes_m + surface_offset_m(surface, surface_seed(config))
     if assumed_axes_m.min() <= 0:
         raise InputError(
-            f"light.surface.error: {surface.survey_sigma_m:g} m makes an ellipsoid of {assumed_axes_m.min():.3g} m;"
-            " allowed: far less than the dome"
+            "light.surface.error",
+            f"{surface.survey_sigma_m:g} m makes an ellipsoid of {assumed_axes_m.min():.3g} m",
+            "far less than the dome",
         )
     if config.instrument is not None:
         center_m = total_station.moved_m(config.instrument, center_m, setup_errors(config))

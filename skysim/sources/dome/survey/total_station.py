@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import ARCSEC_RAD, PPM
 from skysim.core.errors import InputError
-from skysim.core.quantities.tolerance import scaled_errors
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats
 from skysim.scene.sections.tracker import TotalStationConfig
 
@@ -43,7 +43,7 @@ def polar(config: TotalStationConfig, place_m: Floats) -> tuple[Floats, Floats, 
     level_m = np.hypot(sight_m[:, 0], sight_m[:, 1])
     distance_m = np.hypot(level_m, sight_m[:, 2])
     if not np.all(distance_m > 0):
-        raise InputError("tracker.survey.instrument.position: an LED is there; allowed: a place away from the LEDs")
+        raise InputError("tracker.survey.instrument.position", "an LED is there", "a place away from the LEDs")
     return np.arctan2(sight_m[:, 1], sight_m[:, 0]), np.arctan2(level_m, sight_m[:, 2]), distance_m
 
 

@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from skysim.core.constants import HOUR_S, PPM
-from skysim.core.quantities.tolerance import scaled_errors
 from skysim.core.random_streams import LED_CLOCKS, random_stream
+from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import Layout, OnPoints
 from skysim.scene.sections.leds import ClockConfig, DirectConfig, PwmConfig

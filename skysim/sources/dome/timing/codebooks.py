@@ -61,7 +61,7 @@ def codebook(config: Code, count: int) -> Words:
     else:
         words = packed(PLAIN[config.kind], count, config.levels)
     if len(words) < count:
-        raise InputError(f"light.led.code: {count} LEDs; allowed: at most the {len(words)} words of kind {config.kind}")
+        raise InputError("light.led.code", f"{count} LEDs", f"at most the {len(words)} words of kind {config.kind}")
     words.flags.writeable = False
     return words
 

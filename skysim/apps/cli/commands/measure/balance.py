@@ -62,7 +62,7 @@ def balance(
     from skysim.experiments.balance import assumptions, balance_report, observability, procedure
 
     if estimate_only and flights is not None:
-        raise InputError("--flights: has no effect with --estimate-only; allowed: none")
+        raise InputError("--flights", "has no effect with --estimate-only", "none")
     uncertainty = assumptions.parse_uncertainty(inertia_sigma, offset_sigma, wheel_sigma, mount_sigma, tacho_sigma)
     bars = procedure.parse_bars(torque, inertia_bar, offset_bar)
     loaded = load(scene, None, seed, set_)

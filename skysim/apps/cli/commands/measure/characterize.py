@@ -43,7 +43,7 @@ def characterize(
     if frames_to is not None:
         given = {"darks": darks, "flats": flats, "night": night, "out": out}
         if conflict := next((name for name, value in given.items() if value is not None), None):
-            raise InputError(f"--{conflict}: has no effect with --frames-to; allowed: one of the two")
+            raise InputError(f"--{conflict}", "has no effect with --frames-to", "one of the two")
         write_simulated(config, frames_to, seed, json)
         return
     folders = procedure.check_folders(darks, flats)

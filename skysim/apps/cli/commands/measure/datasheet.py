@@ -56,7 +56,7 @@ def datasheet(
     from skysim.experiments.datasheet.statement import numbers, state
 
     if fmu and model is None:
-        raise InputError("--fmu: has no effect without --model; allowed: --model FOLDER --fmu")
+        raise InputError("--fmu", "has no effect without --model", "--model FOLDER --fmu")
     if fmu:
         export.require_fmu_builder()
     loaded = load(scene, None, seed, set_)

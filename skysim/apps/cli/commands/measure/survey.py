@@ -172,17 +172,17 @@ def survey_mode(
     """The mode that the options choose. Raises InputError for options that exclude one another or have no effect."""
     modes = [name for name, on in (("images", images), ("plan", plan), ("repeat", repeat)) if on]
     if len(modes) > 1:
-        raise InputError(f"--{modes[1]}: has no effect with --{modes[0]}; allowed: one of them")
+        raise InputError(f"--{modes[1]}", f"has no effect with --{modes[0]}", "one of them")
     if images is not None and camera is None:
-        raise InputError("--images: no camera; allowed: with --camera FILE, a scene, camera file or OpenCV calibration")
+        raise InputError("--images", "no camera", "with --camera FILE, a scene, camera file or OpenCV calibration")
     if camera is not None and images is None:
-        raise InputError("--camera: has no effect without --images; allowed: the scene's camera is used")
+        raise InputError("--camera", "has no effect without --images", "the scene's camera is used")
     if watch and images is None:
-        raise InputError("--watch: has no effect without --images; allowed: with --images FOLDER")
+        raise InputError("--watch", "has no effect without --images", "with --images FOLDER")
     mode = "watch" if watch else modes[0] if modes else "simulate"
     for name in UNUSED[mode]:
         if name in given:
-            raise InputError(f"--{name}: has no effect with --{mode}; allowed: none")
+            raise InputError(f"--{name}", f"has no effect with --{mode}", "none")
     return mode
 
 
@@ -222,9 +222,9 @@ def repeated(request: Request, repeat: int) -> dict[str, Any]:
     surveys = procedure.repeat_survey(lab, request.uncertainty, plan, repeat)
     results = list(progress(surveys, repeat, "surveys"))
     errors = [one for one in results if isinstance(one, procedure.Errors)]
-    failures = [one for one in results if isinstance(one, str)]
+    failures = [one for one in results if isinstance(one, InputError)]
     if not errors:
-        raise InputError(failures[0])
+        raise failures[0]
     return {
         "scene": request.scene.name,
         "frames": len(plan.shown),
@@ -232,7 +232,7 @@ def repeated(request: Request, repeat: int) -> dict[str, Any]:
         "rows": procedure.comparison(plan, errors),
         "measured": [one.measured for one in errors],
         "false_alarms": sum(one.false_alarms for one in errors),
-        "failures": failures,
+        "failures": [str(one) for one in failures],
     }
 
 
@@ -298,8 +298,8 @@ def followed(request: Request, images: Path, before: CalibrationPrior, stages: S
     watched = WatchedFolder(images, before.camera, stages)
     with suppress(KeyboardInterrupt):
         for news in watched.arrivals(request.frames):
-            for line in news.complaints:
-                print_error(line)
+            for complaint in news.complaints:
+                print_error(str(complaint))
             if news.read and not request.quiet:
                 print_so_far(request, watched.pictures, before, stages)
     return watched.pictures

@@ -35,7 +35,7 @@ def from_angles(scene: Scene, mount: Mount, angles_deg: tuple[float, float, floa
     for name, angle in zip(scoring.angle_names(scene), angles_deg, strict=True):
         low, high = RANGES[name]
         if not (math.isfinite(angle) and low <= angle <= high):
-            raise InputError(f"{name}: {angle:g} deg is not allowed; allowed: {low:g} to {high:g}")
+            raise InputError(name, f"{angle:g} deg is not allowed", f"{low:g} to {high:g}")
     if isinstance(scene.light, StarsConfig):
         return stars.cam_from_icrs(*angles_deg).inv() * mount.cam_from_body
     roll, pitch, yaw = angles_deg
@@ -62,5 +62,5 @@ def within_stop(scene: Scene, lab_from_body: Rotation) -> Rotation:
     vehicle = scene.vehicle
     tilt_deg = float(multibody.tilt_deg(lab_from_body))
     if vehicle.mount == "air_bearing" and tilt_deg > vehicle.tilt_stop_deg:
-        raise InputError(f"tilt of {tilt_deg:.1f} deg: the bearing stops at {vehicle.tilt_stop_deg:g} deg")
+        raise InputError("", f"tilt of {tilt_deg:.1f} deg: the bearing stops at {vehicle.tilt_stop_deg:g} deg")
     return lab_from_body

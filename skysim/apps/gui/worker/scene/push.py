@@ -94,6 +94,6 @@ def pull_torque_nm(grip: Grip | None, lab_from_body: Rotation, inertia_kg_m2: Fl
 def require_vehicle(scene: Scene) -> None:
     """Raise InputError for a scene whose vehicle does not move by dynamics."""
     if isinstance(scene.light, CollimatedDisplayConfig):
-        raise InputError("the camera of this scene is on a bench: there is no vehicle to push")
+        raise InputError("", "the camera of this scene is on a bench: there is no vehicle to push")
     if scene.motion.is_prescribed:
-        raise InputError("the motion of this scene is prescribed: its vehicle cannot be pushed")
+        raise InputError("", "the motion of this scene is prescribed: its vehicle cannot be pushed")

@@ -103,12 +103,13 @@ class Survey:
         rows, holds = frames_at_rest(flight, views)
         if not rows:
             raise InputError(
-                f"survey: the vehicle rests at none of the flight's {holds} holds; allowed: a flight of the survey's"
-                " attitudes with a vehicle that holds them, such as motion.control: prescribed"
+                "survey",
+                f"the vehicle rests at none of the flight's {holds} holds",
+                "a flight of the survey's attitudes with a vehicle that holds them, such as motion.control: prescribed",
             )
         known = {frame.row for frame in self.taken if frame.flown == flight.lab.scene}
         if known >= set(rows):
-            raise InputError("survey: it has the frames of this flight; allowed: a flight of the next attitudes")
+            raise InputError("survey", "it has the frames of this flight", "a flight of the next attitudes")
         settings = tracker_settings.assumed_settings(self.lab.scene)
         camera = onboard_model.assumed_camera(self.lab.scene)
         new = []
@@ -135,7 +136,7 @@ class Survey:
     def map_file(self) -> bytes:
         """The measured LEDs, lever arm and lens as the file for `tracker.map`. Raises InputError if there are none."""
         if self.run is None:
-            raise InputError("the survey has measured no LED yet: fly its attitudes, then adjust")
+            raise InputError("", "the survey has measured no LED yet: fly its attitudes, then adjust")
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "leds.ecsv"
             dome_map_file.write_dome_map(path, adjust.dome_map(self.run.survey, UNCERTAINTY))
@@ -164,7 +165,7 @@ def begin(scene: Scene, frames: int) -> tuple[Survey, SurveyPlan]:
 def allow(frames: int) -> None:
     """Raise InputError for a number of frames that is not allowed."""
     if not 2 <= frames <= MAX_STOPS:
-        raise InputError(f"frames {frames}: allowed: 2 to {MAX_STOPS}")
+        raise InputError("frames", frames, f"2 to {MAX_STOPS}")
 
 
 def tilt_deg(scene: Scene) -> float:

@@ -41,15 +41,15 @@ def si_unit(name: str) -> str:
 
 
 def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
-    """A validator that converts a quantity such as "48 in" to a float in `si_unit`."""
+    """A validator that converts a quantity such as "48 in" to a float in `si_unit`. It raises InputError."""
 
     def parse(value: Any) -> float:
         if not isinstance(value, str):
-            raise ValueError(f"{value!r} has no unit; allowed: a {what} such as {examples}")
+            raise InputError("", f"{value!r} has no unit", f"a {what} such as {examples}")
         try:
             return in_si(value, si_unit)
-        except (TypeError, ValueError) as error:  # astropy's UnitsError is a ValueError
-            raise ValueError(f"{value!r} is not a {what}; allowed: a {what} such as {examples}") from error
+        except InputError as error:
+            raise InputError("", f"{value!r} is not a {what}", f"a {what} such as {examples}") from error
 
     return parse
 
@@ -76,7 +76,7 @@ COMMON_QUANTITY = re.compile(r"([-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?) ?([a-zA-Z][a-z
 
 
 def in_si(value: str, si_unit: str | None = None) -> float:
-    """The value of a quantity such as "48 in" in `si_unit`, or else in SI units. Raises ValueError or TypeError."""
+    """The value of a quantity such as "48 in" in `si_unit`, or else in SI units. Raises InputError."""
     match = COMMON_QUANTITY.fullmatch(value) if len(value) <= MAX_CHARACTERS else None
     if match and (factor := COMMON_UNITS.get(si_unit or "", {}).get(match[2])) is not None:
         return float(match[1]) * factor
@@ -85,18 +85,18 @@ def in_si(value: str, si_unit: str | None = None) -> float:
     # astropy spells it `inch`; scenes write `in`.
     inch = units.def_unit("in", units.imperial.inch)
     if len(value) > MAX_CHARACTERS:
-        raise ValueError(f"{len(value)} characters; allowed: up to {MAX_CHARACTERS}")
+        raise InputError("", f"{len(value)} characters", f"up to {MAX_CHARACTERS}")
     with units.add_enabled_units([inch, units.imperial]):
         try:
             number = units.Quantity(value)
             return float(number.to_value(si_unit) if si_unit else number.si.value)
-        except ArithmeticError as error:  # "3 m(1/0)", "3 m(9e9)"
-            raise ValueError(str(error)) from None
+        except (TypeError, ValueError, ArithmeticError) as error:  # UnitsError is a ValueError; "3 m(1/0)", "3 m(9e9)"
+            raise InputError("", error) from None
 
 
 def finite(value: float) -> float:
     if not math.isfinite(value):
-        raise ValueError(f"{value} is not a finite number")
+        raise InputError("", f"{value} is not a finite number")
     return value
 
 
@@ -124,24 +124,24 @@ NotNegative = Annotated[Number, Field(ge=0)]
 Ascending = Annotated[tuple[Number, ...], Field(min_length=2)]
 
 
-# SI unit, what it is, example, least and greatest value of a quantity on the command line.
-OptionRange = tuple[str, str, str, float, float]
+# SI unit, what it is, example, least and greatest value of a quantity.
+QuantityRange = tuple[str, str, str, float, float]
 
 
-def option_quantities(ranges: Mapping[str, OptionRange], texts: Sequence[str]) -> list[float]:
-    """Quantities of the command line in SI units. Raises InputError for an invalid or out-of-range value.
+def quantities_within(section: str, ranges: Mapping[str, QuantityRange], texts: Sequence[str]) -> list[float]:
+    """Quantities in SI units. Raises InputError for an invalid or out-of-range value.
 
-    ranges : by the option's name with _ for -;  texts : one each, in that order
+    section : of the keys in errors;  ranges : by the name of the quantity;  texts : one each, in that order
     """
     values = []
     for text, (name, (unit, what, example, low, high)) in zip(texts, ranges.items(), strict=True):
-        option = f"--{name.replace('_', '-')}"
+        key = f"{section}.{name}"
         try:
             value = quantity(unit, what, example)(text)
-        except ValueError as error:
-            raise InputError(f"{option}: {error}") from None
+        except InputError as error:
+            raise error.under(key) from None
         if not low <= value <= high:
-            raise InputError(f"{option} {text}: allowed: {low:g} to {high:g}{unit and f' {unit}'}")
+            raise InputError(key, text, f"{low:g} to {high:g}{unit and f' {unit}'}")
         values.append(value)
     return values
 
@@ -159,8 +159,8 @@ class ConfigModel(BaseModel):
 
 
 def check_table(first: Sequence[float], values: Sequence[float], name: str, first_name: str = "angle_deg") -> None:
-    """Raise ValueError unless two columns have equal length and the first, the angle, ascends."""
+    """Raise InputError unless two columns have equal length and the first, the angle, ascends."""
     if len(first) != len(values):
-        raise ValueError(f"{first_name} has {len(first)} numbers, {name} has {len(values)}")
+        raise InputError("", f"{first_name} has {len(first)} numbers, {name} has {len(values)}")
     if any(b <= a for a, b in itertools.pairwise(first)):
-        raise ValueError(f"{first_name} is not strictly ascending")
+        raise InputError("", f"{first_name} is not strictly ascending")

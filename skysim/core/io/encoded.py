@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.io.images import limits, tiff
-from skysim.core.io.images.limits import check_pixels
-from skysim.core.io.images.live import silent_stderr
+from skysim.core.io import decoding, tiff
+from skysim.core.io.decoding import check_pixels, silent_stderr
 
 MAX_DEFLATE_RATIO = 1032  # greatest compression ratio of deflate (zlib's technical details)
 PNG_MAGIC, JPEG_MAGIC, BMP_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"BM"
@@ -40,9 +39,9 @@ def decode_image(path: Path, data: bytes) -> NDArray:
         with silent_stderr():
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise InputError(f"{path}: cannot be decoded: {' '.join(str(error).split())}") from None
+        raise InputError(path, f"cannot be decoded: {error}") from None
     if image is None:
-        raise InputError(f"{path}: cannot be decoded; it may be truncated or not an image")
+        raise InputError(path, "cannot be decoded; it may be truncated or not an image")
     return image
 
 
@@ -54,7 +53,7 @@ def check_encoded_size(path: Path, data: bytes) -> None:
     except Exception:  # of many types, from Pillow or struct, for a truncated or damaged header
         sizes = []
     if not sizes:
-        raise InputError(f"{path}: cannot be decoded; it may be truncated or not an image")
+        raise InputError(path, "cannot be decoded; it may be truncated or not an image")
     for sides, each_bytes in sizes:
         check_pixels(path, *sides, each_bytes=each_bytes)
 
@@ -72,7 +71,7 @@ def png_size(data: bytes) -> Sizes:
     width, height, bits, color = struct.unpack_from(">IIBB", data, 16)
     end = [chunk_end for _, _, chunk_end in png_chunks(data)][-1] + 4  # behind the chunk's checksum
     complete = end <= len(data) and height * (1 + width * bits // 8) <= MAX_DEFLATE_RATIO * len(data)
-    if complete or width * height > limits.MAX_PIXELS:  # the caller reports an excessive size
+    if complete or width * height > decoding.MAX_PIXELS:  # the caller reports an excessive size
         yield (width, height), PNG_SAMPLES.get(color, 4) * max(bits // 8, 1)
 
 
@@ -123,8 +122,9 @@ def check_planes(path: Path, data: bytes) -> None:
     size = tiff.image_size(data) if data.startswith(tiff.MAGICS) else None
     if size and size[2] > 1 and size[3] > 8 and size[4]:
         raise InputError(
-            f"{path}: a TIFF file of separate color planes (PlanarConfiguration 2) of {size[3]} bits; allowed:"
-            " interleaved colors, monochrome, or planes of 8 bits"
+            path,
+            f"a TIFF file of separate color planes (PlanarConfiguration 2) of {size[3]} bits",
+            "interleaved colors, monochrome, or planes of 8 bits",
         )
 
 

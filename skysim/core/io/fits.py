@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.io.guard.process import run_guarded
-from skysim.core.io.images import limits
-from skysim.core.io.images.limits import check_pixels
+from skysim.core.io import decoding
+from skysim.core.io.decoding import check_pixels
+from skysim.core.io.guarded import run_guarded
 
 SUFFIXES = tuple(f"{suffix}{packed}" for packed in ("", ".gz", ".fz") for suffix in (".fits", ".fit", ".fts"))
 MAGIC = b"SIMPLE  ="  # start of every FITS file; a compressed one differs, which astropy would unpack
@@ -84,8 +84,8 @@ def read_fits_image(path: Path) -> FitsImage:
     except InputError:
         raise
     except Exception as error:  # a damaged header makes astropy raise exceptions of many types, KeyError too
-        raise InputError(f"{path}: not a complete FITS file: {' '.join(str(error).split())}") from None
-    raise InputError(f"{path}: a FITS file without an image")
+        raise InputError(path, f"not a complete FITS file: {error}") from None
+    raise InputError(path, "a FITS file without an image")
 
 
 @contextmanager
@@ -108,7 +108,7 @@ def open_fits(path: Path) -> Iterator[BinaryIO]:
         warnings.simplefilter("error", AstropyWarning)  # "file may have been truncated" is one
         if file.read(len(MAGIC)) != MAGIC:
             allowed = "one that begins with SIMPLE" + ("" if packed else ", not compressed")
-            raise InputError(f"{path}: not a complete FITS file; allowed: {allowed}")
+            raise InputError(path, "not a complete FITS file", allowed)
         file.seek(0)
         check_header(path, file)
         yield file
@@ -121,11 +121,11 @@ def unpack(path: Path, file: IO[bytes]) -> None:
         with gzip.open(path) as packed:
             while block := packed.read(GZIP_BLOCK):
                 size += len(block)
-                if size > limits.MAX_BYTES:
-                    raise InputError(f"{path}: more than {limits.MAX_BYTES} bytes when unpacked; allowed: no more")
+                if size > decoding.MAX_BYTES:
+                    raise InputError(path, f"more than {decoding.MAX_BYTES} bytes when unpacked", "no more")
                 file.write(block)
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-        raise InputError(f"{path}: not a complete gzip file: {error}") from None
+        raise InputError(path, f"not a complete gzip file: {error}") from None
     file.flush()
 
 
@@ -142,16 +142,16 @@ def check_header(path: Path, file: BinaryIO, start: int = 0) -> None:
         if not card or card.rstrip() == b"END":
             break
         if (hit := AXES.match(card)) and int(hit[1]) > MAX_AXES:
-            raise InputError(f"{path}: NAXIS {int(hit[1])}; allowed: up to {MAX_AXES} axes")
+            raise InputError(path, f"NAXIS {int(hit[1])}", f"up to {MAX_AXES} axes")
     else:
-        raise InputError(f"{path}: a header of more than {MAX_CARDS} lines; allowed: up to {MAX_CARDS}")
+        raise InputError(path, f"a header of more than {MAX_CARDS} lines", f"up to {MAX_CARDS}")
     file.seek(before)
 
 
 def check_hdu(path: Path, hdu: Any) -> None:
     """Raise InputError for too large a size by the header, before the data is read or skipped."""
     if (columns := hdu.header.get("TFIELDS", 0)) > MAX_COLUMNS:
-        raise InputError(f"{path}: TFIELDS {columns}; allowed: up to {MAX_COLUMNS} columns")
+        raise InputError(path, f"TFIELDS {columns}", f"up to {MAX_COLUMNS} columns")
     if hdu.header.get("ZIMAGE"):
         sides = (int(hdu.header[f"ZNAXIS{n}"]) for n in range(hdu.header["ZNAXIS"], 0, -1))
         check_pixels(path, *sides, each_bytes=abs(int(hdu.header.get("ZBITPIX", 8))) // 8)
@@ -165,10 +165,10 @@ def decode_tiles(path: Path, file: BinaryIO, number: int) -> NDArray:
     """The pixels of a compressed image, the HDU of this number. Raises InputError with one line."""
     with tempfile.TemporaryDirectory(prefix="skysim-") as folder:
         out = Path(folder) / "pixels.npy"
-        script = Path(__file__).parents[1] / "guard/fits_tiles.py"
+        script = Path(__file__).with_name("fits_tiles.py")
         arguments = file.name, str(number), str(out)
         if fault := run_guarded(script, *arguments, cpu_s=TILES_CPU_S, memory_bytes=TILES_BYTES):
-            raise InputError(f"{path}: not a complete FITS file: {fault}")
+            raise InputError(path, f"not a complete FITS file: {fault}")
         return np.asarray(np.load(out))
 
 
@@ -185,7 +185,7 @@ def channels_last(path: Path, pixels: NDArray) -> NDArray:
     if pixels.ndim == 3 and pixels.shape[2] == 3:
         return np.ascontiguousarray(pixels[:, :, ::-1])
     if pixels.ndim != 2:
-        raise InputError(f"{path}: a FITS image of shape {shape}; allowed: (H, W), color (3, H, W) and (H, W, 3)")
+        raise InputError(path, f"a FITS image of shape {shape}", "(H, W), color (3, H, W) and (H, W, 3)")
     return pixels
 
 

@@ -1,4 +1,4 @@
-"""Script for `core.io.guard.process`: decode a compressed FITS image. Wrong sizes make the decoder overrun memory.
+"""Script for `core.io.guarded`: decode a compressed FITS image. Wrong sizes make the decoder overrun memory.
 
 Arguments: the file, the number of the image's HDU, and the .npy file to write.
 """

@@ -21,8 +21,9 @@ import numpy as np
 from pydantic import BeforeValidator, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, core_schema
 
-from skysim.core.quantities.units import ConfigModel, Length, Number, Time
+from skysim.core.errors import InputError
 from skysim.core.types import Floats
+from skysim.core.units import ConfigModel, Length, Number, Time
 
 SIGMAS_OF_TOLERANCE = 3.0  # of a truncated normal distribution whose sigma is not given: 99.73 % (GUM 4.3.9, note 2)
 
@@ -104,13 +105,13 @@ class ToleranceConfig(ConfigModel):
     def check_distribution(self) -> Self:
         half_width, sigma = self.numbers()
         if half_width is None and (sigma is None or self.distribution not in (None, "normal")):
-            raise ValueError(f"{self.distribution or 'an error'} requires a tolerance; allowed: tolerance, or sigma")
+            raise InputError("", f"{self.distribution or 'an error'} requires a tolerance", "tolerance, or sigma")
         if half_width is not None and self.distribution == "normal":
-            raise ValueError("tolerance: a normal distribution has none; allowed: uniform, truncated_normal")
+            raise InputError("tolerance", "a normal distribution has none", "uniform, truncated_normal")
         if half_width is not None and sigma is not None and self.distribution != "truncated_normal":
-            raise ValueError("sigma: a uniform distribution has none; allowed: distribution: truncated_normal")
+            raise InputError("sigma", "a uniform distribution has none", "distribution: truncated_normal")
         if half_width is not None and sigma is not None and not 0.01 <= half_width / sigma <= 100:
-            raise ValueError("sigma: allowed: a hundredth to a hundred times the tolerance")
+            raise InputError("sigma", "", "a hundredth to a hundred times the tolerance")
         return self
 
     def error(self) -> float:

@@ -1,7 +1,12 @@
-"""Read any image file, as stored or as a person sees it."""
+"""Image files (FITS, PNG, TIFF, JPEG, BMP) and frames of a live camera, read with limits on their size.
+
+A few bytes of a damaged or hostile file can declare an image that exceeds the memory. The declared size is therefore
+read from the header, and checked, before astropy (`fits`) or OpenCV (`encoded`) decodes the file.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.io.images import encoded, fits
-from skysim.core.io.images.limits import check_bytes
+from skysim.core.io import encoded, fits
+from skysim.core.io.decoding import check_bytes, silent_opencv
 
 IMAGE_SUFFIXES = (*fits.SUFFIXES, *encoded.SUFFIXES)
 LUMINANCE = {"blue": 0.114, "green": 0.587, "red": 0.299}  # ITU-R BT.601, in OpenCV's order
@@ -73,16 +78,16 @@ def image_suffix(name: str) -> str:
 def check_name(path: Path) -> None:
     """Raise InputError for a missing or too large file, and for one with the suffix of no known format."""
     if not path.is_file():
-        raise InputError(f"{path}: no such file")
+        raise InputError(path, "no such file")
     if not image_suffix(path.name):
-        raise InputError(f"{path}: unknown image suffix; allowed: {', '.join(IMAGE_SUFFIXES)}")
+        raise InputError(path, "unknown image suffix", ", ".join(IMAGE_SUFFIXES))
     check_bytes(path)
 
 
 def check_numbers(path: Path, pixels: NDArray) -> NDArray:
     """The pixels. Raises InputError unless they are real numbers."""
     if pixels.dtype.kind not in "uif":
-        raise InputError(f"{path}: pixels of type {pixels.dtype}; allowed: integers and floats")
+        raise InputError(path, f"pixels of type {pixels.dtype}", "integers and floats")
     return pixels
 
 
@@ -96,7 +101,7 @@ def monochrome(image: NDArray) -> NDArray:
     if image.ndim == 2:
         return image
     if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
-        raise InputError(f"an image of shape {image.shape}; allowed: (height, width) and color with 3 or 4 channels")
+        raise InputError("", f"an image of shape {image.shape}", "(height, width) and color with 3 or 4 channels")
     if image.shape[2] == 1:
         return np.ascontiguousarray(image[:, :, 0])
     if image.dtype in (np.uint8, np.uint16, np.float32):
@@ -105,3 +110,34 @@ def monochrome(image: NDArray) -> NDArray:
     for n, weight in enumerate(LUMINANCE.values()):
         gray += weight * image[:, :, n]
     return gray
+
+
+class LiveCamera:
+    """An open camera or video stream, read frame by frame."""
+
+    def __init__(self, source: str) -> None:
+        self.source, self.frame_count = source, 0
+        with silent_opencv():
+            self.capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
+            self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest frame, not a buffered one
+
+    def frame(self) -> NDArray:
+        """The next frame, (H, W) or (H, W, 3). Raises InputError if there is none."""
+        with silent_opencv():
+            ok, frame = self.capture.read()
+        if not ok or frame is None:
+            if self.frame_count:
+                raise InputError(self.source, f"ends after {self.frame_count} frames")
+            raise InputError(self.source, "no camera found", "an index such as 0, a video file, a URL")
+        self.frame_count += 1
+        return np.asarray(frame)
+
+    def close(self) -> None:
+        """Release the camera."""
+        self.capture.release()
+
+
+def grab_frame(source: str) -> NDArray:
+    """One frame of a camera, (H, W) or (H, W, 3). Raises InputError if there is none."""
+    with contextlib.closing(LiveCamera(source)) as camera:
+        return camera.frame()

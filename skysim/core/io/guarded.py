@@ -1,6 +1,6 @@
 """Run a script on an untrusted file in a child process with limits: libraries in C may crash, hang or fill memory.
 
-The child is `python -m skysim.core.io.guard.process CPU_S MEMORY_BYTES SCRIPT ARGUMENTS`. It imports this module, then
+The child is `python -m skysim.core.io.guarded CPU_S MEMORY_BYTES SCRIPT ARGUMENTS`. It imports this module, then
 the script as a file, without the packages that contain it.
 """
 

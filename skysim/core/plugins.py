@@ -1,7 +1,8 @@
-"""Run a program that a user brings: started once, it answers each message on standard input with a line of JSON.
+"""Code that users bring: star trackers and controllers, as an entry point of a package or as a program behind a pipe.
 
-The program leads its own process group, which is killed when the program ends, when skysim ends, or after a timeout.
-External trackers and controllers both run so.
+`PluginKind` knows the names. A `Program` is started once and answers each message on standard input with a line of
+JSON; it leads its own process group, which is killed when the program ends, when skysim ends, or after a timeout. An
+entry point runs in a process of its own too, where `serve` answers; what it prints goes to standard error.
 """
 
 from __future__ import annotations
@@ -19,13 +20,17 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import metadata
 from multiprocessing.util import Finalize
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
-from skysim.core.errors import InputError, printable
+import numpy as np
+
+from skysim.core.errors import InputError, printable, unknown_name
+from skysim.core.types import Floats
 
 START_LIMIT_S = 120.0  # for the program to report ready
 GRACE_S = 1.0  # for the program to exit after its input is closed
@@ -34,6 +39,61 @@ MAX_STATUS_CHARS = 300  # characters of a status
 CHUNK_BYTES = 1 << 20
 QUOTED_LINES = 3  # of standard error that an error message quotes
 FOLDER = re.compile(r"\{folder(?::(\w+))?\}")
+
+Respond = Callable[[dict[str, Any], IO[bytes]], dict[str, Any]]  # a message's header and what follows it, to an answer
+
+
+class PluginKind(NamedTuple):
+    """A kind of plug-in.
+
+    kind  : what it is, for messages
+    group : group of the entry points
+    key   : key of the scene that names one
+    own   : names of skysim's own, which no plug-in may take
+    """
+
+    kind: str
+    group: str
+    key: str
+    own: tuple[str, ...]
+
+    def entry_points(self) -> dict[str, metadata.EntryPoint]:
+        """The plug-ins of installed packages by name; none is loaded."""
+        return {point.name: point for point in metadata.entry_points(group=self.group) if point.name not in self.own}
+
+    def release(self, name: str) -> str:
+        """Name and version of the package that offers a plug-in; empty for skysim's own and for programs."""
+        point = self.entry_points().get(name) if name not in self.own else None
+        return f"{point.dist.name} {point.dist.version}" if point and point.dist else ""
+
+    def check_name(self, name: str, commands: Mapping[str, str]) -> None:
+        """Raise InputError for an unknown name; commands are those of programs, by name."""
+        allowed = [*self.own, *self.entry_points(), *commands]
+        if name not in allowed:
+            problem, names = unknown_name(self.kind, name, allowed)
+            raise InputError(self.key, problem, f"{names}, or a program as {name}=COMMAND")
+
+
+def to_lists(value: Any) -> Any:
+    """Convert arrays to lists, in mappings and sequences at any depth."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {name: to_lists(inner) for name, inner in value.items()}
+    return [to_lists(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
+def finite_array(value: Any, name: str, shape: tuple[int, ...]) -> Floats:
+    """An array of finite numbers of the given shape. Raises ValueError."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name} is not an array of numbers") from None
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}; allowed: {shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} has a value that is not finite")
+    return array
 
 
 class ProgramError(Exception):
@@ -115,7 +175,7 @@ class Program:
         try:
             self.start()
         except ProgramError as error:
-            raise InputError(f"{key}: {name}: {error}") from None
+            raise InputError(key, f"{name}: {error}") from None
 
     def start(self) -> None:
         """Start the process and wait until it is ready. Raises ProgramError."""
@@ -210,9 +270,36 @@ class Program:
 
 
 def host_command(module: str, name: str) -> tuple[list[str], dict[str, str]]:
-    """Command and environment of a Python process that hosts the plug-in `name` (see `host.serve`).
+    """Command and environment of a Python process that hosts the plug-in `name` (see `serve`).
 
     The child gets this process's import path, so that it finds the same entry points.
     """
     path = os.pathsep.join(folder or os.getcwd() for folder in sys.path)
     return [sys.executable, "-m", module, name], {**os.environ, "PYTHONPATH": path}
+
+
+def describe_error(error: Exception) -> str:
+    """An exception as one line."""
+    return printable(f"{type(error).__name__}: {error}")
+
+
+def serve(create: Callable[[dict[str, Any]], Respond]) -> None:
+    """Set up the plug-in from the first line of the input, then answer each message until the input ends.
+
+    create(setup) : returns the function that answers; an exception becomes {"ready": false, "status": reason}
+    """
+    messages, answers = sys.stdin.buffer, os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+
+    def send(reply: dict[str, Any]) -> None:
+        answers.write(json.dumps(reply) + "\n")
+        answers.flush()
+
+    try:
+        respond = create(json.loads(messages.readline()))
+    except Exception as error:
+        send({"ready": False, "status": describe_error(error)})
+        return
+    send({"ready": True})
+    while line := messages.readline():
+        send(respond(json.loads(line), messages))

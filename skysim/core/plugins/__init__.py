@@ -1,1 +1,0 @@
-"""Code that users bring, as a package's entry point or as a program behind a pipe: star trackers and controllers."""

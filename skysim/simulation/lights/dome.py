@@ -1,0 +1,88 @@
+"""Lights in a laboratory: the LEDs of a dome, a panel's pixels in their place, and a display behind a collimator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+from skysim.camera.glow.display_glow import black_glow
+from skysim.camera.render import Window
+from skysim.camera.thermal import leds_at
+from skysim.core.types import Sources
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene.sections.thermal import ThermalConfig
+from skysim.simulation.lights.light import EdgedGlow, Exposure, KnownLight, Lit
+from skysim.sources.dome.led import warm_up_factor
+from skysim.sources.dome.timing.clocks import Clocks, build_clocks
+from skysim.sources.dome.timing.codes import LedCodes, build_codes
+
+MAX_RUNS = 4  # whose timing is kept
+
+
+class LedTiming(NamedTuple):
+    """The LEDs' timing in one run.
+
+    clocks : the controllers' oscillators; None where all light is steady
+    codes  : the LEDs' words and the clock of their bits; None without light.led.code
+    """
+
+    clocks: Clocks | None
+    codes: LedCodes | None
+
+
+@dataclass(frozen=True)
+class LedDome(KnownLight):
+    """A dome's LEDs: warmed up, moved by the temperature, and lit by their controllers' pulses and codes.
+
+    thermal : what has moved since the survey; None for nothing
+    """
+
+    config: DomeConfig
+    thermal: ThermalConfig | None
+    _timing: dict[int, LedTiming] = field(init=False, repr=False, default_factory=dict)
+
+    def during(self, exposure: Exposure) -> Lit:
+        """The LEDs and the light of black pixels; with no seed the LEDs are lit for their share of the time."""
+        left = warm_up_factor(self.config.led.warm_up, exposure.t_s)
+        leds = self.sources
+        if left < 1:
+            leds = replace(leds, strength=left * leds.strength)
+        if self.thermal is not None:
+            leds = leds_at(self.thermal, leds, exposure.t_s)
+        if exposure.seeds is not None:
+            leds = self.pulsed(leds, exposure.seeds.run, exposure.index, exposure.window, exposure.t_s)
+        return Lit("LEDs", True, leds, self.emitter, edged=black_pixels(self.config, exposure, left))
+
+    def pulsed(self, leds: Sources, seed: int, index: int, window: Window, middle_s: float) -> Sources:
+        """The LEDs with their pulses and codes in a frame of the run of a seed; middle_s : mid-exposure."""
+        timing = self.timing(seed)
+        if timing.clocks:
+            leds = timing.clocks.lights_at(leds, middle_s, window.exposure_s)
+        if timing.codes:
+            leds = timing.codes.shown(leds, window.open_s, window.exposure_s, index)
+        return leds
+
+    def timing(self, seed: int) -> LedTiming:
+        """The timing in the run of a seed, which is drawn once."""
+        if seed not in self._timing:
+            while len(self._timing) >= MAX_RUNS:
+                self._timing.pop(next(iter(self._timing)))
+            clocks = build_clocks(self.config, self.sources, seed)
+            self._timing[seed] = LedTiming(clocks, build_codes(self.config, self.sources, seed))
+        return self._timing[seed]
+
+
+@dataclass(frozen=True)
+class CollimatedDisplay(KnownLight):
+    """The stars of a star simulator's display, and the light of its black pixels."""
+
+    config: CollimatedDisplayConfig
+
+    def during(self, exposure: Exposure) -> Lit:
+        return Lit("stars", True, self.sources, self.emitter, edged=black_pixels(self.config, exposure))
+
+
+def black_pixels(config: DomeConfig | CollimatedDisplayConfig, exposure: Exposure, share: float = 1.0) -> EdgedGlow:
+    """The light of a display's black pixels; none without a display, or if its black is dark."""
+    optics, cam_from_lab, camera_m = exposure.optics, exposure.cam_from_lab, exposure.camera_m
+    return EdgedGlow(lambda: black_glow(config, optics, cam_from_lab, camera_m, exposure.band), share)

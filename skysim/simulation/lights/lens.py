@@ -1,0 +1,93 @@
+"""What the lens and its baffle make of the light: light from beside the field, ghosts, and veiling glare."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from skysim.camera.discs.bodies import centers_of
+from skysim.camera.glow.baffle import stray_around_e_s_m2, stray_of_bodies_e_s_m2
+from skysim.camera.stray.ghosts import ghost_optics
+from skysim.scene.sections.camera import BaffleConfig, GhostConfig, GlareConfig
+from skysim.simulation.lights.light import Beam, Exposure, Light, Lit, Path, beam_of
+from skysim.simulation.lights.plan import Plan
+from skysim.sources.solar_system.bodies import BodyLight
+
+STRAY_LIGHT = "stray light"
+
+
+@dataclass(frozen=True)
+class Baffle(Light):
+    """Light past the baffle: of all bodies that nothing hides, and of the Earth, even over the chip."""
+
+    only_adds: ClassVar[bool] = True
+    config: BaffleConfig
+
+    def through(self, beam: Beam, exposure: Exposure) -> Beam:
+        return beam.plus(Lit(STRAY_LIGHT, glow=lambda: float(sum(self.stray_e_s(beam, exposure).values()))))
+
+    def stray_e_s(self, beam: Beam, exposure: Exposure) -> dict[str, float]:
+        """Electrons s^-1 px^-1 by the name of the body that sends them."""
+        bodies = [disc for lit in beam.lits for disc in visible_discs(lit)]
+        found = stray_of_bodies_e_s_m2(self.config, bodies, exposure.boresight)
+        for lit in beam.lits:
+            if lit.around is not None:
+                found[lit.name] = stray_around_e_s_m2(self.config, *lit.around(), exposure.boresight)
+        pixel_m2 = exposure.optics.camera.pixel_m**2
+        return {name: light * pixel_m2 for name, light in found.items()}
+
+
+def visible_discs(lit: Lit) -> Iterator[BodyLight]:
+    """The discs of a light whose centers nothing hides."""
+    occludes = lit.occlusion
+    hidden = occludes(centers_of(lit.discs).place) if occludes else np.zeros(len(lit.discs), bool)
+    return itertools.compress(lit.discs, ~hidden)
+
+
+def stray_e_s(lights: Sequence[Light], exposure: Exposure) -> dict[str, float]:
+    """Electrons s^-1 px^-1 that each body, and the Earth, sends past the baffle; empty without a baffle."""
+    for n, light in enumerate(lights):
+        if isinstance(light, Baffle):
+            return light.stray_e_s(beam_of(lights[:n], exposure), exposure)
+    return {}
+
+
+@dataclass(frozen=True)
+class Ghosts(Light):
+    """Pairs of surfaces of the lens by which light reaches the chip a second time."""
+
+    only_adds: ClassVar[bool] = True
+    ghosts: tuple[GhostConfig, ...]
+
+    def through(self, beam: Beam, exposure: Exposure) -> Beam:
+        paths = (Path(n, ghost_optics(exposure.optics, ghost)) for n, ghost in enumerate(self.ghosts, 1))
+        return beam._replace(paths=(*beam.paths, *paths))
+
+
+@dataclass(frozen=True)
+class Glare(Light):
+    """Light that the lens scatters over the chip."""
+
+    only_adds: ClassVar[bool] = True
+    config: GlareConfig
+
+    def through(self, beam: Beam, exposure: Exposure) -> Beam:
+        return beam._replace(glares=(*beam.glares, self.config))
+
+
+def build_baffle(plan: Plan) -> Iterator[Light]:
+    baffle = plan.scene.camera.baffle
+    if baffle:
+        yield Baffle(baffle)
+
+
+def build(plan: Plan) -> Iterator[Light]:
+    camera = plan.scene.camera
+    if camera.ghosts:
+        yield Ghosts(camera.ghosts)
+    if camera.glare:
+        yield Glare(camera.glare)

@@ -1,0 +1,57 @@
+"""All kinds of lights in the order in which their light is gathered, and the kinds that programs add.
+
+An entry of `LIGHTS` makes none, one or more lights from a `Plan`. Something hides what comes before it, air, wall and
+lens change what comes before them, and lights are drawn in this order. Kinds of the scene's list `lights` are added by
+`register`, from any module that is imported, or from an installed package by an entry point of the group
+`skysim.lights` (see scene/sections/lights.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from typing import Any
+
+from skysim.scene.sections.lights import LightConfig, add_kind
+from skysim.simulation.lights import air, background, earth, lens, obstacles, satellites, solar_system, wall
+from skysim.simulation.lights.known import known_light
+from skysim.simulation.lights.light import Light
+from skysim.simulation.lights.plan import Plan
+
+KINDS: dict[str, Callable[[Any, Plan], Light]] = {}
+
+
+def register(config: type[LightConfig], build: Callable[[Any, Plan], Light]) -> None:
+    """Add a kind of light to those of the scene's list `lights`.
+
+    config : the schema of its section, with a literal `kind`
+    build  : makes the light of such a section
+    """
+    KINDS[add_kind(config)] = build
+
+
+def further_lights(plan: Plan) -> Iterator[Light]:
+    """The lights of the scene's list `lights`."""
+    for config in plan.scene.lights:
+        yield KINDS[config.kind](config, plan)
+
+
+LIGHTS: dict[str, Callable[[Plan], Iterable[Light]]] = {
+    "background": background.build,
+    "stars, LEDs or a display": lambda plan: [known_light(plan)],
+    "Sun, Moon and planets": solar_system.build,
+    "Earth": earth.build,
+    "satellites": satellites.build,
+    "air": air.build,
+    "further lights": further_lights,
+    "wall": wall.build,
+    "baffle": lens.build_baffle,
+    "vehicle and dome": obstacles.build,
+    "lens": lens.build,
+}
+
+
+def build_lights(plan: Plan) -> tuple[Light, ...]:
+    """All lights of a camera. Raises InputError for files that cannot be read and for a dome that does not fit."""
+    plan = replace(plan, known=known_light(plan))
+    return tuple(light for build in LIGHTS.values() for light in build(plan))
