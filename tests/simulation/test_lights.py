@@ -11,8 +11,8 @@ import pytest
 from pydantic import Field
 
 from skysim.core.errors import InputError
-from skysim.core.quantities.units import Intensity, Length, Number, Time
 from skysim.core.types import Sources
+from skysim.core.units import Intensity, Length, Number, Time
 from skysim.scene import loader
 from skysim.scene.sections import lights as schema
 from skysim.scene.sections.leds import CosineLobeConfig
