@@ -18,24 +18,26 @@ from skysim.apps.gui.shared.texts import for_page
 from skysim.apps.gui.views import overlay
 from skysim.apps.gui.worker.study_process import MAX_STUDIES, StudyProcess
 from skysim.apps.gui.worker.workbench import Workbench
-from skysim.core.errors import InputError
+from skysim.core.errors import OVERRIDES, InputError, Where
 
 pytest_plugins = ["labpage"]
 in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
 
 
 @pytest.mark.parametrize(
-    ("told", "shown"),
+    ("error", "shown"),
     [
-        ("camera.f_number: allowed: above 0 (--set)", "camera.f_number: allowed: above 0"),
-        ("out: contains another study; allowed: another --out", "out: contains another study; allowed: a study of "),
-        ("--fov 200: allowed: 2 to 120", "the field of view 200: allowed: 2 to 120"),
-        ("the camera's 12 bits, as --camera has them", "the camera's 12 bits, as camera has them"),
+        (InputError("camera.f_number", -1, "above 0", OVERRIDES), "camera.f_number: -1; allowed: above 0"),
+        (InputError("solve.fov_deg", 200, "2 to 120"), "the field of view: 200; allowed: 2 to 120"),
+        (
+            InputError("light.kind", "moon", "stars", Where("x.yaml", 3)),
+            "light.kind: moon; allowed: stars (x.yaml, line 3)",
+        ),
     ],
 )
-def test_a_message_names_no_option_of_the_command_line(told: str, shown: str) -> None:
-    assert for_page(told).startswith(shown)
-    assert "--" not in for_page(told)
+def test_an_error_has_its_field_s_label_and_a_place_if_it_is_of_a_file(error: InputError, shown: str) -> None:
+    """A value that was typed in the page has no place."""
+    assert for_page(error) == shown
 
 
 def test_actions_are_found_by_their_words_in_any_order() -> None:
