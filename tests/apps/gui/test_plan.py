@@ -219,7 +219,7 @@ def test_a_survey_that_determines_nothing_says_so() -> None:
 
 
 def test_a_plan_needs_two_frames() -> None:
-    with pytest.raises(InputError, match="frames 1: allowed: 2 to"):
+    with pytest.raises(InputError, match="frames: 1; allowed: 2 to"):
         survey.begin(loader.load("afit_simsat"), 1)
 
 

@@ -11,31 +11,36 @@ from labpage import CHROMIUM, NARROW, WIDE, Server, changed, come, onto_the_page
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
+from skysim.apps.cli.option_names import OPTIONS
 from skysim.apps.gui.page.actions import Command, matching
 from skysim.apps.gui.page.tab import PANELS
 from skysim.apps.gui.shared import style
-from skysim.apps.gui.shared.texts import for_page
+from skysim.apps.gui.shared.texts import LABELS, for_page
 from skysim.apps.gui.views import overlay
 from skysim.apps.gui.worker.study_process import MAX_STUDIES, StudyProcess
 from skysim.apps.gui.worker.workbench import Workbench
-from skysim.core.errors import InputError
+from skysim.core.errors import OVERRIDES, InputError, Where
 
 pytest_plugins = ["labpage"]
 in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
 
 
 @pytest.mark.parametrize(
-    ("told", "shown"),
+    ("error", "shown"),
     [
-        ("camera.f_number: allowed: above 0 (--set)", "camera.f_number: allowed: above 0"),
-        ("out: contains another study; allowed: another --out", "out: contains another study; allowed: a study of "),
-        ("--fov 200: allowed: 2 to 120", "the field of view 200: allowed: 2 to 120"),
-        ("the camera's 12 bits, as --camera has them", "the camera's 12 bits, as camera has them"),
+        (InputError("camera.f_number", "", "above 0", OVERRIDES), "camera.f_number: allowed: above 0"),
+        (InputError("seed", "-1", "", Where("x.yaml", 3)), "seed: -1 (x.yaml, line 3)"),
+        (InputError("solve.fov_deg", "200", "2 to 120"), "the field of view: 200; allowed: 2 to 120"),
+        (InputError("survey.tilt_deg", "95", "to 30"), "the tilt: 95; allowed: to 30"),
+        (InputError("", "no frame has been rendered"), "no frame has been rendered"),
     ],
 )
-def test_a_message_names_no_option_of_the_command_line(told: str, shown: str) -> None:
-    assert for_page(told).startswith(shown)
-    assert "--" not in for_page(told)
+def test_an_error_names_the_field_of_the_page(error: InputError, shown: str) -> None:
+    assert for_page(error) == shown
+
+
+def test_every_parameter_of_a_photo_has_a_label() -> None:
+    assert {key for key in OPTIONS if key.startswith("solve.")} <= LABELS.keys()
 
 
 def test_actions_are_found_by_their_words_in_any_order() -> None:
