@@ -96,27 +96,19 @@ def print_check(facts: Sequence[Fact], findings: Sequence[str]) -> None:
 
 def print_scores(lines: list[TrackerScore], folder: Path) -> None:
     """Print the scoreboard of a comparison, and the reasons for unsolved frames."""
-    shares = ["frames", "right %", "(95 %)", "wrong", "refused", "failed"]
-    errors = ["cross ″", "worst ″", "roll ″", "worst ″", "ms", "95 % ms"]
-    columns = [Column("tracker", kind="text"), *map(Column, shares), *map(Column, errors)]
-    rows = [
-        [
-            line.tracker,
-            line.frames,
-            f"{100 * line.right.value:.1f}",
-            f"{100 * line.right.low:.1f} to {100 * line.right.high:.1f}",
-            Cell(str(line.wrong), "bad" if line.wrong else ""),
-            line.refused,
-            line.failed,
-            *(f"{value:.3g}" for value in (line.cross_arcsec_median, line.cross_arcsec_worst)),
-            *(f"{value:.3g}" for value in (line.roll_arcsec_median, line.roll_arcsec_worst)),
-            *(f"{value:.3g}" for value in (line.time_ms_median, line.time_ms_p95)),
-        ]
-        for line in lines
-    ]
-    print_table(
-        Table(columns, rows, optional=((12,), (11,), (3,), (10,), (8,)))
-    )  # the times, the interval, the worst errors
+    columns = [Column("tracker", kind="text"), Column("frames"), Column("right", "%", ".1f"), Column("(95 %)")]
+    columns += [Column("wrong"), Column("refused"), Column("failed")]
+    columns += [Column(head, "″", ".3g") for head in ("cross", "worst", "roll", "worst")]
+    columns += [Column("ms", format=".3g"), Column("95 % ms", format=".3g")]
+    rows = []
+    for line in lines:
+        interval = f"{100 * line.right.low:.1f} to {100 * line.right.high:.1f}"
+        wrong = Cell(str(line.wrong), "bad" if line.wrong else "")
+        outcomes = [line.tracker, line.frames, 100 * line.right.value, interval, wrong, line.refused, line.failed]
+        errors = [line.cross_arcsec_median, line.cross_arcsec_worst, line.roll_arcsec_median, line.roll_arcsec_worst]
+        rows.append([*outcomes, *errors, line.time_ms_median, line.time_ms_p95])
+    left_out = ((12,), (11,), (3,), (10,), (8,))  # the times, the interval, the worst errors
+    print_table(Table(columns, rows, optional=left_out))
     for line in lines:
         for status, count in line.refusals.items():
             print(f"{line.tracker}: {count} × {status}")
@@ -124,23 +116,13 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
 
 
 def print_solutions(solutions: list[dict[str, Any]], out: Path) -> None:
-    columns = [
-        Column("file", kind="text"),
-        Column("status", kind="text"),
-        *(Column(name, "°", ".4f") for name in ("RA", "Dec", "roll", "fov")),
-        Column("stars"),
-        Column("rms", "″", ".1f"),
-        Column("ms", format=".0f"),
-    ]
-    rows = [
-        [
-            one["file"],
-            one["status"] if one["time_ms"] is not None else "bad input",
-            *(one[key] for key in ("ra_deg", "dec_deg", "roll_deg", "fov_deg", "matches", "rms_arcsec", "time_ms")),
-        ]
-        for one in solutions
-    ]
-    print_table(Table(columns, rows))
+    columns = [Column("file", kind="text"), Column("status", kind="text")]
+    columns += [Column(name, "°", ".4f") for name in ("RA", "Dec", "roll", "fov")]
+    columns += [Column("stars"), Column("rms", "″", ".1f"), Column("ms", format=".0f")]
+    keys = ("ra_deg", "dec_deg", "roll_deg", "fov_deg", "matches", "rms_arcsec", "time_ms")
+    statuses = [one["status"] if one["time_ms"] is not None else "bad input" for one in solutions]
+    found = zip(solutions, statuses, strict=True)
+    print_table(Table(columns, [[one["file"], status, *(one[key] for key in keys)] for one, status in found]))
     for solution in solutions:
         print_remarks(solution)
     print(f"annotated images and solutions.json in {out}")

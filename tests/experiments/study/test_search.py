@@ -26,7 +26,7 @@ from skysim.experiments.study.report.study_report import front_table
 from skysim.results.files.builder.parts import parts_list
 from skysim.results.files.builder.prices import find_prices, read_prices
 from skysim.results.metrics import Summary
-from skysim.results.report.as_text import print_blocks
+from skysim.results.report import Report
 from skysim.scene import loader as scene_loader
 
 pytest.importorskip("optuna")
@@ -402,12 +402,12 @@ def test_the_terminal_s_front_has_levels_error_and_cost(tmp_path: Path, capsys: 
     heads, cells = search.front_cells(study, result)
     assert heads == ["candidate", "x", "y", "angle_arcsec_median", "cost"]
     assert cells == [["1", "0.25", "0.5", "30 (20..60)", "200"], ["0", "0", "0.5", "40 (20..60)", "100"]]
-    print_blocks(front_table(study, result))
+    Report("", front_table(study, result)).print()
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "3 candidates, 3 of them feasible; the front:"
     assert [line.split() for line in lines[-2:]] == [" ".join(one).split() for one in cells]
     none = [one._replace(feasible=False) for one in candidates]
-    print_blocks(front_table(study, search.SearchResult(none, [], True)))
+    Report("", front_table(study, search.SearchResult(none, [], True))).print()
     assert capsys.readouterr().out == "3 candidates, 0 of them feasible.\n"
     assert search.front_columns(result) == {"front": [1, 0], "costs": [100.0, 200.0, 300.0]}
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from skysim.core.types import Floats
-from skysim.experiments.dome_survey.results.findings import fault_lines
+from skysim.experiments.dome_survey.results.findings import accuracy_statistics, fault_lines
 from skysim.experiments.dome_survey.survey_run import SurveyRun, residuals_px
 from skysim.results.plots import INK, png
 from skysim.results.report import Block, Cell, Column, Facts, Figure, Report, Section, Table, Text, Verdict
@@ -27,15 +27,11 @@ FILES = (("map, for tracker.map", "leds.ecsv"), ("every number of this page", "s
 
 def survey_report(statistics: dict[str, Any], run: SurveyRun, command: str) -> Report:
     """The report of a survey. statistics : as in `survey.json`"""
-    reached = {
-        "led_mm": 1e3 * run.accuracy.led_rms_m,
-        "lever_mm": 1e3 * float(np.sqrt(np.mean(run.accuracy.lever_sigma_m**2))),
-        "focal_px": float(run.accuracy.lens_sigma[0]),
-    }
+    reached = accuracy_statistics(run.accuracy)
     dome = Figure(Path(statistics["picture"]).read_bytes(), "The dome from above: LED errors, faults, next attitudes.")
     residuals = Figure(residual_figure(run), "Residuals: their distribution, and their means over the chip.")
     blocks = [
-        verdict(statistics, reached["led_mm"], len(fault_rows(statistics["faults"]))),
+        verdict(statistics, 1e3 * run.accuracy.led_rms_m),
         Text(FIT.format(**statistics)),
         Facts([(name, [Cell(file, link=file)]) for name, file in FILES], on_terminal=False),
         Section("The dome", [dome]),
@@ -49,8 +45,9 @@ def survey_report(statistics: dict[str, Any], run: SurveyRun, command: str) -> R
     return Report(f"Survey of {statistics['scene']}", blocks, command)
 
 
-def verdict(statistics: Mapping[str, Any], led_mm: float, faults: int) -> Verdict:
+def verdict(statistics: Mapping[str, Any], led_mm: float) -> Verdict:
     """How many LEDs were measured, how well, and the number of faults."""
+    faults = len(fault_rows(statistics["faults"]))
     text = "{surveyed} of {leds} LEDs measured in {tied} of {frames} frames".format(**statistics)
     text += f", to {led_mm:.2g} mm rms about each axis (1σ); {faults} faults."
     return Verdict(text, "warning" if faults else "good")
@@ -85,7 +82,7 @@ def truth_blocks(statistics: dict[str, Any]) -> list[Block]:
     return [Text(text), Table(columns, rows)]
 
 
-def accuracy_table(statistics: dict[str, Any], reached: Mapping[str, float]) -> Table:
+def accuracy_table(statistics: dict[str, Any], reached: Mapping[str, Any]) -> Table:
     """Errors by the plan, by this survey's covariance, in truth, and with the next attitudes."""
     predicted, after = statistics.get("predicted"), statistics.get("led_mm_after")
     columns = {"by the plan": predicted} if predicted else {}
