@@ -16,7 +16,6 @@ import numpy as np
 
 from estimator.catalog import catalog, ptase
 from estimator.core.errors import ImageError
-from skysim.apps.cli import terminal
 from skysim.apps.cli.commands import validate
 from skysim.apps.stream import packet
 from skysim.camera.psf import otf
@@ -34,6 +33,8 @@ from skysim.experiments.study import loader as study_loader
 from skysim.experiments.study.execution import store
 from skysim.results.files import recording
 from skysim.results.files.builder.prices import read_prices
+from skysim.results.report.as_text import print_table
+from skysim.results.report.blocks import Column, Table
 from skysim.scene import loader, opencv_calibration
 from skysim.sources import catalog as star_catalog
 from skysim.sources import photometry
@@ -172,7 +173,7 @@ def answers(data: bytes) -> None:
     if rejects(lambda: statuses.append(interface.check_answer(interface.Answer.of_tree(tree)).status), ValueError):
         return
     with redirect_stdout(TextIOWrapper(BytesIO(), "utf-8")) as output:
-        terminal.print_table("", ["status"], [statuses])
+        print_table(Table((Column("status"),), [tuple(statuses)]))
         output.seek(0)
         printed = output.read()
     if statuses[0][:80] not in printed or not printed.removesuffix("\n").partition("\n")[2].isprintable():

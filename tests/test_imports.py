@@ -63,7 +63,7 @@ def test_no_module_imports_itself_by_way_of_others() -> None:
 
 @pytest.mark.parametrize("package", ["skysim", "estimator"])
 def test_no_folder_holds_more_than_a_reader_takes_in(package: str) -> None:
-    """About nine; the flow of skysim itself is ten words long."""
+    """About a dozen; a folder needs a sentence of its own, so that many small ones read no better."""
     for folder in {path.parent for path in FILES.values() if path.is_relative_to(ROOT / package)}:
         entries = {path.name for path in folder.iterdir()} - {
             "__init__.py",
@@ -71,17 +71,4 @@ def test_no_folder_holds_more_than_a_reader_takes_in(package: str) -> None:
             "__main__.py",
             "README.md",
         }
-        assert len(entries) <= MOST.get(folder.relative_to(ROOT).as_posix(), 9), sorted(entries)
-
-
-MOST = {
-    **{
-        "skysim": 10,
-        "skysim/dynamics": 10,
-        "skysim/dynamics/profiles": 10,
-        "skysim/simulation/checks": 10,
-        "skysim/sources": 10,
-        "skysim/scene/sections": 10,
-    },
-    **{"skysim/experiments/study/execution": 10, "skysim/apps/cli/commands": 11},
-}
+        assert len(entries) <= 14, sorted(entries)

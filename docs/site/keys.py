@@ -64,6 +64,7 @@ CATALOG = f"{names(SHIPPED)}, or an `.ecsv` file of `skysim catalog build`"
 # What a text may be, where the model does not say it.
 TEXTS = {
     "title": "any text",
+    "lights.kind": "a kind that a module or an installed package adds",
     "tracker.name": "`own`, or a tracker of `skysim trackers` or `--program`",
     "tracker.options": "a section; its keys are the tracker's",
     "tracker.detector": names(DETECTORS),

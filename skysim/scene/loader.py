@@ -249,8 +249,8 @@ def list_scenes() -> list[str]:
 
 def located(error: InputError, name: str, overrides: Mapping[str, str]) -> InputError:
     """An error about a key that was only checked after loading, with file and line; any other error unchanged."""
-    section, *_ = keys = error.key.split(".")
-    if error.where or section not in Scene.model_fields:
+    keys = error.key.split(".")
+    if error.where or keys[0] not in Scene.model_fields:
         return error
     return error.at(where_of(keys, read(find(name))[1], overrides))
 

@@ -228,5 +228,5 @@ def require_catalog(key: str, name: str) -> Path:
     if not is_file(path):
         allowed = sorted(file.stem for file in CATALOGS.glob("*_*.ecsv"))
         problem, names = unknown_name("catalog", name, allowed)
-        raise InputError(key, problem, f"{names}, or a built .ecsv file")
+        raise InputError(key, problem, f"{names}, or an .ecsv file of a catalog build")
     return path

@@ -185,7 +185,7 @@ def test_a_sky_seen_in_a_mirror_is_refused(blind: plate_solver.Solver) -> None:
 
 @pytest.mark.parametrize("stage", ["detector", "centroider", "identifier", "solver"])
 def test_a_stage_s_wrong_name_is_answered_with_the_allowed_ones(stage: str) -> None:
-    with pytest.raises(InputError, match=rf"^--{stage}: unknown {stage} 'magic'; allowed: \w+, \w+"):
+    with pytest.raises(InputError, match=rf"^solve.{stage}: unknown {stage} 'magic'; allowed: \w+, \w+"):
         plate_solver.make_solver(None, None, stages={stage: "magic"})
 
 

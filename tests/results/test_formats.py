@@ -343,7 +343,7 @@ def test_a_distorted_frame_s_header_has_its_stars(stars: Flown) -> None:
 
 
 def test_bad_input_is_one_line_and_leaves_nothing(stars: Flown, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no frames with truth files; allowed: a folder of skysim run"):
+    with pytest.raises(InputError, match="no frames with truth files; allowed: a folder of a run"):
         recording.open_recording(tmp_path)
     with pytest.raises(InputError, match="unknown format 'jpeg'; allowed: aem, ecsv, parquet, tiff, zarr, video"):
         export.export(stars[1], ["aem", "jpeg"], tmp_path / "out", quiet)

@@ -316,14 +316,14 @@ def test_a_check_does_not_start_a_program(tmp_path: Path) -> None:
 
 def test_an_unknown_law_is_told_before_the_motion() -> None:
     with pytest.raises(
-        InputError, match=r"motion.control.law: unknown law 'lqr'; allowed: pid, pd, prescribed.*--progr"
+        InputError, match=r"motion.control.law: unknown law 'lqr'; allowed: pid, pd, prescribed, or a program"
     ):
         build_lab(loader.load("simsat_slew", {"motion.control": "lqr"}))
 
 
 @pytest.mark.parametrize("name", ["pid", "pd", "prescribed", "mine"])
 def test_a_program_takes_no_name_that_is_taken(name: str, installed: Path) -> None:
-    with pytest.raises(InputError, match=f"--program {name}: name already in use"):
+    with pytest.raises(InputError, match=f"programs.{name}: name already in use"):
         process.program_commands([f"{name}=x"])
 
 

@@ -267,7 +267,7 @@ def read_catalog(name: str | None) -> star_catalog.StarCatalog:
     try:
         return star_catalog.read(CATALOG)
     except ImageError as error:
-        raise InputError("", f"{error}; `skysim catalog build` makes it") from None
+        raise InputError("solve.catalog", error, "a star catalog (.ecsv) built by skysim") from None
 
 
 def validated_date(date_utc: datetime.datetime | None) -> tuple[datetime.datetime | None, str]:

@@ -67,7 +67,8 @@ def level_of(stack: Stack, setting: Setting) -> Level:
 
 def check_dark(darks: Stack, level: Level) -> None:
     """Raise InputError for a level of darks that is cut off at 0, equal frame by frame, or has structure or stars."""
-    folder, which = darks.folder, f"the darks of {describe(Setting(level.exposure_s, level.temperature_c))}"
+    folder = darks.folder
+    which = f"the darks of {describe(Setting(level.exposure_s, level.temperature_c))}"
     mean, noise_dn = level.mean_dn, math.sqrt(float(np.median(level.variance_dn2)))
     zeros = float(np.mean(mean < 1))
     if zeros > MAX_ZEROS:

@@ -13,7 +13,7 @@ WIDE = 240  # characters in a line of a file
 NARROW = 40  # characters, below which no text is wrapped
 MAX_ROWS = 60  # printed rows of a table; the page has all
 FACT_COLUMN = 21  # characters before the text of a fact
-FACT_WIDTH = 80  # of the lines of facts
+FACT_WIDTH = 80  # of the lines of facts and warnings
 COLORS = {"good": "green", "warning": "yellow", "bad": "bold red"}
 
 
@@ -34,11 +34,14 @@ def print_section(section: Section) -> None:
 
 
 def print_items(items: Items) -> None:
-    """Print one wrapped sentence after the other; warnings are named."""
+    """Print one wrapped sentence after the other; warnings are named, and as narrow as facts."""
     if items.title:
         print_wrapped(items.title)
     for line in items.lines:
-        print_wrapped(f"warning: {line}" if items.tone == "warning" else line)
+        if items.tone == "warning":
+            print_wrapped(f"warning: {line}", width=FACT_WIDTH)
+        else:
+            print_wrapped(line)
 
 
 def print_facts(facts: Facts) -> None:
@@ -94,9 +97,12 @@ def styled(cell: Cell, style: str) -> Any:
     return RichText(printable(cell.text), style)
 
 
-def print_wrapped(text: str, first: str = "", others: str = "  ") -> None:
-    """Print a text in lines of the terminal's width. first, others : what the first line and the others begin with"""
-    width = max(terminal_width(), NARROW)
+def print_wrapped(text: str, first: str = "", others: str = "  ", width: int | None = None) -> None:
+    """Print a text in lines of a width, by default the terminal's.
+
+    first, others : what the first line and the others begin with
+    """
+    width = width or max(terminal_width(), NARROW)
     print(textwrap.fill(printable(text), width, initial_indent=first, subsequent_indent=others, break_on_hyphens=False))
 
 

@@ -126,7 +126,8 @@ def check(sheet: Sheet, answers: Mapping[str, str]) -> None:
     except ValidationError as error:
         faults: list[InputError] = []
         for one in error.errors():
-            fault, section = fault_of(one, CameraConfig), ".".join(map(str, yaml_keys(one["loc"], tree, False)))
+            fault = fault_of(one, CameraConfig)
+            section = ".".join(map(str, yaml_keys(one["loc"], tree, False)))
             faults.append(fault.under(section) if section else fault)
         raise blame(faults, answers) from None
 

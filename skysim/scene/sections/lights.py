@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_args
 
 from pydantic import AfterValidator, ConfigDict, ModelWrapValidatorHandler, SerializeAsAny, model_validator
 
-from skysim.core.errors import unknown_name
+from skysim.core.errors import InputError, unknown_name
 from skysim.core.plugins import PluginKind
 from skysim.core.units import ConfigModel
 
@@ -20,9 +20,9 @@ CONFIGS: dict[str, type[LightConfig]] = {}  # of the kinds that were added
 
 
 def check_kind(kind: str) -> str:
-    """The name of a kind. Raises ValueError for an unknown one, with the known ones."""
+    """The name of a kind. Raises InputError for an unknown one, with the known ones."""
     if kind not in CONFIGS:
-        raise ValueError(unknown_name("light", kind, sorted({*CONFIGS, *PLUGINS.entry_points()})))
+        raise InputError("", *unknown_name("light", kind, sorted({*CONFIGS, *PLUGINS.entry_points()})))
     return kind
 
 

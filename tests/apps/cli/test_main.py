@@ -624,9 +624,17 @@ def test_a_run_carries_the_findings_before_its_frames_and_in_its_report(skysim: 
     (finding,) = json.loads(ran.out)["findings"]
     assert finding in ran.err
     page = (tmp_path / "report.html").read_text()
-    assert page.index("of the lights are saturated") < page.index("last solved frame") < page.index("Frames</h2>")
+    parts = (
+        "check of the plan warns: 1",
+        "last solved frame",
+        "<h2>Scene",
+        "of the lights are saturated",
+        "<h2>Frames",
+    )
+    places = [page.index(part) for part in parts]
+    assert places == sorted(places)
     for name in ("lights in the field", "expected error", "camera", "1600 × 1200 px"):
-        assert name in page[: page.index("last solved frame")]
+        assert name in page[page.index("<h2>Scene") : page.index("<h2>Frames")]
 
 
 def test_validate_carries_the_findings(skysim: Skysim, tmp_path: Path) -> None:

@@ -11,10 +11,11 @@ from labpage import CHROMIUM, NARROW, WIDE, Server, changed, come, onto_the_page
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
+from skysim.apps.cli.option_names import OPTIONS
 from skysim.apps.gui.page.actions import Command, matching
 from skysim.apps.gui.page.tab import PANELS
 from skysim.apps.gui.shared import style
-from skysim.apps.gui.shared.texts import for_page
+from skysim.apps.gui.shared.texts import LABELS, for_page
 from skysim.apps.gui.views import overlay
 from skysim.apps.gui.worker.study_process import MAX_STUDIES, StudyProcess
 from skysim.apps.gui.worker.workbench import Workbench
@@ -27,17 +28,19 @@ in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed"
 @pytest.mark.parametrize(
     ("error", "shown"),
     [
-        (InputError("camera.f_number", -1, "above 0", OVERRIDES), "camera.f_number: -1; allowed: above 0"),
-        (InputError("solve.fov_deg", 200, "2 to 120"), "the field of view: 200; allowed: 2 to 120"),
-        (
-            InputError("light.kind", "moon", "stars", Where("x.yaml", 3)),
-            "light.kind: moon; allowed: stars (x.yaml, line 3)",
-        ),
+        (InputError("camera.f_number", "", "above 0", OVERRIDES), "camera.f_number: allowed: above 0"),
+        (InputError("seed", "-1", "", Where("x.yaml", 3)), "seed: -1 (x.yaml, line 3)"),
+        (InputError("solve.fov_deg", "200", "2 to 120"), "the field of view: 200; allowed: 2 to 120"),
+        (InputError("survey.tilt_deg", "95", "to 30"), "the tilt: 95; allowed: to 30"),
+        (InputError("", "no frame has been rendered"), "no frame has been rendered"),
     ],
 )
-def test_an_error_has_its_field_s_label_and_a_place_if_it_is_of_a_file(error: InputError, shown: str) -> None:
-    """A value that was typed in the page has no place."""
+def test_an_error_names_the_field_of_the_page(error: InputError, shown: str) -> None:
     assert for_page(error) == shown
+
+
+def test_every_parameter_of_a_photo_has_a_label() -> None:
+    assert {key for key in OPTIONS if key.startswith("solve.")} <= LABELS.keys()
 
 
 def test_actions_are_found_by_their_words_in_any_order() -> None:

@@ -97,7 +97,7 @@ def test_what_is_wrong_in_the_options_is_told() -> None:
     for more, message in (
         ({"frames": 0}, "dataset.frames: 0; allowed: 1 or more"),
         ({"frames_per_shard": 0}, "dataset.frames_per_shard: 0; allowed: 1 or more"),
-        ({"formats": ("tiff",)}, "--to: unknown format 'tiff'; allowed: webdataset, zarr, coco"),
+        ({"formats": ("tiff",)}, "dataset.formats: unknown format 'tiff'; allowed: webdataset, zarr, coco"),
         ({"overrides": {"camera.widht_px": "5"}}, "widht_px"),
     ):
         with pytest.raises(InputError, match=message):

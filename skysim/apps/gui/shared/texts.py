@@ -12,7 +12,11 @@ from skysim.core.errors import OVERRIDES, InputError
 LABELS = {  # of the fields, by the parameter's key; a key of a scene is the label of its field
     "solve.fov_deg": "the field of view",
     "solve.time_utc": "the date",
-    "solve.catalog": "the catalog",
+    "solve.catalog": "the star catalog",
+    "solve.detector": "the detector",
+    "solve.centroider": "the centroider",
+    "solve.identifier": "the identifier",
+    "solve.solver": "the solver",
     "survey.tilt_deg": "the tilt",
 }
 

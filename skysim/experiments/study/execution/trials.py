@@ -160,7 +160,8 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
         if len(seeds) > 1:
             return [row for one in divided(segment, 1) for row in run_block(spec, one, key)]
         if isinstance(raised, InputError):
-            scene, error = scene or REFUSED, str(raised)
+            scene = scene or REFUSED
+            error = str(raised)
         else:
             error = traceback.format_exc().replace(f"{ROOT}/", "")  # independent of the installation path
     seconds = (time.perf_counter() - start_s) / len(seeds)
