@@ -64,7 +64,6 @@ CATALOG = f"{names(SHIPPED)}, or an `.ecsv` file of `skysim catalog build`"
 # What a text may be, where the model does not say it.
 TEXTS = {
     "title": "any text",
-    "lights.kind": "a kind that a module or an installed package adds",
     "tracker.name": "`own`, or a tracker of `skysim trackers` or `--program`",
     "tracker.options": "a section; its keys are the tracker's",
     "tracker.detector": names(DETECTORS),
@@ -90,6 +89,7 @@ TEXTS = {
     "motion.control.law": "`pid`, `pd`, or a controller of an entry point or of `--program`",
     "motion.maneuver.file": "a CSV, ECSV, CCSDS AEM or STK `.a` file",
     "vehicle.boxes.name": "any text",
+    "lights.kind": "a kind that was [added](../howto/light.md)",
     "vehicle.surroundings.name": "any text",
     "scene": "a name of `skysim scenes`, or a file",
     "factors.key": "a dotted key of the scene, or of the trial (`trial.noise_px`)",
@@ -127,6 +127,11 @@ def models(annotation: Any) -> Iterator[type[BaseModel]]:
             yield from models(argument)
 
 
+def own_subclasses(model: type[BaseModel]) -> list[type[BaseModel]]:
+    """The kinds of a section that skysim has itself."""
+    return [one for one in model.__subclasses__() if one.__module__.startswith("skysim.")]
+
+
 def sections(root: type[BaseModel]) -> dict[str, Section]:
     """The sections beneath a file's model by the model's name, a section before those beneath it."""
     found = {root.__name__: Section(root, [])}
@@ -135,7 +140,7 @@ def sections(root: type[BaseModel]) -> dict[str, Section]:
         for name, field in model.model_fields.items():
             below = f"{path}.{field.alias or name}".lstrip(".")
             direct = [one for part in (field.annotation, *field.metadata) for one in models(part)]
-            for inner in (one for one in direct for one in (one, *one.__subclasses__())):
+            for inner in (one for one in direct for one in (one, *own_subclasses(one))):
                 known = inner.__name__ in found
                 section = found.setdefault(inner.__name__, Section(inner, []))
                 if below not in section.paths:

@@ -120,37 +120,16 @@ def motion_lines(motion: Mapping[str, float]) -> list[str]:
 
 def frame_table(angles: tuple[str, str, str], rows: Sequence[FrameRow]) -> Table:
     """One row per frame: truth, estimate, errors, lights and time. angles : names of the three"""
-    columns = [
-        Column("frame"),
-        Column("t", "s", ".3f"),
-        Column("exp", "ms", ".5g"),
-        Column("rate", "°/s", ".2f"),
-        *(Column(f"true {name}", "°", ".5f") for name in angles),
-        *(Column(name, "°", ".5f") for name in angles),
-        Column("cross", "″", ".3f"),
-        Column("roll", "″", "+.3f"),
-        Column("detected"),
-        Column("used"),
-        Column("time", "ms", ".1f"),
-        Column("status", kind="text"),
-    ]
-    lines = [
-        [
-            row.frame,
-            row.t_s,
-            1e3 * row.exposure_s,
-            row.rate_deg_s,
-            *row.truth_deg,
-            *(row.estimate_deg or (None, None, None)),
-            row.cross_arcsec,
-            row.roll_arcsec,
-            row.detected,
-            row.matched,
-            row.time_ms,
-            Cell("WRONG", "bad") if row.wrong else row.status,
-        ]
-        for row in rows
-    ]
+    columns = [Column("frame"), Column("t", "s", ".3f"), Column("exp", "ms", ".5g"), Column("rate", "°/s", ".2f")]
+    columns += [Column(name, "°", ".5f") for name in (*(f"true {name}" for name in angles), *angles)]
+    columns += [Column("cross", "″", ".3f"), Column("roll", "″", "+.3f"), Column("detected"), Column("used")]
+    columns += [Column("time", "ms", ".1f"), Column("status", kind="text")]
+    lines = []
+    for row in rows:
+        motion = [row.frame, row.t_s, 1e3 * row.exposure_s, row.rate_deg_s, *row.truth_deg]
+        errors = [*(row.estimate_deg or (None, None, None)), row.cross_arcsec, row.roll_arcsec]
+        status = Cell("WRONG", "bad") if row.wrong else row.status
+        lines.append([*motion, *errors, row.detected, row.matched, row.time_ms, status])
     return Table(columns, lines, optional=((7, 8, 9), (2,), (14,), (3,), (12,), (4, 5, 6)))
 
 

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -11,11 +15,11 @@ import pytest
 from pydantic import Field
 
 from skysim.core.errors import InputError
+from skysim.core.paths import ROOT
 from skysim.core.types import Sources
-from skysim.core.units import Intensity, Length, Number, Time
+from skysim.core.units import Intensity, Length, Time
 from skysim.scene import loader
 from skysim.scene.sections import lights as schema
-from skysim.scene.sections.leds import CosineLobeConfig
 from skysim.scene.sections.lights import LightConfig
 from skysim.simulation.checks import check
 from skysim.simulation.exposure import render_at_rest
@@ -25,7 +29,6 @@ from skysim.simulation.lights import registry
 from skysim.simulation.lights.light import Exposure, Light, Lit, Obstacle, Occluder
 from skysim.simulation.lights.plan import Plan
 from skysim.simulation.lights.registry import register
-from skysim.sources.dome.led import Emitter
 from skysim.sources.photometry import led_strength_e_s_sr
 
 # A light in one file, with its schema: the lighthouse. Nothing else of skysim knows of it.
@@ -44,8 +47,6 @@ class LighthouseConfig(LightConfig):
     intensity_cd: Annotated[Intensity, Field(gt=0)]
     period_s: Annotated[Time, Field(gt=0)]
     lit_s: Annotated[Time, Field(gt=0)]
-    radius_m: Annotated[Length, Field(ge=0)] = 0.0
-    lobe_exponent: Annotated[Number, Field(gt=0)] = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,11 +55,10 @@ class Lighthouse(Light):
 
     config: LighthouseConfig
     lamp: Sources
-    emitter: Emitter
 
     def during(self, exposure: Exposure) -> Lit:
         is_lit = exposure.t_s % self.config.period_s < self.config.lit_s
-        return Lit("lighthouse", points=self.lamp if is_lit else None, emitter=self.emitter)
+        return Lit("lighthouse", points=self.lamp if is_lit else None)
 
 
 def build_lighthouse(config: LighthouseConfig, plan: Plan) -> Lighthouse:
@@ -66,10 +66,7 @@ def build_lighthouse(config: LighthouseConfig, plan: Plan) -> Lighthouse:
     strength = np.atleast_1d(led_strength_e_s_sr(config.intensity_cd, "white", plan.band))
     place, down = np.array([[*config.place_m, 1.0]]), np.array([[0.0, 0.0, -1.0]])
     ids, clock = np.array([LAMP_ID]), np.zeros(1, np.int64)
-    radius_m = np.array([config.radius_m])
-    lamp = Sources(ids, place, down, radius_m, strength, one, zero, one, clock, np.full(1, np.nan))
-    lobe = CosineLobeConfig(kind="cosine", exponent=config.lobe_exponent)
-    return Lighthouse(config, lamp, dataclasses.replace(Emitter(), lobe=lobe))
+    return Lighthouse(config, Sources(ids, place, down, zero, strength, one, zero, one, clock, np.full(1, np.nan)))
 
 
 # A second one, which hides.
@@ -234,3 +231,15 @@ def test_a_head_that_looks_at_the_earth_is_told_by_its_own_key() -> None:
     told = [line for line in findings if "behind the Earth" in line]
     assert len(told) == 1
     assert told[0].startswith("heads.0.rotation_deg: ")
+
+
+def test_the_page_s_lighthouse_is_a_light(tmp_path: Path) -> None:
+    """The block of docs/howto/light.md as a program prints what the page says."""
+    page = (ROOT / "docs/howto/light.md").read_text(encoding="utf-8")
+    block = re.search(r"```python\n# (\S+)\n(.*?)```", page, re.DOTALL)
+    printed = re.search(r"```text\n(.*?)```", page, re.DOTALL)
+    assert block
+    assert printed
+    (tmp_path / block[1]).write_text(block[2], encoding="utf-8")
+    done = subprocess.run([sys.executable, block[1]], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout == printed[1], done.stderr

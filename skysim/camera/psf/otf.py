@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from skysim.core.errors import InputError
+from skysim.core.io.yaml_reader import is_file
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import (
     AiryPsfConfig,
@@ -151,6 +152,8 @@ def read_cells(file: str) -> Floats:
     from skysim.core.io.images import monochrome, read_image
 
     path = Path(file)
+    if not is_file(path):
+        raise InputError("camera.psf.file", f"{path} not found")
     try:
         if path.suffix.lower() == ".csv":
             cells = np.loadtxt(path, delimiter=",", ndmin=2)

@@ -156,29 +156,15 @@ def verdict(statistics: dict[str, Any]) -> Verdict:
 
 def flight_table(flights: Sequence[dict[str, Any]]) -> Table:
     """One row per flight."""
-    columns = [
-        Column("flight"),
-        Column("frames solved"),
-        Column("greatest tilt", "°", ".1f"),
-        Column("trim masses", "mm"),
-        Column("center of mass", "µm"),
-        Column("of the simulated vehicle", "µm"),
-        Column("gravity torque", "N m", ".2g"),
-        Column("at most", "N m", ".2g"),
-    ]
-    rows = [
-        [
-            one["flight"],
-            f"{one['solved']} / {one['frames']}",
-            one["tilt_deg"],
-            ", ".join(f"{place:.3f}" for place in one["trim_mm"]),
-            offset_text(one),
-            ", ".join(f"{value:.3g}" for value in one["true_offset_um"]),
-            one["torque_nm"],
-            one["torque_bound_nm"],
-        ]
-        for one in flights
-    ]
+    columns = [Column("flight"), Column("frames solved"), Column("greatest tilt", "°", ".1f")]
+    columns += [Column("trim masses", "mm"), Column("center of mass", "µm"), Column("of the simulated vehicle", "µm")]
+    columns += [Column("gravity torque", "N m", ".2g"), Column("at most", "N m", ".2g")]
+    rows = []
+    for one in flights:
+        trims = ", ".join(f"{place:.3f}" for place in one["trim_mm"])
+        truth = ", ".join(f"{value:.3g}" for value in one["true_offset_um"])
+        flown = [one["flight"], f"{one['solved']} / {one['frames']}", one["tilt_deg"]]
+        rows.append([*flown, trims, offset_text(one), truth, one["torque_nm"], one["torque_bound_nm"]])
     return Table(columns, rows)
 
 
@@ -192,10 +178,9 @@ def mass_blocks(rows: Sequence[dict[str, Any]]) -> list[Block]:
     """Estimates of the mass properties beside the simulated vehicle's."""
     heads = ("estimate", "1σ", "simulated vehicle")
     columns = [Column("what", kind="text"), *(Column(head, format=".5g") for head in heads)]
-    values = [
-        [row["what"], row["estimate"], row["sigma"], row["truth"], (row["estimate"] - row["truth"]) / row["sigma"]]
-        for row in rows
-    ]
+    values = [[row[key] for key in ("what", "estimate", "sigma", "truth")] for row in rows]
+    for row in values:
+        row.append((row[1] - row[3]) / row[2])
     table = Table([*columns, Column("error over 1σ", format=".1f")], values)
     return [table, Text("J in kg m², of the vehicle with its trim masses at zero.")] if rows else []
 

@@ -58,17 +58,11 @@ def facts(statistics: dict[str, Any]) -> Facts:
 
 def value_table(statistics: dict[str, Any]) -> Table:
     """The values with their intervals, and those of the camera's file."""
-    columns = [
-        Column("what", kind="text"),
-        Column("measured", format=".5g"),
-        Column("95 %"),
-        Column("file", format=".5g"),
-        Column("unit", kind="text"),
-    ]
-    rows = [
-        [row["what"], row["value"], f"{row['low']:.5g} to {row['high']:.5g}", row["file"], row["unit"]]
-        for row in statistics["values"] + (statistics["night"]["values"] if statistics["night"] else [])
-    ]
+    columns = [Column("what", kind="text"), Column("measured", format=".5g"), Column("95 %")]
+    columns += [Column("file", format=".5g"), Column("unit", kind="text")]
+    values = statistics["values"] + (statistics["night"]["values"] if statistics["night"] else [])
+    interval = "{low:.5g} to {high:.5g}"
+    rows = [[row["what"], row["value"], interval.format(**row), row["file"], row["unit"]] for row in values]
     return Table(columns, rows)
 
 

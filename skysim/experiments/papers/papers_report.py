@@ -5,20 +5,13 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 
-from skysim.experiments.papers.compare import (
-    VERDICTS,
-    Comparison,
-    Reproduction,
-    Verdict,
-    format_summary,
-    format_with_source,
-)
-from skysim.results import report
+from skysim.experiments.papers import compare
+from skysim.experiments.papers.compare import VERDICTS, Comparison, Reproduction
 from skysim.results.plots import png
-from skysim.results.report import Cell, Column, Figure, Items, Report, Section, Table, Text, Tone
+from skysim.results.report import Cell, Column, Figure, Items, Report, Section, Table, Text, Tone, Verdict
 
 KINDS = (*VERDICTS, "derived", "open")
-TONES: dict[Verdict, Tone] = {"agrees": "good", "explained": "warning", "disagrees": "bad"}
+TONES: dict[compare.Verdict, Tone] = {"agrees": "good", "explained": "warning", "disagrees": "bad"}
 INTRODUCTION = (
     "All experiments with published numbers, repeated with our simulator and estimator: the published number, ours with"
     " its 95 % interval, and a verdict. Seed {seed}{quick}. The published numbers with their sources and tolerances are"
@@ -53,28 +46,25 @@ def total_counts(reproductions: Sequence[Reproduction]) -> dict[str, int]:
     return {kind: sum(one.counts[kind] for one in reproductions) for kind in KINDS}
 
 
-def verdict(reproductions: Sequence[Reproduction]) -> report.Verdict:
+def verdict(reproductions: Sequence[Reproduction]) -> Verdict:
     """How many published numbers agree with ours."""
     counts = total_counts(reproductions)
     text = "Of {} published numbers {agrees} agree, {explained} are explained and {disagrees} disagree".format(
         sum(counts[kind] for kind in VERDICTS), **counts
     )
     tone: Tone = "bad" if counts["disagrees"] else "good"
-    return report.Verdict(f"{text}; {counts['derived']} are derived, {counts['open']} verdicts are open.", tone)
+    return Verdict(f"{text}; {counts['derived']} are derived, {counts['open']} verdicts are open.", tone)
 
 
 def contents(reproductions: Sequence[Reproduction]) -> Table:
     """Counts and seconds of each experiment, with links, and their sums."""
     columns = [Column("experiment", kind="text"), Column("", kind="text"), *map(Column, KINDS)]
-    rows = [
-        [
-            Cell(one.id, link=f"#{one.id}"),
-            one.published.title,
-            *(Cell(str(count), "bad" if kind == "disagrees" and count else "") for kind, count in one.counts.items()),
-            one.seconds,
+    rows = []
+    for one in reproductions:
+        counts = [
+            Cell(str(count), "bad" if kind == "disagrees" and count else "") for kind, count in one.counts.items()
         ]
-        for one in reproductions
-    ]
+        rows.append([Cell(one.id, link=f"#{one.id}"), one.published.title, *counts, one.seconds])
     total = ["all", "", *total_counts(reproductions).values(), sum(one.seconds for one in reproductions)]
     return Table([*columns, Column("time", "s", ".0f")], [*rows, total])
 
@@ -102,21 +92,10 @@ def section(reproduction: Reproduction, drawn: bool = True) -> Section:
 
 def comparison_table(comparisons: Sequence[Comparison]) -> Table:
     """The published numbers beside ours."""
-    columns = [
-        Column("what", kind="text"),
-        Column("published"),
-        Column("ours (95 %)"),
-        Column("verdict", kind="text"),
-        Column("note", kind="aside"),
-    ]
-    rows = [
-        [
-            one.row.quantity,
-            format_with_source(one.row),
-            format_summary(one.result.ours),
-            Cell(one.verdict, TONES[one.verdict]),
-            one.note,
-        ]
-        for one in comparisons
-    ]
+    columns = [Column("what", kind="text"), Column("published"), Column("ours (95 %)")]
+    columns += [Column("verdict", kind="text"), Column("note", kind="aside")]
+    rows = []
+    for one in comparisons:
+        numbers = [compare.format_with_source(one.row), compare.format_summary(one.result.ours)]
+        rows.append([one.row.quantity, *numbers, Cell(one.verdict, TONES[one.verdict]), one.note])
     return Table(columns, rows)

@@ -142,14 +142,14 @@ class Section(Block):
 
 
 def filled(blocks: Sequence[Block]) -> list[Block]:
-    """The blocks without those that hold nothing: a text of no words, a list of no lines, a section of such blocks."""
+    """The blocks without those that hold nothing: a text of no words, a table of no rows, a section of such blocks."""
     found: list[Block] = []
     for one in blocks:
         match one:
             case Section():
                 inner = filled(one.blocks)
                 found += [replace(one, blocks=inner)] if inner else []
-            case Text(text="") | Items(lines=[]) | Facts(rows=[]):
+            case Text(text="") | Items(lines=[]) | Facts(rows=[]) | Table(rows=[]):
                 pass
             case _:
                 found.append(one)

@@ -17,7 +17,6 @@ from skysim.results.report import Block, Cell, Column, Facts, Figure, Report, Se
 CELLS = 8  # across the chip, over which residuals are averaged
 BINS = 60
 TAIL = 0.005  # share of the residuals beyond each end of the histogram
-WHAT = Column("", kind="text")
 REACHED = {"led_mm": "LED place, mm", "lever_mm": "lever, mm", "focal_px": "focal length, px"}
 FIT = (
     "{status}: {outliers} outliers, {rms_px:.2g} px rms residual; 1σ of an LED's place: median"
@@ -60,22 +59,13 @@ def verdict(statistics: Mapping[str, Any], led_mm: float, faults: int) -> Verdic
 def value_table(statistics: dict[str, Any]) -> Table:
     """Lens and lever before and after the survey, and in truth if it was simulated."""
     truth = statistics.get("truth")
-    rows = [
-        [
-            row["what"],
-            *(value_text(row["what"], row[key]) for key in ("believed", "found")),
-            f"{row['sigma']:.2g}",
-            *([value_text(row["what"], truth[row["what"]])] if truth else []),
-        ]
-        for row in statistics["values"]
-        if row["sigma"]
-    ]
-    return Table([WHAT, *map(Column, ["before", "found", "1σ", *["truth"] * bool(truth)])], rows)
-
-
-def value_text(what: str, number: float) -> str:
-    """A number of lens or lever."""
-    return f"{number:.5g}" if what[0] in "kp" else f"{number:.3f}"
+    rows = []
+    for row in statistics["values"]:
+        what = row["what"]
+        numbers = [row["believed"], row["found"], *([truth[what]] if truth else [])]
+        before, found, *known = (f"{one:.5g}" if what[0] in "kp" else f"{one:.3f}" for one in numbers)
+        rows += [[what, before, found, f"{row['sigma']:.2g}", *known]] if row["sigma"] else []
+    return Table([Column("", kind="text"), *map(Column, ["before", "found", "1σ", *["truth"] * bool(truth)])], rows)
 
 
 def truth_blocks(statistics: dict[str, Any]) -> list[Block]:
@@ -88,10 +78,8 @@ def truth_blocks(statistics: dict[str, Any]) -> list[Block]:
         f" after (predicted {predicted} mm); {statistics['renamed']} with another identity."
     )
     errors = ("cross_arcsec_median", "cross_arcsec_worst", "roll_arcsec_median", "roll_arcsec_worst")
-    rows = [
-        [when, f"{one['solved']} / {one['stops']}", *(one[key] for key in errors)]
-        for when, one in ((when, statistics[when]) for when in ("before", "after"))
-    ]
+    trackers = [(when, statistics[when]) for when in ("before", "after")]
+    rows = [[when, f"{one['solved']} / {one['stops']}", *(one[key] for key in errors)] for when, one in trackers]
     heads = ("cross, median", "worst", "roll, median", "worst")
     columns = [Column("the tracker", kind="text"), Column("solved"), *(Column(head, "″", ".3g") for head in heads)]
     return [Text(text), Table(columns, rows)]
@@ -131,9 +119,8 @@ def stop_table(stops: list[dict[str, Any]]) -> Table:
 def fault_blocks(faults: dict[str, Any]) -> list[Block]:
     """The faults as a table; their numbers, the error of the list's other places, and which exchanges can be found."""
     columns = [Column("LED"), Column("fault", kind="text"), Column("details", kind="text")]
-    rows = fault_rows(faults)
     *_, counts = fault_lines(faults)
-    return [*([Table(columns, rows)] if rows else []), Text(counts)]
+    return [Table(columns, fault_rows(faults)), Text(counts)]
 
 
 def fault_rows(faults: dict[str, Any]) -> list[tuple[str, str, str]]:

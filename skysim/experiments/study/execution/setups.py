@@ -18,6 +18,7 @@ from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.plan import Trial, TrialSpec, digest, resolve_point
 from skysim.scene.loader import file_names
 from skysim.scene.scene import Scene
+from skysim.scene.sections.lights import PLUGINS
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.simulation.user_parts import UserParts
 from skysim.tracking import factory
@@ -81,10 +82,10 @@ def build_setup(spec: TrialSpec, settings: Settings) -> Setup:
 
 
 def scene_hash(scene: Scene) -> str:
-    """Hash of a scene, of the files it names, and of the releases of external tracker and controller."""
+    """Hash of a scene, of the files it names, and of the releases of external tracker, controller and lights."""
     tree = scene.model_dump(mode="json", by_alias=True)
     contents = [sha256(Path(path).read_bytes()).hexdigest() for _, path in file_names(tree) if Path(path).is_file()]
-    releases = [TRACKERS.release(scene.tracker.name)]
+    releases = [TRACKERS.release(scene.tracker.name), *(PLUGINS.release(light.kind) for light in scene.lights)]
     if scene.motion.control and (release := CONTROLLERS.release(scene.motion.control.law)):
         releases.append(release)
     return digest([tree, contents, *releases])

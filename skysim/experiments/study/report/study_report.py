@@ -23,22 +23,8 @@ from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
 from skysim.experiments.study.report import figures, layout, maps
 from skysim.experiments.study.report.maps import DirectionMap
 from skysim.experiments.study.report.overview import Overview, overview
-from skysim.results.report import (
-    Block,
-    Cell,
-    Code,
-    Column,
-    Facts,
-    Figure,
-    Items,
-    Report,
-    Section,
-    Table,
-    Text,
-    Tone,
-    Verdict,
-)
-from skysim.results.report.blocks import Kind
+from skysim.results.report import Block, Cell, Code, Column, Facts, Figure, Items, Report, Section, Table, Text, Verdict
+from skysim.results.report.blocks import Kind, Tone
 
 POINTS = "Points"  # titles of sections
 STUDY_FILE = "The study file"
@@ -134,19 +120,19 @@ def compose(
         *study_figures(lines, study, store.point_columns, command("replay")),
     ]
     shown = {one.response for one in layout.figures(study, lines)}
-    left = [name for name in study.responses if name not in shown]
+    left = ", ".join(name for name in study.responses if name not in shown)
+    scene = [(name, [text]) for name, text in found.about.rows]
+    warnings = Items(found.about.findings, tone="warning")
     blocks = [
         Text(question(store.meta("study")), on_terminal=False),
         verdict(study, store),
         failures(store, command("replay")),
         Items(found.headline, "Answer"),
-        Section(
-            "Figures", [*drawn, Text(f"In the table alone: {', '.join(left)}." if left else "")], on_terminal=False
-        ),
-        Section("Scene", [scene_facts(store, found.about)], on_terminal=False),
-        Section("Checks of the scene", checks(found.about)),
+        Section("Figures", [*drawn, Text(left and f"In the table alone: {left}.")], on_terminal=False),
+        Section("Scene", [Facts([*scene, ("code version", [store.meta("code")])])], on_terminal=False),
+        Section("Checks of the scene", [warnings if found.about.findings else Text("Nothing to warn of.")]),
         Section("Ranges of the responses", [Items(found.ranges)], on_terminal=False),
-        Section("Sobol indices", index_table(found.indices)),
+        Section("Sobol indices", [index_table(found.indices)]),
         Section("Front", front_table(study, found.result)),
         points_section(lines, study, front, costs),
         runs_section(store),
@@ -168,12 +154,10 @@ def verdict(study: Study, store: Store) -> Verdict:
     """How many trials are done, failed, and ended in a wrong attitude."""
     counts = store.counts()
     trials = study.trial_count(len(store.points()))
-    text = (
-        f"{counts['done']} of {trials} trials, {counts['failed']} failed, {counts['wrong']} wrong attitudes (over 10′)"
-    )
     finished = 0 < trials <= counts["done"]
     tone: Tone = "good" if finished else "warning"
-    text += "." if finished else ". Not finished: what follows is of the trials that are in."
+    text = "{done} of {} trials, {failed} failed, {wrong} wrong attitudes (over 10′).".format(trials, **counts)
+    text += "" if finished else " Not finished: what follows is of the trials that are in."
     return Verdict(text, "bad" if counts["failed"] else tone)
 
 
@@ -186,16 +170,6 @@ def failures(store: Store, replay: str) -> Items:
     trials = "1 trial failed and counts" if count == 1 else f"{count} trials failed and count"
     first = ", the first of them" if count > len(listed) else ""
     return Items(lines, f"{trials} in no figure but `failed`{first}:", "bad", on_terminal=False)
-
-
-def scene_facts(store: Store, about: Overview) -> Facts:
-    """Scene and trials as a table, and the version of the code."""
-    return Facts([*((name, [text]) for name, text in about.rows), ("code version", [store.meta("code")])])
-
-
-def checks(about: Overview) -> list[Block]:
-    """What the checks of the scene found."""
-    return [Items(about.findings, tone="warning")] if about.findings else [Text("Nothing to warn of.")]
 
 
 # Tables.
@@ -226,7 +200,7 @@ def points_section(
     return Section(POINTS, [table, Text(f"{note} {more}")], folded=len(lines) > OPEN_ROWS)
 
 
-def index_table(indices: Sequence[Index]) -> list[Block]:
+def index_table(indices: Sequence[Index]) -> Table:
     """The Sobol indices, the largest total of each error first."""
     columns = [Column("error", kind="text"), Column("factor", kind="text"), Column("alone, rms", "″", ".3g")]
     columns += [Column("first order"), Column("total")]
@@ -234,7 +208,7 @@ def index_table(indices: Sequence[Index]) -> list[Block]:
         [one.response, one.factor, one.rms_arcsec, with_key(one.first), with_key(one.total)]
         for one in sorted(indices, key=lambda one: (one.response, -one.total.value))
     ]
-    return [Table(columns, rows)] if rows else []
+    return Table(columns, rows)
 
 
 def with_key(summary: Any) -> Cell:
@@ -250,7 +224,7 @@ def front_table(study: Study, result: SearchResult | None) -> list[Block]:
     text = f"{len(result.candidates)} candidates, {feasible} of them feasible" + ("; the front:" if feasible else ".")
     heads, rows = search.front_cells(study, result)
     table = Table([Column(head) for head in heads], rows, from_the_last(len(study.factors) + 1, len(heads)))
-    return [Text(text), *([table] if rows else [])]
+    return [Text(text), table]
 
 
 def from_the_last(kept: int, count: int) -> list[tuple[int]]:
@@ -262,11 +236,9 @@ def runs_section(store: Store) -> Section:
     """The runs that filled the store."""
     columns = [Column("engine", kind="text"), Column("workers"), Column("trials")]
     columns += [Column("time", "s", ".1f"), Column("trials/s", format=".1f")]
-    rows = [
-        [run[name] for name in ("engine", "workers", "trials", "seconds")]
-        + [run["trials"] / run["seconds"] if run["seconds"] else None]
-        for run in store.runs()
-    ]
+    rows = [[run[name] for name in ("engine", "workers", "trials", "seconds")] for run in store.runs()]
+    for row in rows:
+        row.append(row[2] / row[3] if row[3] else None)
     untimed = store.counts()["done"] - sum(run["trials"] for run in store.runs())
     note = f"{untimed} trials are of runs that were killed." if untimed > 0 else ""
     return Section("Runs", [Table(columns, rows), Text(note)])
@@ -281,8 +253,8 @@ def study_figures(lines: Sequence[PointRow], study: Study, columns_of: ColumnsOf
     for one in layout.figures(study, lines):
         if isinstance(one, Map):
             panels = maps.direction_maps(lines, one, study, columns_of)
-            blocks += [Figure(maps.map_png(panels, one), maps.caption(panels, one, study, lines))]
-            blocks += worst_table(panels, replay)
+            picture = Figure(maps.map_png(panels, one), maps.caption(panels, one, study, lines))
+            blocks += [picture, worst_table(panels, replay)]
             continue
         blocks.append(Figure(figures.figure_png(lines, one, study), layout.caption(one, study, lines)))
         if not is_sampled(study):
@@ -290,7 +262,7 @@ def study_figures(lines: Sequence[PointRow], study: Study, columns_of: ColumnsOf
     return blocks
 
 
-def worst_table(panels: Sequence[DirectionMap], replay: str) -> list[Block]:
+def worst_table(panels: Sequence[DirectionMap], replay: str) -> Table:
     """The worst trials of a map's panels with the commands that repeat them."""
     columns = [Column("worst", kind="text"), Column("lights", format=".0f"), Column("what happened", kind="text")]
     rows = [
@@ -298,7 +270,7 @@ def worst_table(panels: Sequence[DirectionMap], replay: str) -> list[Block]:
         for panel in panels
         for one in panel.worst
     ]
-    return [Table([*columns, Column("repeat it", kind="text")], rows)] if rows else []
+    return Table([*columns, Column("repeat it", kind="text")], rows)
 
 
 def pivot_table(figure: Curve | Heat, lines: Sequence[PointRow], study: Study) -> Table:
