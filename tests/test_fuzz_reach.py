@@ -35,6 +35,7 @@ OUT_OF_REACH = {
     "skysim.scene.data_sheet.sheet.parsed": "a word of the command line, read as a quantity or a number",
     "skysim.apps.cli.commands.study.load_stored_plan": "the store is read by `open_store`, the study by `loader.load`",
     "skysim.apps.plate_solver.picture.load_picture": "hands the file on to `read_picture`",
+    "skysim.apps.plate_solver.picture.read_and_solve": "hands the file on to `load_picture`",
     "skysim.apps.plate_solver.solver.read_camera": "hands the file on to `loader` or `opencv_calibration.read`",
     "skysim.apps.plate_solver.solver.read_catalog": "hands the file on to the estimator's `catalog.read`",
     "skysim.apps.cli.options.load": "hands a scene's name on to `loader.load`",

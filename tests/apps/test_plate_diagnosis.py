@@ -176,7 +176,7 @@ def test_a_catalog_that_is_too_shallow_is_named_and_a_deeper_one_solves(focal: s
     image = photograph(focal, 195.0, 25.0)
     assert hint(image, fov_deg, "hipparcos_hp6.5") == (
         f"the catalog is too shallow for this field: {expected} of its 7996 stars are expected there;"
-        " take --catalog gaia_v8.0"
+        " take the catalog gaia_v8.0"
     )
     deep = plate_solver.make_solver(fov_deg, None, catalog=str(CATALOGS / "gaia_v8.0.ecsv"))
     report, _ = plate_solver.solve_array(image, deep, None)

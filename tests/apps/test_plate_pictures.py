@@ -289,7 +289,7 @@ def test_python_gets_what_was_seen_and_tried(gray: NDArray, tmp_path: Path) -> N
     assert (narrow, wide) == pytest.approx((0.948 * FOV_DEG, 1.058 * FOV_DEG), rel=2e-3)
     assert found.catalog_limit_mag == 8.0
     assert package.solve(with_exif(path, gray), fov_deg=FOV_DEG, catalog="gaia_v8.0").catalog_limit_mag == 8.0
-    with pytest.raises(InputError, match=r"--catalog: unknown catalog 'deep'; allowed: gaia_v8.0, hipparcos_hp6.5"):
+    with pytest.raises(InputError, match=r"solve.catalog: unknown catalog 'deep'; allowed: gaia_v8.0, hipparcos_hp6.5"):
         package.solve(path, catalog="deep")
 
 

@@ -48,3 +48,11 @@ def test_each_frame_of_each_camera_is_exposed_once_with_a_filter_or_without(name
     with mock.patch.object(exposure, "expose", wraps=exposure.expose) as exposed:
         skysim.simulate(skysim.load_scene(name, {"exposure.frames": 2}))
     assert exposed.call_count == 2 * cameras
+
+
+def test_a_run_along_a_given_table_is_saved(tmp_path: Path) -> None:
+    """The table has no file that the check of the plan could read again."""
+    level = [0.0] * 4
+    table = Table({"t_s": [0.0, 1.0, 2.0, 3.0], "roll_deg": [0.0, 0.5, 1.0, 1.5], "pitch_deg": level, "yaw_deg": level})
+    run = skysim.simulate(skysim.load_scene("afit_simsat", {"exposure.frames": 1}), profile=table)
+    assert (run.save(tmp_path / "run") / "report.html").is_file()

@@ -51,7 +51,7 @@ def check(lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | Non
     Raises InputError for unreadable files, and for a maneuver that a run would refuse.
     """
     scene = lab.scene
-    first = [line for line in [assumptions.camera_outside_warning(scene, lab.camera.mount)] if line]
+    first = [line for line in [assumptions.camera_outside_warning(scene, lab.camera.mount, lab.start)] if line]
     if first:
         return Check([], first)  # all else assumes that the camera is inside
     context = context_of(lab)

@@ -80,7 +80,7 @@ def test_a_stopped_datasheet_goes_on_and_is_the_same(small: None, tmp_path: Path
 
 
 def test_too_few_fields_are_refused_with_their_number(small: None, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"--fields 4: . fields are solved .* allowed: 10 of them or more"):
+    with pytest.raises(InputError, match=r"datasheet.fields: 4: . fields are solved .* allowed: 10 of them or more"):
         state(measured(tmp_path, fields=4))
 
 

@@ -243,7 +243,10 @@ def write_images(folder: Path, count: int, size: tuple[int, int] = (480, 640)) -
         (lambda path: None, "no such folder"),
         (lambda path: path.mkdir(), "0 images; allowed: 3 or more, typically tens"),
         (lambda path: write_images(path, 2), "2 images; allowed: 3 or more, typically tens"),
-        (lambda path: write_images(path, 4, (100, 120)), "120 x 100 pixels; allowed: 640 x 480, as --camera has them"),
+        (
+            lambda path: write_images(path, 4, (100, 120)),
+            "120 x 100 pixels; allowed: 640 x 480, as the camera has them",
+        ),
         (lambda path: (write_images(path, 3), (path / "003.png").write_bytes(b"PNG?")), "003.png: cannot be decoded"),
         (lambda path: write_images(path, 3), "0 of 3 images identified; allowed: 2 or more: give their attitudes"),
     ],

@@ -345,7 +345,7 @@ def test_a_map_is_read_as_it_was_written(statistics: dict[str, Any], folder: Pat
 @pytest.mark.parametrize(
     ("right", "wrong", "says"),
     [
-        ("z_m", "zz", "no column z_m; allowed: a map written by skysim survey"),
+        ("z_m", "zz", "no column z_m; allowed: a map written by a survey"),
         ("focal_px: 17", "focal_px: -17", "focal_px in the header is -17"),
         ("focal_px: 17", "focal: 17", "focal_px in the header is None; allowed: 1 finite number above 0"),
         (
@@ -432,12 +432,12 @@ def test_a_map_that_is_not_there_or_not_alone_is_one_line(
         (["shefex2"], "light.kind: a survey needs LEDs, not stars; allowed: dome"),
         (
             ["afit_simsat", "--tilt", "31"],
-            "--tilt 31: allowed: above 0, up to 30 degrees, the vehicle's stop",
+            "--tilt: 31; allowed: above 0, up to 30 degrees, the vehicle's stop",
         ),
         (["afit_simsat", "--imu-sigma", "2 mm"], "--imu-sigma: '2 mm' is not a plane angle"),
-        (["afit_simsat", "--imu-sigma", "20 deg"], "--imu-sigma 20 deg: allowed: 0 to 0.1 rad"),
-        (["afit_simsat", "--led-sigma", "0 mm"], "--led-sigma 0 mm: allowed: 1e-06 to 0.1 m"),
-        (["afit_simsat", "--focal-error", "50%"], "--focal-error 50%: allowed: -0.1 to 0.1"),
+        (["afit_simsat", "--imu-sigma", "20 deg"], "--imu-sigma: 20 deg; allowed: 0 to 0.1 rad"),
+        (["afit_simsat", "--led-sigma", "0 mm"], "--led-sigma: 0 mm; allowed: 1e-06 to 0.1 m"),
+        (["afit_simsat", "--focal-error", "50%"], "--focal-error: 50%; allowed: -0.1 to 0.1"),
         (["afit_simsat", "--frames", "2", "--attitudes", "random"], "survey: "),
     ],
 )

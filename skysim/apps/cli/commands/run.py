@@ -113,7 +113,7 @@ def render(
     folder = output_folder(out, loaded.name)
     paths = list[str]()
     with open_flight(loaded) as flight:
-        if warning := assumptions.camera_outside_warning(loaded, flight.lab.camera.mount):
+        if warning := assumptions.camera_outside_warning(loaded, flight.lab.camera.mount, flight.lab.start):
             terminal.print_error(warning)
         recorder = FlightRecorder(folder, flight)
         with terminal.progress_callback(loaded.title) as update:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from skysim.core.types import Mount, Sources
-from skysim.dynamics import guidance
-from skysim.dynamics.profiles.load import load_profiles
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig, SurveyedSurfaceConfig
 from skysim.sources.dome.shell import surface
@@ -34,9 +33,8 @@ def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
     return [line for line in lines if line]
 
 
-def camera_outside_warning(scene: Scene, mount: Mount) -> str:
-    """Warn where the camera is outside of the dome at the start, so that its frames are probably black."""
-    start = guidance.start_attitude(scene.motion, load_profiles(scene, mount))
+def camera_outside_warning(scene: Scene, mount: Mount, start: Rotation) -> str:
+    """Warn where the camera is outside of the dome at the start (lab_from_body), so that its frames may be black."""
     camera_m = start.apply(mount.camera_body_m)
     if not isinstance(scene.light, DomeConfig) or surface.build_surface(scene.light.surface).inside(camera_m):
         return ""
