@@ -113,9 +113,9 @@ def test_the_worst_are_named_with_what_repeats_them(typed):
     assert re.search(line, out, re.MULTILINE)
     assert "no trial counts for misidentified" in typed(*words, "--response", "misidentified")[1]
     for wrong, complaint in (
-        (("--where", "strays=6"), "--where.strays: unknown level 6; allowed: 0, 5"),
+        (("--where", "strays=6"), "--where strays: unknown level 6; allowed: 0, 5"),
         (("--where", "star=6"), "--where: unknown factor 'star'; allowed: strays"),
-        (("--where", "strays"), "--where strays: allowed: FACTOR=LEVEL"),
+        (("--where", "strays"), "--where: strays; allowed: FACTOR=LEVEL"),
         (("--response", "stray"), "--response: unknown response 'stray'"),
     ):
         code, _, err = typed("study", "worst", "question.yaml", *wrong)
