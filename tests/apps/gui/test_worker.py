@@ -46,6 +46,7 @@ def test_a_dome_is_flown_played_sought_and_its_loop_opened(page: Any) -> None:
     simulate(page, 8)
     page.get_by_text(re.compile(r"^\d of 8 frames solved; rms: cross")).wait_for()
     clock = page.get_by_text(re.compile(r"^\d+\.\d\d s +\d/8$"))
+    page.get_by_role("button", name="Previous frame").click()  # a flight that is computed plays: pause it
     chosen(page, "Speed", "5×")
     onto_the_page(page)
     page.keyboard.press("Control+k")

@@ -58,6 +58,7 @@ class RunPanel:
         self.sought: int | None = None
         self.plays_when_done = False
         self.index = 0
+        self.factor = SPEEDS["real time"]
         self.started_s = 0.0
         self.from_s = 0.0
         self.drawn_s = 0.0
@@ -259,17 +260,11 @@ class RunPanel:
         elapsed = (time.monotonic() - self.started_s) * self.factor if self.playing else 0.0
         return self.from_s + elapsed
 
-    @property
-    def factor(self) -> float:
-        return SPEEDS[str(self.speed.value)]
-
-    def resync(self, event: Any) -> None:
+    def resync(self) -> None:
         """Continue from the current time at another speed."""
-        if self.playing:
-            before = SPEEDS[str(event.previous_value)]
-            now = time.monotonic()
-            self.from_s += (now - self.started_s) * before
-            self.started_s = now
+        self.from_s = self.now_s
+        self.started_s = time.monotonic()
+        self.factor = SPEEDS[str(self.speed.value)]
 
     async def step(self, frames: int) -> None:
         """Show the next or the previous frame."""
